@@ -68,7 +68,7 @@ PATCHES: dict[str, dict[str, object]] = {
     "sfm.misplaced": {"sfm.doubt._MIN_AGREEMENT": 0.0},
     "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
     "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},
-    "silhouettes.shadows": {"silhouettes.reliability._without_shadows": lambda cuts: cuts},
+    "silhouettes.shadows": {"silhouettes.cuts._without_shadow": lambda mask, *_: mask},
     "coarse.seen_through": {"coarse.trim._MIN_BEHIND": 10**9},
     "remesh.outside": {
         "coarse.remesh.within": lambda *given: torch.ones(given[2], dtype=torch.bool)

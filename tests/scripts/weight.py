@@ -28,8 +28,8 @@ LINES = {
     "doors/outputs": 518,
     "doors/size": 1092,
     "ground": 26,
-    "ground/geometry": 3585,
-    "ground/kernels": 5133,
+    "ground/geometry": 3591,
+    "ground/kernels": 5135,
     "ground/linalg": 1359,
     "ground/radiometry": 484,
     "method": 1,
@@ -40,7 +40,7 @@ LINES = {
     "method/patches": 979,
     "method/photometry": 3932,
     "method/sfm": 4618,
-    "method/silhouettes": 1656,
+    "method/silhouettes": 1647,
     "method/sweep": 706,
     "paper": 1263,
     "priors": 791,
@@ -65,8 +65,8 @@ LINES = {
 # Numbers of module constants, in tuples and mappings, too; lines of signatures and of imports.
 BARS = {
     "numbers in module constants": 894,
-    "lines of signatures": 5321,
-    "lines of imports": 4301,
+    "lines of signatures": 5318,
+    "lines of imports": 4302,
 }
 
 

@@ -67,18 +67,16 @@ def nearest_to(
     return best, place
 
 
-def cuts_of(masks: Tensor, margins_px: Tensor, on_plane: bool, grey: Tensor | None = None) -> Cuts:
-    """Cuts of which cues doubt none, as bright everywhere unless ``grey`` is given."""
+def cuts_of(masks: Tensor, margins_px: Tensor) -> Cuts:
+    """Cuts of which cues doubt none."""
     none = torch.zeros(len(masks), dtype=torch.float64)
     return Cuts(
         masks=masks,
         margins_px=margins_px,
         exposed=none,
         held=1 + none,
-        on_plane=on_plane,
         doubted=none > 0,
         agreement=None,
-        grey=torch.zeros_like(margins_px) if grey is None else grey,
     )
 
 

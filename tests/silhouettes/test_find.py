@@ -200,7 +200,7 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
     projections[:, 60:120, 60:180] = 5.0
     masks = torch.zeros_like(staged.truth)
     masks[:, 60:120, 180 - int(fraction * 120) : 240] = True
-    nonsense = shapes.cuts_of(masks, projections, on_plane=True)
+    nonsense = shapes.cuts_of(masks, projections)
     monkeypatch.setattr(find, "cut_in_iterations", lambda _: nonsense)
     overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
     with pytest.warns(PimperWarning, match=f"above the plane.*by {overlap_percent:.0f}%"):
@@ -219,7 +219,7 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
     projections[:, 60:120, 60:180] = 5.0
     masks = projections > 0
     masks[:7, 60:120, 60:205] = True  # overlap 0.83, of which 0.83 is inside
-    cuts = shapes.cuts_of(masks, projections, on_plane=False)
+    cuts = shapes.cuts_of(masks, projections)
     monkeypatch.setattr(find, "cut_in_iterations", lambda _: cuts)
     with pytest.warns(PimperWarning, match="only 5 of 12 silhouettes agree"):
         assert FindSilhouettes(SMALL)(staged.scene).source == "everything"

@@ -86,17 +86,30 @@ def test_a_view_that_is_wrong_is_outvoted_or_left_out(cameras):
 @pytest.mark.parametrize(("doubt", "held"), [(0.3, True), (0.2, False)])
 def test_words_add_up_and_a_tie_is_the_objects(cameras, doubt, held):
     """Of 20 views a tenth may disagree: 5 that count 0.4 each are as much as 2."""
-    silhouettes = of_ball(cameras)
+    silhouettes = of_ball(cameras).replace(source="found")
     wrong = silhouettes.inside.clone()
-    wrong[:10:2] = doubt
+    wrong[:10:2, :, WIDTH // 2 :] = doubt * (wrong[:10:2, :, WIDTH // 2 :] > 0)
     hull = visual_hull(
-        silhouettes.replace(inside=wrong, source="found"),
-        cameras,
-        BOX,
-        num_voxels=32**3,
-        disagreeing=0.1,
+        silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=32**3, disagreeing=0.1
     )
-    assert (hull is not None) == held
+    assert hull is not None
+    assert (float(hull.occupied.sum() * hull.spacing**3) > 4.0) == held
+
+
+def test_what_only_doubt_leaves_inside_is_left_out_where_it_stands_apart(cameras):
+    """A second ball that no view shows, and none denies for certain."""
+    silhouettes = of_ball(cameras).replace(source="found")
+    hull = visual_hull(silhouettes, cameras, BOX, num_voxels=32**3, disagreeing=0.1)
+    other = silhouettes_of(lambda points: shapes.ball(3 * (points - 0.9)), cameras).inside
+    inside = torch.maximum(silhouettes.inside, 0.48 * other)
+    found = visual_hull(
+        silhouettes.replace(inside=inside), cameras, BOX, num_voxels=32**3, disagreeing=0.1
+    )
+    assert hull is not None
+    assert found is not None
+    assert found.depth_of(torch.full((3,), 0.9)) < 0
+    volume, before = (float(one.occupied.sum() * one.spacing**3) for one in (found, hull))
+    assert 0.95 * before < volume < 1.2 * before
 
 
 def test_views_abstain_where_their_pixels_show_the_object_or_not(cameras):

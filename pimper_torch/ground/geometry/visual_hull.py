@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import label
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
@@ -173,8 +174,9 @@ def visual_hull(
     r"""Build the hull by the vote of the reliable views.
 
     A pixel that shows the object with a probability :math:`p` below a half counts
-    :math:`1 - 2 p` against it; at a half, and outside its photograph, a view abstains. Time and
-    memory grow with the voxels.
+    :math:`1 - 2 p` against it; at a half, and outside its photograph, a view abstains. Of what
+    only such words leave inside, pieces that stand apart are left out. Time and memory grow with
+    the voxels.
 
     Args:
         box_world: Smallest and largest corner of the region to look in; the grid is fitted to
@@ -294,11 +296,15 @@ def _voted(
     # All views' distances to a slab take 8 MB.
     slab = max(1, 2**21 // (len(maps) * int(counts[1:].prod())))
 
-    def vote(some: Float[Tensor, " x"]) -> Float[Tensor, "x y z"]:
+    def vote(some: Float[Tensor, " x"]) -> Float[Tensor, "2 x y z"]:
         return _vote(maps, cameras, (first, steps), (some, reach[1], reach[2]), fractions)
 
-    distance = list(side_by_side(vote, torch.split(reach[0], slab), tracked=False))
-    return Hull(origin_world=low, spacing=spacing, distance=torch.cat(distance))
+    slabs = list(side_by_side(vote, torch.split(reach[0], slab), tracked=False))
+    distance, certain = torch.cat(slabs, dim=1)
+    labels = torch.from_numpy(label((distance > 0).cpu().numpy())[0]).to(distance.device)
+    apart = (labels > 0) & ~torch.isin(labels, labels[certain > 0].unique())
+    distance = torch.where(apart, -spacing, distance)
+    return Hull(origin_world=low, spacing=spacing, distance=distance)
 
 
 def _vote(
@@ -307,8 +313,8 @@ def _vote(
     projected: tuple[Float[Tensor, "view 3"], Float[Tensor, "view 3 3"]],
     reach: tuple[Float[Tensor, " x"], Float[Tensor, " y"], Float[Tensor, " z"]],
     fractions: tuple[float, float],
-) -> Float[Tensor, "x y z"]:
-    """Return the smallest distance to a silhouette after those that may disagree.
+) -> Float[Tensor, "2 x y z"]:
+    """Return the smallest distance to a silhouette after those that may disagree, by both counts.
 
     Args:
         maps: Distances to the silhouettes in pixels, and what they count, one a view.
@@ -339,7 +345,7 @@ def _vote(
             word[view] = counted[0]
         looks = (depth > 0) & (value < _UNSEEN / 1e3)
         distance[view] = torch.where(looks, value * (depth / focal[view]), _UNSEEN)
-    chosen = torch.empty(shape)
-    rows = (one.flatten(1).cpu().numpy() for one in (distance, word))
-    vote(*rows, _UNSEEN, disagreeing, min_seen, chosen.view(-1).numpy())
+    chosen = torch.empty(2, *shape)
+    first, second = (one.flatten(1).cpu().numpy() for one in (distance, word))
+    vote(first, second, _UNSEEN, disagreeing, min_seen, chosen.flatten(1).numpy())
     return chosen.to(distance)

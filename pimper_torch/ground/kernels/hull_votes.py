@@ -11,7 +11,7 @@ Array = NDArray[np.float32]
 _TIE = 1e-4
 
 
-@compiled("void(float32[:,::1], float32[:,::1], float64, float64, float64, float32[::1])")
+@compiled("void(float32[:,::1], float32[:,::1], float64, float64, float64, float32[:,::1])")
 def vote(
     distance: Array,
     word: Array,
@@ -27,7 +27,8 @@ def vote(
         word: How much each view counts.
         disagreeing: Fraction of the views that do not abstain whose words together are outvoted.
         min_seen: Fraction of the views that may not abstain.
-        found: Set; minus infinity where more do.
+        found: Set: by these words, and by equal ones of twice as many views; minus infinity where
+            more abstain.
     """
     views, voxels = distance.shape
     nearest, counts = np.empty(views + 1, np.float32), np.empty(views + 1, np.float32)
@@ -51,10 +52,11 @@ def vote(
             while total - counts[length - 1] > disagreeing * views + _TIE:
                 length -= 1
                 total -= counts[length]
-        found[voxel] = -np.inf
+        found[:, voxel] = -np.inf
         if seen > 0 and seen >= min_seen * views:
             place, outvoted = 0, counts[0]
             while place < length - 1 and outvoted <= disagreeing * seen + _TIE:
                 place += 1
                 outvoted += counts[place]
-            found[voxel] = nearest[place]
+            found[0, voxel] = nearest[place]
+            found[1, voxel] = nearest[min(int(2 * disagreeing * seen + _TIE), length - 1)]

@@ -16,7 +16,6 @@ from pimper_torch.method.silhouettes.reliability import (
     MIN_HELD,
     agreement_of,
     contradictory,
-    repaired,
     silhouettes_of,
 )
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
@@ -130,7 +129,6 @@ def _cut(cues: Cues) -> tuple[Cuts | None, str]:
         cuts = cut_in_iterations(cues)
     if cuts is None:
         return None, "the views' silhouettes have nothing in common"
-    cuts = repaired(cuts)
     return cuts, _doubt(cuts)
 
 

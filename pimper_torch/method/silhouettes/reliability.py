@@ -7,14 +7,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, max_pool2d
 
-from pimper_torch.ground.geometry.opencv import blind_holes, components_of, signed_distance
+from pimper_torch.ground.geometry.opencv import signed_distance
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, scale_intrinsics
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.visual_hull import box_round
 from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, ViewMask
 from pimper_torch.method.silhouettes.cuts import DOUBT_OFF_PLANE, Cuts, doubt_of, is_deep
 from pimper_torch.records import Cameras, Silhouettes, Views
-from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view, zeros
 from pimper_torch.runtime.parallel import side_by_side
 
@@ -30,11 +29,6 @@ MAX_EXPOSED = 0.01
 # Fraction of the object's points that it holds. True masks hold 0.948 and more, masks 20 px too
 # narrow 0.50 to 0.80 (mug, potatoes).
 MIN_HELD = 0.9
-
-# Log radiance below that of a cut's median from which on what the hull denies is a shadow: a third.
-# Of such pieces of armadillo, ogre and spot under a hard lamp, 150 of 161 of shadow are darker, and
-# 14 of 90 of the object.
-_SHADOW = 1.1
 
 
 def agreement_of(cuts: Cuts) -> tuple[Float[Tensor, " view"], ViewMask]:
@@ -57,45 +51,6 @@ def agreement_of(cuts: Cuts) -> tuple[Float[Tensor, " view"], ViewMask]:
     reliable = (both / own.clamp_min(1) >= _MIN_COVERED) & (own > 0)
     reliable &= (cuts.exposed <= MAX_EXPOSED) & (cuts.held >= MIN_HELD)
     return both / either.clamp_min(1), reliable
-
-
-def repaired(cuts: Cuts) -> Cuts:
-    """Repair single cuts that the hull denies: shadows taken in, highlights left out.
-
-    A supporting plane shows shadows, and what is seen through a hole is known there
-    (:func:`~pimper_torch.method.silhouettes.cuts.filled`); without a plane the hull tells of holes.
-    """
-    return _without_shadows(cuts) if cuts.on_plane else _without_holes(cuts)
-
-
-def _without_holes(cuts: Cuts) -> Cuts:
-    """Fill holes deep inside the projection, as a highlight makes them in a single view."""
-
-    def filled(mask: Tensor, margin: Tensor) -> Tensor:
-        # Beside a skull's cheek bone views see through what is half as deep.
-        return mask | blind_holes(mask, ~is_deep(margin / 2.0), 0.2)
-
-    return cuts.replace(masks=by_view(filled, cuts.masks, cuts.margins_px))
-
-
-def _without_shadows(cuts: Cuts) -> Cuts:
-    """Take from the cuts what the hull denies and is dark, as shadows on the plane are.
-
-    They move with the light, so that other views see the plane there. What is as bright as the rest
-    of the object stays: the hull may have lost it, or the camera be misplaced.
-    """
-    far = 1 / 200 * max(cuts.masks.shape[1:])
-
-    def without(mask: Tensor, margin: Tensor, grey: Tensor) -> Tensor:
-        shown = grey[mask & (margin > 0)]
-        if len(shown) == 0:
-            return mask
-        shadow = mask & (margin < -far / 2) & (grey < shown.median() - _SHADOW)
-        return mask & ~components_of(shadow, margin < -far)
-
-    masks = by_view(without, cuts.masks, cuts.margins_px, cuts.grey)
-    leave_out("silhouettes.shadows", cuts.masks & ~masks)
-    return cuts.replace(masks=masks)
 
 
 # Probability where the hull denies by more than two pixels what a cut shows.
