@@ -9,13 +9,17 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from PIL import Image, ImageDraw, ImageOps
+from PIL import Image, ImageDraw
 from skimage.measure import marching_cubes
 
 import pimper_torch
 from pimper_bench.scenes import SceneConfig, render_scene
 
 SKULL = Path(pimper_torch.__file__).parent / "data" / "skull"
+
+# Beside the repository, not part of it: meshes whose y axis is up.
+MESHES = Path(__file__).parents[2] / "shared" / "data" / "meshes"
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 @dataclass(frozen=True)
@@ -48,13 +52,6 @@ def stamped(folder: Path) -> list[str]:
     return []
 
 
-def inverted(folder: Path) -> list[str]:
-    """Exchange object and background in one mask."""
-    path = sorted((folder / "masks").iterdir())[2]
-    ImageOps.invert(Image.open(path).convert("L")).save(path)
-    return [sorted((folder / "photos").iterdir())[2].name]
-
-
 def foreign(folder: Path) -> list[str]:
     """Put a photograph of the skull in the place of one."""
     path = sorted((folder / "photos").iterdir())[2]
@@ -67,6 +64,7 @@ ROUND, TURN = {"path": "handheld"}, {"path": "turntable"}
 PATTERN, PLAIN, GREY = {"table": "patterned"}, {"table": "plain"}, {"albedo": (0.6, 0.6, 0.6)}
 ROOM = {**TURN, "fixed_point_light": True, "fixed_room": True}
 TURNED = {**ROUND, **PATTERN, "elevation_deg": 22.0, "turned_over": True}
+LAMP = {**PATTERN, **GREY, "ambient": 0.03}
 SETS = {
     "mug-arc": Set("mug", 12, 480),
     "jar-arc": Set("jar", 24, 800, PATTERN),
@@ -89,12 +87,17 @@ SETS = {
     "jar-glossy": Set("jar", 16, 640, {"specular": 0.08, "roughness": 0.15}),
     "potatoes-glossy": Set("potatoes", 24, 480, ROUND | {"specular": 0.08, "roughness": 0.2}),
     "skull": Set("skull", 24, 900),
+    **{
+        f"{mesh}-{name}-{seed}": Set(f"{mesh}.obj", 30, 800, {**LAMP, **path, "seed": seed})
+        for mesh in ("spot", "ogre", "armadillo")
+        for name, path in (("arc", {}), ("round", ROUND))
+        for seed in (1, 2)
+    },
     "turned-over": Set("mug", 20, 480, TURNED, ("sfm.moved_object",)),
     "room": Set("mug", 24, 640, ROOM, ("sfm.room",)),
     "room-shifts": Set("mug", 24, 640, ROOM | {"pan_jitter_px": 40.0}, ("sfm.moved_object",)),
     "stamp": Set("mug", 16, 480, ROUND | PATTERN, ("sfm.room",), stamped),
     "foreign": Set("jar", 16, 480, PATTERN, ("sfm.weak_views", "sfm.misplaced"), foreign),
-    "inverted": Set("mug", 16, 480, PATTERN, ("remesh.outside",), inverted, masks=True),
     "mouth": Set("mug", 20, 640, ROUND | PATTERN, ("coarse.seen_through",)),
     "flaps": Set("skull", 8, 900, {}, ("extract.borders", "extract.pieces")),
     "shadows": Set(
@@ -121,6 +124,18 @@ def limbs(path: Path) -> None:
     trimesh.Trimesh(vertices, faces).export(path)
 
 
+def upright(path: Path) -> None:
+    """Write a mesh of that name with its z axis up."""
+    source = MESHES / path.name
+    if source.exists():
+        mesh = trimesh.load(source, process=False)
+        vertices, faces = mesh.vertices, mesh.faces
+    else:
+        with np.load(source.with_suffix(".npz")) as arrays:
+            vertices, faces = arrays["v"], arrays["f"]
+    trimesh.Trimesh(vertices @ UPRIGHT.T, faces, process=False).export(path)
+
+
 def prepared(folder: Path, name: str, tiny: bool) -> tuple[Path, list[str]]:
     """Render a set, spoil it, and list the photographs that should be left out."""
     one, place = SETS[name], folder / "scenes" / (f"{name}-tiny" if tiny else name)
@@ -137,6 +152,9 @@ def prepared(folder: Path, name: str, tiny: bool) -> tuple[Path, list[str]]:
             if scene == "limbs":
                 scene = str(folder / "limbs.ply")
                 limbs(folder / "limbs.ply")
+            elif scene.endswith(".obj"):
+                scene = str(folder / scene)
+                upright(Path(scene))
             height = width * 3 // 4
             settings = {"num_views": views, "width": width, "height": height, **one.settings}
             render_scene(scene, place, SceneConfig(**settings))

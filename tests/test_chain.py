@@ -118,6 +118,11 @@ def height_over_sphere(mesh: Mesh) -> torch.Tensor:
     return inner.norm(dim=1) - 1
 
 
+# Facets of a cap are given, whose sides are flat, and silhouettes show the whole sphere.
+PART_OF_SPHERE = pytest.mark.filterwarnings("ignore:.*the surface (lacks|sticks)")
+
+
+@PART_OF_SPHERE
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_cap_of_a_sphere_is_rounder_after_the_chain_than_its_facets_are(preset):
     scene = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
@@ -129,6 +134,7 @@ def test_a_cap_of_a_sphere_is_rounder_after_the_chain_than_its_facets_are(preset
     assert fine < 0.3 * coarse  # measured 0.15 with paper, 0.24 with default
 
 
+@PART_OF_SPHERE
 @pytest.mark.parametrize("preset", PRESETS)
 def test_one_light_for_all_views_is_told_and_geometry_delivered(preset):
     scene = photographed(Sphere(), 163, target=(0.0, 0.0, 1.0))
@@ -196,6 +202,7 @@ class Spy(nn.Module):
         return found
 
 
+@PART_OF_SPHERE
 def test_a_fold_is_mended_before_a_round_or_the_mesh_builds_on_it():
     scene = photographed(Sphere(), 165, target=(0.0, 0.0, 1.0))
     pimper = small_chain("default", sparse_scene(scene, 150, torch.Generator().manual_seed(17)))

@@ -86,15 +86,15 @@ def test_a_listener_hears_masks_and_places_in_threads_too():
 def test_the_closing_line_names_photographs_and_what_is_more_than_a_twentieth():
     left_out = [
         entry("sfm.missing", 2, 8, ("IMG_1", "IMG_2")),
-        entry("remesh.outside", 500, 1000),
+        entry("remesh.data", 500, 1000),
         entry("warp", 90, 100),
         entry("sfm.doubt", 1, 1),
-        entry("remesh.outside", 60, 1000),
+        entry("remesh.data", 60, 1000),
         entry("extract.spikes", 5, 100),
         entry("extract.borders", 8, 100),
     ]
     assert closing_line(left_out) == (
-        "Left out: IMG_1, IMG_2 (sfm.missing); 6% of the facets (remesh.outside); "
+        "Left out: IMG_1, IMG_2 (sfm.missing); 6% of the facets (remesh.data); "
         "8% of the faces (extract.borders)."
     )
     assert closing_line([entry("warp", 90, 100), entry("sfm.missing", 0, 8)]) == ""

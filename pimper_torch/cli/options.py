@@ -32,7 +32,6 @@ from pimper_torch.runtime.file_names import view_named
 
 
 def _word(kind: type, read: Callable[[str], object], metavar: str) -> Any:  # noqa: ANN401 - tyro's
-    """Make a type that is read from one word, in lists, too."""
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
         metavar=metavar,

@@ -104,3 +104,16 @@ class ContourPoints(Record):
     variance: Float[Tensor, " point"]
     view: Int[Tensor, " point"]
     ray: Int[Tensor, " point"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Explained(Record):
+    """How a surface differs from silhouettes, in fractions of the area of each.
+
+    Attributes:
+        uncovered: Of the silhouette, where the view sees no surface, or its back.
+        outside: Of surface beside it, by how sure the silhouette is there.
+    """
+
+    uncovered: Float[Tensor, " view"]
+    outside: Float[Tensor, " view"]

@@ -60,7 +60,6 @@ GUARDS: dict[str, tuple[What, str]] = {
     "fuse.normals": ("points", "without a photometric normal"),
     "fuse.albedo": ("points", "without albedo"),
     "repair": ("points", "in folds or spikes"),
-    "remesh.outside": ("facets", "outside the hull"),
     "remesh.data": ("facets", "no data"),
     "extract.support": ("faces", "no photograph supports them"),
     "extract.expected_error": ("faces", "expected to be far off"),

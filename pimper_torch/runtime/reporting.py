@@ -18,6 +18,7 @@ from pimper_torch.ground.geometry.topology import boundary_loops
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
+    Explained,
     Mesh,
     PatchSet,
     PatchViews,
@@ -210,6 +211,18 @@ def _(silhouettes: Silhouettes) -> dict[str, int | float]:
     return {
         "reliable_views": int(silhouettes.reliable.sum()),
         "object_fraction": int(masks.count_nonzero()) / max(1, masks.numel()),
+    }
+
+
+@figures.register
+def _(found: Explained) -> dict[str, int | float]:
+    if not len(found.uncovered):
+        return {}
+    return {
+        "covered": 1 - float(found.uncovered.mean()),
+        "sticking_out": float(found.outside.mean()),
+        "least_covered": 1 - float(found.uncovered.max()),
+        "most_sticking_out": float(found.outside.max()),
     }
 
 

@@ -9,9 +9,8 @@ from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
 from pimper_torch.ground.geometry.topology import boundary_vertices
-from pimper_torch.ground.geometry.visual_hull import Hull
 from pimper_torch.method.coarse.coarse_config import RemeshConfig
-from pimper_torch.method.coarse.remesh import remesh, within
+from pimper_torch.method.coarse.remesh import remesh
 from pimper_torch.paper.cloud_filters import delaunay
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh
 from pimper_torch.runtime.errors import InputError
@@ -143,39 +142,6 @@ def test_a_closed_mesh_stays_closed_and_nears_the_ball(generator):
     count = len(coarse.mesh.faces)
     surface = surface_on(coarse, lambda points: normalize(points, dim=1))
     assert len(remesh(coarse, surface, SPACING, config).mesh.faces) == count
-
-
-def test_facets_outside_the_hull_are_dropped(generator):
-    vertices, faces = icosphere(2)
-    coarse = coarse_of(vertices, faces)
-    grid = torch.linspace(-1.5, 1.5, 91).double()
-    x, y, z = torch.meshgrid(grid, grid, grid, indexing="ij")
-    # Half a ball: the plane z = -0.2 cuts it.
-    distance = torch.minimum(1.05 - (x**2 + y**2 + z**2).sqrt(), z + 0.2)
-    hull = Hull(origin_world=grid[:1].expand(3), spacing=grid[1] - grid[0], distance=distance)
-    surface = surface_on(coarse, lambda points: points, spacing=0.1)
-    inside = within(hull, surface, len(faces))
-    high, low = vertices[faces][..., 2].amax(dim=1), vertices[faces][..., 2].amin(dim=1)
-    assert inside[low > -0.2].all()
-    assert not inside[high < -0.35].any()
-    found = remesh(coarse, surface, 0.1, inside=inside)
-    assert len(found.mesh.faces) == int(inside.sum())
-    nowhere = torch.zeros_like(inside)
-    assert len(remesh(coarse, surface, 0.1, inside=nowhere).mesh.faces) == len(faces)
-
-
-def test_a_facet_without_vertices_of_its_own_is_not_outside(generator):
-    vertices, faces = icosphere(1)
-    surface = surface_on(coarse_of(vertices, faces), lambda points: points, spacing=5.0)
-    owners = torch.unique(surface.facet)
-    assert len(owners) < len(faces)  # facets share their corners, and have nothing else here
-    nowhere = Hull(
-        origin_world=vertices.new_full((3,), 5.0),
-        spacing=vertices.new_tensor(0.1),
-        distance=vertices.new_full((3, 3, 3), 1.0),
-    )
-    left = within(nowhere, surface, len(faces)).nonzero()[:, 0]
-    assert set(left.tolist()) == set(range(len(faces))) - set(owners.tolist())
 
 
 def test_only_where_the_residual_is_high_if_nothing_else_is(generator):

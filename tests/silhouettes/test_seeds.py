@@ -18,7 +18,6 @@ from pimper_torch.method.silhouettes.cuts import (
     labels_from_hull,
     labels_from_points,
     not_seen_through,
-    off_level,
     off_plane,
 )
 
@@ -106,14 +105,6 @@ def test_what_is_wide_and_off_the_plane_but_not_the_object_stands_before_it(thin
     assert not found[:, :195].any()
     assert not in_front(thing, agreeing(thing | halo)).any()
     assert not in_front(thing, torch.full((HEIGHT, WIDTH), torch.nan)).any()
-
-
-def test_only_what_no_light_makes_of_the_plane_is_off_its_level(thing):
-    agreement = agreeing(thing)
-    assert not off_level(agreement).any()
-    agreement[100:160, 120:180] = -1
-    assert off_level(agreement)[130, 150]
-    assert not off_level(agreement)[90, 110]
 
 
 @pytest.mark.parametrize("seen_through", [False, True])

@@ -98,7 +98,6 @@ def _chunk(file: DataSetPath) -> ElementTree.Element:
 
 
 def _placed(chunk: ElementTree.Element) -> list[ElementTree.Element]:
-    """Find the cameras that are aligned and switched on."""
     return [
         camera
         for camera in chunk.iterfind("cameras//camera")
@@ -107,7 +106,6 @@ def _placed(chunk: ElementTree.Element) -> list[ElementTree.Element]:
 
 
 def _component(cameras: list[ElementTree.Element], path: Path) -> list[ElementTree.Element]:
-    """Choose the cameras of the component that has most."""
     sizes = Counter(camera.get("component_id") for camera in cameras).most_common()
     if len(sizes) < 2:
         return cameras

@@ -136,7 +136,6 @@ def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
 
 
 def _tell_alpha(opaque: Sequence[Mask | None], names: tuple[str, ...], folder: Path) -> None:
-    """State that transparency is taken for masks."""
     drawn = [name for name, one in zip(names, opaque, strict=True) if one is not None]
     caution(
         f"{folder}: {len(drawn)} of {len(names)} photographs have transparent pixels "

@@ -125,7 +125,6 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
 
 
 def _nearest_values(mesh: Mesh, names: list[str], points: Points) -> dict[str, Tensor]:
-    """Blend fields of a mesh at the places that are nearest to points."""
     places = mesh.vertices_world.detach().cpu().double()
     nearest = NearestSurface(mesh).query(points)
     corners = mesh.faces.cpu()[nearest.face]

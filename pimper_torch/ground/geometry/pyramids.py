@@ -336,7 +336,6 @@ def _prior_maps(
 
 
 def _lights_of(views: Views) -> LightPrior | None:
-    """Put the guessed lights in the order of the views."""
     given = next((prior for prior in views.priors if isinstance(prior, LightPrior)), None)
     if given is None:
         return None

@@ -301,8 +301,10 @@ def _voted(
 
     slabs = list(side_by_side(vote, torch.split(reach[0], slab), tracked=False))
     distance, certain = torch.cat(slabs, dim=1)
-    labels = torch.from_numpy(label((distance > 0).cpu().numpy())[0]).to(distance.device)
-    apart = (labels > 0) & ~torch.isin(labels, labels[certain > 0].unique())
+    found, count = label((distance > 0).cpu().numpy())
+    labels = torch.from_numpy(found).to(distance.device)
+    apart = torch.bincount(labels[certain > 0], minlength=count + 1)[labels] == 0
+    apart &= labels > 0
     distance = torch.where(apart, -spacing, distance)
     return Hull(origin_world=low, spacing=spacing, distance=distance)
 

@@ -27,8 +27,7 @@ def vote(
         word: How much each view counts.
         disagreeing: Fraction of the views that do not abstain whose words together are outvoted.
         min_seen: Fraction of the views that may not abstain.
-        found: Set: by these words, and by equal ones of twice as many views; minus infinity where
-            more abstain.
+        found: Set: by these words, and were all of them 1; minus infinity where more abstain.
     """
     views, voxels = distance.shape
     nearest, counts = np.empty(views + 1, np.float32), np.empty(views + 1, np.float32)
@@ -59,4 +58,4 @@ def vote(
                 place += 1
                 outvoted += counts[place]
             found[0, voxel] = nearest[place]
-            found[1, voxel] = nearest[min(int(2 * disagreeing * seen + _TIE), length - 1)]
+            found[1, voxel] = nearest[min(int(disagreeing * seen + _TIE), length - 1)]

@@ -26,6 +26,7 @@ from pimper_torch.method.photometry.gauge import FixGauge
 from pimper_torch.method.photometry.lights import thinned
 from pimper_torch.method.sfm.poses import one_view_a_pose
 from pimper_torch.method.sfm.reconstruct import Reconstruct
+from pimper_torch.method.silhouettes.explain import explain
 from pimper_torch.method.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.method.silhouettes.trace import TraceContours
 from pimper_torch.method.sweep.sweep import Sweep
@@ -134,6 +135,7 @@ class CoarseToFine(Chain):
         if shown is not scene:
             coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
         self.show(scene, coarse)
+        run(explain, coarse.mesh, contours)
         cameras, surface = scene.cameras, None
         sources = run(prepare, scene.views, self.config.warp.saturation_level)
         photometric = Photometric(self.warp, self.factorize, self.sweep)
@@ -151,6 +153,7 @@ class CoarseToFine(Chain):
                 del sources  # as much memory as the photographs themselves
             surface = run(self.fuse, heights, contours, last, *by_blocks)
             surface = run(self.repair, surface)
+            run(explain, surface, contours, shown.views.names if mesh is None else ())
             yield Step(
                 scale=scale,
                 last=last,

@@ -29,7 +29,9 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 # Stages whose records are made in less time than they are read, and one that keeps its own.
-_NOT_KEPT = ("reconstruct", "contours", "prepare", "decompose", "warp", "gauge", "repair")
+_NOT_KEPT = (
+    *("reconstruct", "contours", "prepare", "decompose", "warp", "gauge", "repair", "explain"),
+)
 
 # Kernels that a stage waits for in an installation's first run.
 _KERNELS: Mapping[str, Sequence[str]] = {
@@ -91,14 +93,12 @@ class Running:
 
 
 def _returns(call: Callable[..., object]) -> type[Record] | None:
-    """Return the record that a call is annotated to return."""
     function = call.forward if isinstance(call, nn.Module) else call
     cls: Any = typing.get_type_hints(function).get("return")
     return cls if isinstance(cls, type) and issubclass(cls, Record) else None
 
 
 def _beside(record: Record, inputs: tuple[object, ...]) -> Record:
-    """Put a record on the device of the inputs."""
     records = [value for value in inputs if isinstance(value, Record)]
     tensors = [leaf for leaf in pytree.tree_leaves(records) if isinstance(leaf, Tensor)]
     return record.to(tensors[0].device) if tensors else record

@@ -256,7 +256,6 @@ def _pixels_per_inverse_depth(
     pixels: Float[Tensor, "other 2 point"],
     inverse_depth: Float[Tensor, "other point"],
 ) -> Float[Tensor, "other point"]:
-    """Differentiate the pixels in a view of other views' points by their inverse depth there."""
     rotation, shift = pixels_from_pixels(level.cameras, view, others)
     shift = shift.to(pixels)[:, :, None]
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)

@@ -168,7 +168,6 @@ def _points_of(
 def _in_source(
     maps: DepthMaps, view: int, source: int, chosen: Mask
 ) -> tuple[Pixels, Bool[Tensor, " point"]]:
-    """Return where a source shows the points of a view's pixels, and whether it does."""
     one = torch.tensor([source], device=chosen.device)
     pairing = pair(maps.level, view, one)
     field, there = maps.inverse_depth[view], maps.agreed > 0

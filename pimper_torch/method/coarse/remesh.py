@@ -7,7 +7,6 @@ from torch import Tensor
 from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.ground.geometry.topology import face_edges, vertex_fans
-from pimper_torch.ground.geometry.visual_hull import Hull
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.shapes import FaceMask, Faces, Vertices
 from pimper_torch.method.coarse import splitting
@@ -37,12 +36,11 @@ class Remesh(Stage):
     def forward(self, swept: SweptPatches, surface: Surface, contours: Contours) -> CoarseMesh:
         """Remesh the patches' coarse mesh to the surface that was reconstructed on it.
 
-        Lengths count in samples of these patches; the residual is their photometry's. Inside the
-        silhouettes' visual hull all facets stay, seen or not: the coarse surface is closed as far
-        as it should be, and facets outside the hull are dropped. Without a hull a facet that two
-        views see has data, illuminated or not.
+        Lengths count in samples of these patches; the residual is their photometry's. Inside a
+        visual hull all facets stay, seen or not: the coarse surface is closed as far as it should
+        be. Without a hull a facet that two views see has data, illuminated or not.
         """
-        patches, mesh = swept.patches, swept.patches.coarse.mesh
+        patches = swept.patches
         residual = surface.information.new_full((patches.num_patches,), torch.nan)
         seen = torch.full_like(residual, contours.confine, dtype=torch.bool)
         for templates, found, heights in zip(
@@ -51,8 +49,6 @@ class Remesh(Stage):
             known = torch.where(found.determined, found.convergence.residual, torch.nan)
             residual[templates.facet] = known.detach().to(residual)
             seen[templates.facet] |= heights.num_views >= 2
-        inside = within(contours.hull, surface, patches.num_patches)
-        leave_out("remesh.outside", ~inside, at=(mesh.vertices_world, mesh.faces))
         return remesh(
             patches.coarse,
             surface,
@@ -60,7 +56,6 @@ class Remesh(Stage):
             self.config,
             residual=residual,
             seen=seen,
-            inside=inside,
         )
 
 
@@ -72,7 +67,6 @@ def remesh(
     *,
     residual: Float[Tensor, " facet"] | None = None,
     seen: Bool[Tensor, " facet"] | None = None,
-    inside: Bool[Tensor, " facet"] | None = None,
 ) -> CoarseMesh:
     """Fit the coarse mesh to the surface that was reconstructed on it.
 
@@ -88,7 +82,6 @@ def remesh(
             settings.
         residual: Of the photometry, one a facet, in any unit; NaN for none.
         seen: True for facets that have data even where the surface has no support.
-        inside: False for facets outside the object, which are dropped even with data.
 
     Returns:
         The new mesh. Its normals are the piecewise linear fit to the surface's; points of the
@@ -107,8 +100,6 @@ def remesh(
     with torch.no_grad():
         kept = _with_data(old, faces, surface, seen, config.max_hole)
         leave_out("remesh.data", ~kept, at=(old, faces))
-        if inside is not None and bool((kept & inside).any()):
-            kept = kept & inside
         severity = _severity(corners, faces, surface, spacing, residual, config)
         # Of the equilateral triangle of each facet's area.
         side = (2 / 3**0.5 * face_normals(corners, faces).norm(dim=1)).sqrt() / spacing
@@ -135,13 +126,6 @@ def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
             f"remesh: the surface lies on {found} facets, the coarse mesh has {count}; needed: the "
             "surface that was made on this mesh. Hand over the two of the same round."
         )
-
-
-def within(hull: Hull, surface: Surface, count: int) -> Bool[Tensor, " {count}"]:
-    """Find facets with a vertex of the surface inside the hull, or without own vertices."""
-    inside = hull.holds(surface.vertices_world.detach())
-    outside = torch.bincount(surface.facet[~inside], minlength=count)
-    return torch.bincount(surface.facet[inside], minlength=count) >= outside.clamp_max(1)
 
 
 def _on_surface(

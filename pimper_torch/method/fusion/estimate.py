@@ -149,7 +149,6 @@ def fuse_like(fused: Fused, kinds: Sequence[Equations], start: PerVertex) -> Fus
 
 
 def _kept(error: SingularSystemError) -> None:
-    """Note that a solve failed."""
     done = "The surface is the one before that solve: of the solve before, or of the patches"
     skipped_solver("fuse", "the fusion", error, done)
 

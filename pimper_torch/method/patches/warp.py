@@ -156,7 +156,6 @@ def occluded(
 
 
 def _nearest_site(sites: int, samples: int) -> Int[Tensor, " sample"]:
-    """Return the site nearest to each of a row of samples."""
     index = torch.arange(sites, dtype=torch.float32)[None, None]
     return interpolate(index, size=samples, mode="nearest-exact")[0, 0].long()
 

@@ -237,7 +237,6 @@ def _newton_matrix(
 def _second_derivatives(
     model: LightModel, lights: Float[Tensor, "view parameter"], weight: Float[Tensor, "sample view"]
 ) -> Float[Tensor, "view parameter parameter"]:
-    """Sum the second derivatives of the samples' shading, by each view's parameters."""
     if model.normals is None:
         return lights.new_zeros(*lights.shape, lights.shape[1])
     with torch.enable_grad():

@@ -189,7 +189,6 @@ def following_fraction(model: SparseModel) -> float:
 
 
 def _same(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the places of the points that are in both lists."""
     here = torch.nonzero(torch.isin(points, others))[:, 0]
     order = others.argsort()
     return here, order[torch.searchsorted(others[order], points[here])]

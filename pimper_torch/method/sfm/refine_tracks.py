@@ -118,7 +118,6 @@ def _renewed(
 def _photographed(
     pixels: Pixels, view: Int[Tensor, " sighting"], cameras: Cameras, model: SparseModel
 ) -> Pixels:
-    """Carry pixels of the undistorted photographs to the photographs."""
     ends = homogeneous(pixels)
     found = torch.empty_like(pixels)
     for index, lens in enumerate(model.lenses):

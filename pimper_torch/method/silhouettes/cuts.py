@@ -110,8 +110,7 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
         cues = cues.relearned(masks)
         masks = _filled(cues, masks)
         abstain = by_view(torch.bitwise_or, unknown, _in_front(cues, masks))
-        likely = by_view(torch.bitwise_or, masks, _likely(cues)).float()
-        seen = _voted(cues, by_view(_abstaining, likely, abstain), voting)
+        seen = _voted(cues, by_view(_abstaining, masks.float(), abstain), voting)
         if seen is None:
             return None
         cues, voting = cues.seen_in(seen), None
@@ -245,17 +244,6 @@ def _cut(
     surrounded &= ~(agreement >= DISPUTED)
     labels = torch.where(is_deep(margin / 2.0) & surrounded, OBJECT, labels)
     return how(cues.pictures.opponent[view], labels, 2)
-
-
-def _likely(cues: Cues) -> Masks:
-    """Find pixels too bright or too dark for the plane, such as the inside of a vessel.
-
-    They count as object in the vote, even where the cuts miss them.
-    """
-    agreement = cues.agreement
-    if agreement is None or not cues.has_points:
-        return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
-    return of_views(lambda view: off_level(agreement[view]), cues.num_views)
 
 
 def _doubted(cues: Cues, masks: Masks) -> ViewMask:
@@ -428,11 +416,6 @@ def not_seen_through(object_px: Pixels, agreement: Map) -> Mask:
     """Find what the object's points surround, where the plane is not seen."""
     height, width = agreement.shape
     return convex_hull_of(object_px, (width, height)) & ~_shows_plane(agreement)
-
-
-def off_level(agreement: Map) -> Mask:
-    """Find what is so bright or dark that light cannot make it so on the plane."""
-    return _grainless(agreement == -1)
 
 
 def filled(cut: Mask, agreement: Map) -> Mask:

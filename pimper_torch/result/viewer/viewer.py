@@ -97,7 +97,6 @@ class Viewer:
         self.server.sleep_forever()
 
     def _repr_html_(self) -> str:
-        """Show the page in a notebook."""
         return f'<iframe src="{self.address}" width="100%" height="600"></iframe>'
 
     def add_cameras(

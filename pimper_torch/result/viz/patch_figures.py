@@ -171,7 +171,6 @@ def by_facet(patches: AnyPatch, name: str) -> Float[Tensor, " face"]:
 
 
 def _panels(patch: AnyPatch) -> list[tuple[str, Tensor]]:
-    """Return titles and rasters, in colour or not."""
     if isinstance(patch, PatchSet):
         (templates,) = patch.buckets
         return [("template's depth", templates.depth[0]), ("inside", templates.inside[0])]

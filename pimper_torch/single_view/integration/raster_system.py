@@ -138,5 +138,4 @@ class RasterSystem:
 
 
 def _times(weight: Float[Tensor, "..."], value: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """Multiply in float64, ignoring values without weight."""
     return weight.double() * torch.where(weight > 0, value, 0).double()

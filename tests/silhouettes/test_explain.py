@@ -1,0 +1,59 @@
+import pytest
+import torch
+
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.method.silhouettes.explain import explain
+from pimper_torch.method.silhouettes.trace import TraceContours
+from pimper_torch.records import Mesh
+from pimper_torch.runtime.errors import PimperWarning
+from tests.silhouettes.shapes import ball, silhouettes_of
+
+NAMES = [f"{number:02}.png" for number in range(20)]
+
+
+@pytest.fixture(scope="module")
+def contours(cameras):
+    return TraceContours()(silhouettes_of(ball, cameras), cameras)
+
+
+def sphere(radius=1.0):
+    vertices, faces = icosphere(4)
+    return Mesh(vertices_world=radius * vertices, faces=faces)
+
+
+def test_the_surface_that_silhouettes_show_explains_them(contours, recwarn):
+    found = explain(sphere(), contours, NAMES)
+    assert found.uncovered.max() < 0.02
+    assert found.outside.max() < 0.02
+    assert not recwarn.list
+
+
+def test_a_hole_is_not_covered_by_the_back_that_is_seen_through_it(contours, cameras):
+    whole = sphere()
+    up = whole.vertices_world[whole.faces].mean(dim=1)[:, 2]
+    with pytest.warns(PimperWarning, match=r"\.png: the surface lacks"):
+        found = explain(whole.replace(faces=whole.faces[up < 0.6]), contours, NAMES)
+    above = cameras.centers_world[:, 2].argmax()
+    assert found.uncovered[above] == found.uncovered.max()
+    assert found.uncovered.max() > 0.1
+    assert found.outside.max() < 0.02
+
+
+def test_what_sticks_out_is_told_with_the_photograph(contours):
+    """A radius larger by a tenth: 0.21 of the area, and perspective adds to it."""
+    with pytest.warns(PimperWarning, match=r"\.png: the surface sticks out by 2\d %|2\d%"):
+        found = explain(sphere(1.1), contours, NAMES)
+    assert 0.19 < found.outside.min() < found.outside.max() < 0.27
+    assert found.uncovered.max() < 0.01
+
+
+def test_unsure_silhouettes_and_views_that_are_not_relied_on_count_less(contours):
+    silhouettes = contours.silhouettes
+    unsure = torch.where(silhouettes.inside < 0.5, 0.25, silhouettes.inside)
+    reliable = silhouettes.reliable.clone()
+    reliable[3:] = False
+    known = explain(sphere(1.1), contours).outside
+    some = silhouettes.replace(inside=unsure, reliable=reliable)
+    found = explain(sphere(1.1), contours.replace(silhouettes=some)).outside
+    assert len(found) == 3
+    assert torch.allclose(found, known[:3] / 2, rtol=0.05)
