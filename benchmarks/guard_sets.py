@@ -99,7 +99,7 @@ SETS = {
     "stamp": Set("mug", 16, 480, ROUND | PATTERN, ("sfm.room",), stamped),
     "foreign": Set("jar", 16, 480, PATTERN, ("sfm.weak_views", "sfm.misplaced"), foreign),
     "mouth": Set("mug", 20, 640, ROUND | PATTERN, ("coarse.seen_through",)),
-    "flaps": Set("skull", 8, 900, {}, ("extract.borders", "extract.pieces")),
+    "flaps": Set("skull", 8, 900, {}, ("extract.borders", "coarse.fringes", "extract.pieces")),
     "shadows": Set(
         "limbs", 24, 480, ROUND | PATTERN, ("silhouettes.shadows", "photometry.shadows")
     ),

@@ -44,6 +44,7 @@ GUARDS: dict[str, tuple[What, str]] = {
     "coarse.far": ("faces", "far from points"),
     "coarse.seen_through": ("faces", "views look through them"),
     "coarse.unseen": ("faces", "no view sees them"),
+    "coarse.fringes": ("faces", "narrow strips"),
     "coarse.components": ("faces", "small components"),
     "coarse.crowded": ("facets", "a third at an edge"),
     "coarse.pieces": ("facets", "small components"),

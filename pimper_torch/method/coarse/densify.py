@@ -291,7 +291,6 @@ def _seen_from(maps: DepthMaps, source: int, view: int) -> Map:
 
 
 def _splatted(pixels: Pixels, values: Float[Tensor, " point"], like: Map) -> Map:
-    """Write values into the pixels of an image: the largest of each, 0 for none."""
     height, width = like.shape
     column, row = pixels.floor().long().unbind(dim=1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)

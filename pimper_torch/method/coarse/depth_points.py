@@ -132,7 +132,6 @@ def _distance(cameras: Cameras, view: int) -> Scalar:
 def _framed(
     points: Points, cameras: Cameras, views: Views
 ) -> tuple[Bool[Tensor, "point view"], Bool[Tensor, "point view"]]:
-    """Find which views have points in their frames, and which show them in their masks."""
     framed, shown = [], []
     for view in range(cameras.num_views):
         pixels, depth = project(points, cameras.cam_from_world[view], cameras.intrinsics[view])

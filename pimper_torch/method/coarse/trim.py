@@ -238,6 +238,16 @@ def seen_surface(
     holes = enclosed_holes(vertices, faces, kept, MAX_UNSEEN * area)
     kept = kept | (holes & ~topology.connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
+    # Narrow is what a morphological opening removes: small or unsupported spurs of the border.
+    rings, count = int(HOLE_PX / (2 * CELL_PX)), len(vertices)
+    core = ~topology.dilated(faces, ~kept, rings, count)
+    strips = kept & ~topology.dilated(faces, core, rings, count)
+    label = topology.face_components(faces, strips)
+    areas = surfaces.component_areas(vertices, faces, label)
+    borne = surfaces.component_areas(vertices, faces, label, support != Support.NOTHING)
+    strips &= (areas < small) | (borne < areas / 2)
+    leave_out("coarse.fringes", strips, at=(vertices, faces))
+    kept &= ~strips
     (chosen,) = torch.nonzero(kept, as_tuple=True)
     stays = supported_components(vertices, faces[chosen], known[chosen], fraction)
     leave_out("coarse.components", ~stays, at=(vertices, faces[chosen]))

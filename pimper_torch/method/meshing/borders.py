@@ -95,7 +95,6 @@ def _near(points: Points, others: Float[Tensor, "other 3"], reach: float) -> Boo
 
 
 def _long_borders(vertices: Vertices, faces: Faces, bare: topology.Pairs, length: float) -> Points:
-    """List the vertices of borders that are no small holes."""
     edges, loop = topology.boundary_loops(faces, bare)
     sides = (vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1)
     around = torch.bincount(loop, sides)

@@ -243,7 +243,6 @@ class Warp(Stage):
         templates: Templates,
         dark_level: float,
     ) -> Observations:
-        """Resample views on a bucket, without occlusion; ``rows`` of the sources are theirs."""
         images = sources.images.finest
         if images.dtype == torch.float32 and compiled_for(images.detach()):
             steepest = math.cos(math.radians(self.config.max_tilt_deg))
@@ -316,5 +315,4 @@ class Warp(Stage):
 def _maps_of(
     sources: Sources, rows: Int[Tensor, " view"]
 ) -> list[tuple[PriorMaps, Int[Tensor, " map"]]]:
-    """List the guessed maps of some views, where there are any, and their rows."""
     return [(maps, own) for maps, own in (each.of(rows) for each in sources.priors) if len(own)]

@@ -259,7 +259,6 @@ def _by_deviation(
 def _change_of(
     deviation_slope: Float[Tensor, "patch view sample"], hessian: Hessian, step: FactorStep
 ) -> Float[Tensor, " patch"]:
-    """Return the directional derivative of the deviation along a step."""
     samples = step.lights @ hessian.shading
     samples = samples + hessian.lights @ combination(hessian.columns, step.along_tangents)
     return -(deviation_slope * samples).sum(dim=(1, 2))
@@ -357,7 +356,6 @@ def _apply_mixed(
 def _apply_mixed_transpose(
     hessian: Hessian, step: Float[Tensor, "patch view rank"]
 ) -> Float[Tensor, "patch tangent sample"]:
-    """Apply its transpose to steps of the lights."""
     ambient = hessian.lights.mT @ (hessian.loss_curvature * (step @ hessian.shading)) - (
         step.mT @ hessian.weighted_residual
     )

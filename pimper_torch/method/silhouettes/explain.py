@@ -53,8 +53,7 @@ def explain(
             caution(
                 f"{worst}: the surface {what} {float(found.max()):.0%} of the silhouette's area, "
                 f"and {int((found > most).sum())} of {len(views)} views see more than "
-                f"{most:.0%}. Look at the silhouette of that photograph (overview.png); masks "
-                "(`--masks`) replace it.",
+                f"{most:.0%}. Look at its silhouette in overview.png; `--masks` replaces it.",
                 stacklevel=2,
             )
     return Explained(uncovered=uncovered, outside=outside)

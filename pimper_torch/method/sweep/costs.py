@@ -336,7 +336,6 @@ def _footprint(
 
 
 def _look_up(given: Hypotheses, samples: _Samples) -> Float[Tensor, "sample chosen hypothesis"]:
-    """Look every sample up at all heights in its chosen views."""
     spacing = given.templates.spacing[samples.patch]
     moves = STEP * spacing[:, None] * given.ladder.to(spacing)
     radiance = moves.new_zeros(*samples.chosen.shape, moves.shape[1]).flatten(0, 1)
