@@ -164,7 +164,6 @@ def _on_surface(
 def _with_data(
     vertices: Vertices, faces: Faces, surface: Surface, seen: FaceMask | None, max_hole: float
 ) -> FaceMask:
-    """Find facets with data, and small holes that those enclose."""
     everything = torch.ones_like(faces[:, 0], dtype=torch.bool)
     supported = surface.supported
     inner = (surface.barycentric >= _ON_EDGE).all(dim=1)
@@ -194,7 +193,6 @@ def _severity(
     residual: Float[Tensor, " face"] | None,
     config: RemeshConfig,
 ) -> Float[Tensor, " face"]:
-    """Return the largest ratio of each facet's measures to their limits."""
     limit = config.max_departure * spacing
     worst = departures(corners, faces, surface) / limit
     spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg

@@ -177,7 +177,6 @@ def _without_shadow(mask: Mask, margin: Map, grey: Map) -> Mask:
 
 
 def _filled(cues: Cues, masks: Masks) -> Masks:
-    """Fill holes that the plane is not seen through."""
     agreement = cues.agreement
     if agreement is None:
         return masks

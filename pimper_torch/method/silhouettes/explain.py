@@ -30,11 +30,10 @@ def explain(
     cameras, silhouettes = contours.cameras.to(vertices.dtype), contours.silhouettes
 
     def of_view(view: int) -> Tensor:
-        inside = silhouettes.inside[view]
         width, height = cameras.sizes_px[view].tolist()
         step = max(1, round(math.sqrt(width * height / 20_000)))
         rows, columns = (torch.arange(step // 2, side, step) for side in (height, width))
-        inside = inside[rows][:, columns].to(vertices)
+        inside = silhouettes.inside[view, rows][:, columns].to(vertices)
         pixels = torch.cartesian_prod(columns, rows).to(vertices) + 0.5
         rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
         face = caster.cast(cameras.centers_world[view], rays).face

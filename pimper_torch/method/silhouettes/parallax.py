@@ -277,7 +277,6 @@ def _textured(grey: Map, hidden: Mask, longer: int) -> Map:
 
 
 def _agreement(one: Map, common: Map, spread: Map, longer: int) -> Map:
-    """Compare a view with the plane's texture window by window."""
     known = common.isfinite() & spread.isfinite()
     common, spread = torch.where(known, common, 0), torch.where(known, spread, 0)
     layers = [one, common, one * one, common * common, one * common, spread, known.to(one)]
