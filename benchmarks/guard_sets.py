@@ -36,7 +36,6 @@ class Set:
     settings: dict[str, Any] = field(default_factory=dict)
     guards: tuple[str, ...] = ()
     spoil: Callable[[Path], list[str]] | None = None
-    masks: bool = False
 
 
 def stamped(folder: Path) -> list[str]:

@@ -27,7 +27,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from guard_sets import SETS, Set, prepared
+from guard_sets import SETS, prepared
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -182,7 +182,7 @@ def shown_by(place: Path, capture: Capture, names: tuple[str, ...]) -> Tensor | 
     return None if masks is None else masks[rows]
 
 
-def run(place: Path, spoilt: list[str], one: Set, preset: str, without: str) -> dict[str, Any]:
+def run(place: Path, spoilt: list[str], preset: str, without: str) -> dict[str, Any]:
     """Reconstruct a set once, and count what every guard took, and how much of it was right."""
     heard, result, failure = Heard(), None, ""
     chain = load_chain(preset, CHANGES.get(without, {}))
@@ -192,9 +192,7 @@ def run(place: Path, spoilt: list[str], one: Set, preset: str, without: str) -> 
             stack.enter_context(patch(f"pimper_torch.method.{target}", replacement))
         stack.enter_context(listening(heard))
         try:
-            result = chain(
-                load_views(place / "photos", masks=place / "masks" if one.masks else None)
-            )
+            result = chain(load_views(place / "photos"))
         except (PimperError, RuntimeError, IndexError, ValueError) as error:  # without a guard
             failure = f"{type(error).__name__}: {str(error)[:200]}"
     seconds = time.perf_counter() - began
@@ -286,7 +284,7 @@ def main() -> None:
                 path = results / f"{name}--{preset}--{without or 'all'}.json"
                 if not path.exists() and not options.table:
                     place, spoilt = prepared(options.folder, name, options.tiny)
-                    each = run(place, spoilt, SETS[name], preset, without)
+                    each = run(place, spoilt, preset, without)
                     path.with_suffix(".part").write_text(json.dumps(each))
                     path.with_suffix(".part").rename(path)
                     say(f"{name} {preset} {without}: {told(each)}")

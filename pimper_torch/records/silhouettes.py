@@ -23,7 +23,8 @@ class Silhouettes(Record):
     """The object's silhouette in every view.
 
     Attributes:
-        inside: Probability that the pixel's ray meets the object; 0 in the padding.
+        inside: Probability that the pixel's ray meets the object; 0 in the padding. Below a half
+            it weighs the view's denial in the visual hull.
         reliable: True for views whose silhouette agrees with the hull of the others.
         source: ``masks`` that a person gave, ``found`` in the photographs, or ``everything``: no
             view constrains the object.

@@ -29,7 +29,7 @@ GUARDS: dict[str, tuple[What, str]] = {
     "sfm.sound_views": ("photographs", "show nothing or stand nowhere"),
     "silhouettes.doubt": ("doubt", "silhouettes agree too little"),
     "silhouettes.by_series": ("doubt", "silhouettes of a series tell nothing"),
-    "silhouettes.shadows": ("pixels", "the hull denies them"),
+    "silhouettes.shadows": ("pixels", "dark, and the hull denies them"),
     "silhouettes.unreliable": ("photographs", "their silhouette contradicts the others"),
     "silhouettes.empty": ("photographs", "their silhouette is empty"),
     "contours.hull": ("doubt", "silhouettes have no place in common"),

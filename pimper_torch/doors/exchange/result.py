@@ -178,5 +178,6 @@ def _left_out(summary: Mapping[str, object], guards: Sequence[str]) -> set[objec
 
 
 def _reference(folder: Path, summary: Mapping[str, object], names: tuple[str, ...]) -> str:
+    """Return the reference view; the first where nothing names one."""
     named = summary.get("reference") or read_reference(folder / "depth.npz")
     return str(named) if named in names else names[0]

@@ -120,6 +120,7 @@ class Patch(NamedTuple):
 def _views_that_count(
     given: Floats, anchor: Floats, regularization: Floats, lights: Floats
 ) -> Integers:
+    """List the views with data, and those whose light is not at its anchor."""
     found = np.empty(len(given), np.int64)
     count = 0
     for f in range(len(given)):

@@ -247,5 +247,6 @@ def cauchy_weights(residual: Scalars, scale: Float[Tensor, "*#batch"]) -> Scalar
 
 
 def _relative_square(residual: Scalars, scale: Float[Tensor, "*#batch"]) -> Scalars:
+    """Return squared residuals in units of the squared scale; 0 where the scale is 0."""
     relative = torch.where(scale > 0, residual / torch.where(scale > 0, scale, 1), 0)
     return relative * relative

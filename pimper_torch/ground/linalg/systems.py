@@ -116,6 +116,7 @@ def solve_compressed(
 
 
 def _by_factor(what: str, error: SingularSystemError) -> None:
+    """Note that multigrid did not converge."""
     done = "It is solved by a Cholesky factor instead, which takes more time and memory"
     skipped_solver("linalg", what, error, done)
 

@@ -243,6 +243,7 @@ class Warp(Stage):
         templates: Templates,
         dark_level: float,
     ) -> Observations:
+        """Resample views on a bucket, without occlusion; ``rows`` of the sources are theirs."""
         images = sources.images.finest
         if images.dtype == torch.float32 and compiled_for(images.detach()):
             steepest = math.cos(math.radians(self.config.max_tilt_deg))

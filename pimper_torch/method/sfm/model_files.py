@@ -215,6 +215,7 @@ def _sound(image: _Image, lens: Lens | None) -> bool:
 def _with_points(
     model: SparseModel, images: list[_Image], points: list[_Point], folder: Path
 ) -> SparseModel:
+    """Take the points that are finite, and what images observe of them."""
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     finite = (np.abs(xyz) < _MAX_COORDINATE).all(axis=1)
     number = np.where(finite, np.cumsum(finite) - 1, -1)

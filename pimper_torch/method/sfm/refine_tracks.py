@@ -94,6 +94,7 @@ def _sighted(views: Views, model: SparseModel) -> tuple[tracks.TrackObservations
 def _renewed(
     model: SparseModel, found: tracks.TrackObservations, cameras: Cameras
 ) -> tuple[SparseModel, Bool[Tensor, " renewed"]]:
+    """Replace features by track observations; tell which observations are track observations."""
     often = torch.bincount(found.point, minlength=len(model.points_world)) >= 3
     kept = often[found.point]
     point, view = found.point[kept], found.view[kept]
