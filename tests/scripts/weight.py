@@ -29,7 +29,7 @@ LINES = {
     "doors/size": 1092,
     "ground": 26,
     "ground/geometry": 3591,
-    "ground/kernels": 5134,
+    "ground/kernels": 5133,
     "ground/linalg": 1359,
     "ground/radiometry": 484,
     "method": 1,

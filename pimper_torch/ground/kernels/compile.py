@@ -51,7 +51,7 @@ _FIRST = (*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE)
 ROWS = (tuple(name for name in _FIRST if name not in _SECOND), _SECOND)
 
 # Of gradients alone: compiled where a run first asks for them.
-GRADIENTS = ("factor_adjoint", "lookup_adjoint", "resampling_adjoint", "sweep_adjoint")
+GRADIENTS = ("factor_adjoint", "resampling_adjoint", "sweep_adjoint")
 
 # Relaxations of IEEE arithmetic for vectorized sums: reordering, fused and reciprocal operations.
 # NaN and infinity keep their meaning.

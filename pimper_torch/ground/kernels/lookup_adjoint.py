@@ -11,11 +11,7 @@ from pimper_torch.ground.kernels.lookup import blended_level, corners
 Array = NDArray[Any]
 
 
-@compiled(
-    "Tuple((float64, float64, float64))(float32[:,::1], float32[:,::1], float32[:,::1],"
-    "float32[:,::1], int64[:,::1], float64[:,::1], int64, float64, float64, float64, float32[::1],"
-    "boolean)"
-)
+@compiled(fast=True)
 def spread(
     finest: Array,
     coarser: Array,

@@ -85,6 +85,9 @@ def _inconsistency(
         The derivative by ``per_scale``.
     """
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    if on_cost == 0:
+        on_radiance[step] = 0
+        return 0.0
     for view in range(count):
         ratios[view] = radiance[step, view] * per_shading[view]
     first = np.float32(_lower_median(ratios, order, count))
