@@ -15,6 +15,7 @@ exponent, and does not shift the minimum.
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize_scalar
@@ -35,73 +36,67 @@ from pimper_torch.single_view.factorization import low_rank
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class EncodedMatrix(Record):
-    """Encoded values of the same samples in several views.
+class EncodedFit(Record):
+    """Encoded values of the same samples in several views, and light fitted to them.
 
     Attributes:
         scale: Of Cauchy's loss; 0 is least squares.
+        predicted: By the fit; at first the values themselves.
+        weight: Of each entry, less for outliers; 0 where not used.
+        left: Left factor.
     """
 
     encoded: Float[Tensor, "view sample"]
-    seen: Bool[Tensor, "view sample"]
     used: Bool[Tensor, "view sample"]
     scale: float
-    rank: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class EncodedFit(Record):
-    """The fit under one response.
-
-    Attributes:
-        loss: Of each entry; 0 where not used.
-        weight: Of each entry, less for outliers.
-        left: Left factor, the initial value for the next response.
-    """
-
     predicted: Float[Tensor, "view sample"]
-    loss: Float[Tensor, "view sample"]
     weight: Float[Tensor, "view sample"]
     left: Float[Tensor, "view rank"]
 
+    @property
+    def loss(self) -> Float[Tensor, "view sample"]:
+        """Of each entry; 0 where not used."""
+        square = (self.used * (self.encoded - self.predicted)).square()
+        return self.scale**2 * (square / self.scale**2).log1p() if self.scale else square
 
-def fit_encoded(
-    problem: EncodedMatrix, response: Response, start: EncodedFit | None, iterations: int = 1
-) -> EncodedFit:
+    @property
+    def freedom(self) -> int:
+        """The residual degrees of freedom."""
+        lines = sum(int(self.used.any(dim=axis).sum()) for axis in (0, 1))
+        rank = self.left.shape[1]
+        return int(self.used.sum()) - rank * (lines - rank)
+
+    @property
+    def spread(self) -> float:
+        """The residuals' robust standard deviation, corrected for the degrees of freedom."""
+        residual = (self.encoded - self.predicted)[self.used]
+        size = float(robust_deviation(residual, residual.isfinite()))
+        return size * (len(residual) / max(self.freedom, 1)) ** 0.5
+
+
+def fit_encoded(start: EncodedFit, response: Response, iterations: int = 1) -> EncodedFit:
     """Fit first-order light to encoded values through a response; constant to autograd.
 
-    The encoded residual is linearized, first about the values or a former fit, then about the
-    fit: it is then least squares in radiance, weighted by the square of the response's slope.
+    The encoded residual is linearized, first about the start, the fit of a similar response, then
+    about the fit: it is then least squares in radiance, weighted by the square of the response's
+    slope.
 
     Args:
-        start: Fit of a similar response; ``None`` starts from the values.
         iterations: Further linearizations about the fit, with outlier weights.
     """
-    mask = problem.used.double()
-    about, weight = torch.where(problem.used, problem.encoded, 0.5), mask
-    left: Tensor | None = None
-    if start is not None:
-        about, weight, left = start.predicted, mask * start.weight, start.left
+    about, weight, left = start.predicted, start.used * start.weight, start.left
     for iteration in range(iterations + 1):
         linear, rate = with_slope(response.linear_from_encoded, about)
-        target = linear + rate * (problem.encoded - about)
+        target = linear + rate * (start.encoded - about)
         heavy = weight / rate.square()
-        heavy = heavy / heavy.max()
-        if left is None:
-            guess = low_rank.brightness_guess(target, mask)[None]
-            left = low_rank.singular_left(target[None], mask[None], problem.rank, guess, 29)[0]
-        matrix = low_rank.low_rank_problem(target[None], heavy[None], left[None])
+        matrix = low_rank.low_rank_problem(target[None], (heavy / heavy.max())[None], left[None])
         solved = solve_variable_projection(matrix, 30, 1e-7)
         left = solved.lights[0]
         about = response.encoded_from_linear(left @ solved.shading[0]).clamp_min(0.02)
-        residual = mask * (problem.encoded - about)
-        if problem.scale and iteration < iterations:
-            weight = mask * cauchy_weights(residual, torch.tensor(problem.scale).to(residual))
-    loss = residual.square()
-    if problem.scale:
-        loss = problem.scale**2 * torch.log1p(loss / problem.scale**2)
-    assert left is not None, "there is one round at least"
-    return EncodedFit(predicted=about, loss=loss, weight=weight, left=left)
+        if iteration < iterations:
+            scale = torch.tensor(start.scale).to(about)
+            weight = start.used * cauchy_weights(start.encoded - about, scale)
+    return start.replace(predicted=about, weight=weight, left=left)
 
 
 def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
@@ -109,20 +104,6 @@ def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view s
     for _ in range(2):
         used = used & (used.sum(dim=0) > rank) & (used.sum(dim=1, keepdim=True) > 2 * rank)
     return used
-
-
-def freedom(used: Bool[Tensor, "view sample"], rank: int) -> int:
-    """Count the residual degrees of freedom."""
-    views, samples = (int(used.any(dim=axis).sum()) for axis in (1, 0))
-    return int(used.sum()) - rank * (views + samples - rank)
-
-
-def residual_spread(problem: EncodedMatrix, fit: EncodedFit) -> float:
-    """Return the residuals' robust standard deviation, corrected for the degrees of freedom."""
-    residual = (problem.encoded - fit.predicted)[problem.used]
-    size = float(robust_deviation(residual, residual.isfinite()))
-    free = max(freedom(problem.used, problem.rank), 1)
-    return size * (int(problem.used.sum()) / free) ** 0.5
 
 
 # Range of the search, a choice: it holds all curves in use; 1 is linear.
@@ -215,27 +196,19 @@ def estimate_gamma(
             "scale, or `seen` false for these."
         )
     with torch.no_grad():
-        problem = _problem(encoded, seen, rank)
+        fit = _sampled(encoded, seen, rank)
         for _ in range(2):  # the first still starts from a selection by noisy values
-            problem = _chosen_by_fit(problem, _grid_search(problem, iterations=0)[1].predicted)
-        found = _consistent_minimum(problem)
-        residual, linear, srgb = (
-            residual_spread(found.problem, fit)
-            for fit in (
-                found.fit,
-                fit_encoded(found.problem, Linear(), found.fit, 2),
-                fit_encoded(found.problem, Srgb(), found.fit, 2),
-            )
-        )
-        sure = found.inner and found.error < _MAX_UNCERTAIN * found.gamma
+            fit = _chosen_by_fit(_grid_search(fit, iterations=0)[1])
+        gamma, error, fit = _consistent_minimum(fit)
+        sure = _inside_range(gamma) and error < _MAX_UNCERTAIN * gamma
         return GammaEstimate(
-            gamma=found.gamma,
-            standard_error=found.error,
-            determined=sure and residual < _MAX_RESIDUAL,
-            residual=residual,
-            residual_linear=linear,
-            residual_srgb=srgb,
-            entries=int(found.problem.used.sum()),
+            gamma=gamma,
+            standard_error=error,
+            determined=sure and fit.spread < _MAX_RESIDUAL,
+            residual=fit.spread,
+            residual_linear=fit_encoded(fit, Linear(), 2).spread,
+            residual_srgb=fit_encoded(fit, Srgb(), 2).spread,
+            entries=int(fit.used.sum()),
         )
 
 
@@ -264,24 +237,9 @@ def gamma_of_photographs(views: Views, *, mask: Mask | None = None, rank: int = 
     return estimate_gamma(encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Minimum(Record):
-    """The minimum of the loss over gamma, and its standard error."""
-
-    problem: EncodedMatrix
-    gamma: float
-    fit: EncodedFit
-    error: float
-
-    @property
-    def inner(self) -> bool:
-        """Whether it is not at an end of the range."""
-        return MIN_GAMMA * 1.01 < self.gamma < MAX_GAMMA / 1.01
-
-
-def _problem(
+def _sampled(
     encoded: Float[Tensor, "view sample"], seen: Bool[Tensor, "view sample"], rank: int
-) -> EncodedMatrix:
+) -> EncodedFit:
     """Subsample, and use entries that are neither dark nor saturated."""
     used = enough(seen & (encoded > _DARK) & (encoded < SATURATED), rank)
     views, samples = used.any(dim=1), used.any(dim=0).nonzero().flatten()
@@ -294,95 +252,99 @@ def _problem(
     count = min(300, len(samples))
     spaced = torch.linspace(0, len(samples) - 1, count, dtype=torch.float64).round().long()
     chosen = samples[spaced.to(samples.device)]
-    return EncodedMatrix(
-        encoded=torch.where(seen, encoded, 0)[views][:, chosen].double(),
-        seen=seen[views][:, chosen],
-        used=enough(used[views][:, chosen], rank),
-        scale=0.0,
-        rank=rank,
+    used = enough(used[views][:, chosen], rank)
+    return _start(torch.where(seen, encoded, 0)[views][:, chosen].double(), used, rank, 0.0)
+
+
+def _start(
+    encoded: Float[Tensor, "view sample"],
+    used: Bool[Tensor, "view sample"],
+    rank: int,
+    scale: float,
+) -> EncodedFit:
+    """Start from the values, with the left factor under the least gamma."""
+    mask, about = used.double(), torch.where(used, encoded, 0.5)
+    radiance = Gamma(exponent=MIN_GAMMA).linear_from_encoded(about)
+    guess = low_rank.brightness_guess(radiance, mask)[None]
+    left = low_rank.singular_left(radiance[None], mask[None], rank, guess, 29)[0]
+    return EncodedFit(
+        encoded=encoded, used=used, scale=scale, predicted=about, weight=mask, left=left
     )
 
 
-def _chosen_by_fit(
-    problem: EncodedMatrix, predicted: Float[Tensor, "view sample"]
-) -> EncodedMatrix:
-    """Use entries that the fit predicts to be lit and not saturated, with outlier weights."""
-    encoded = problem.encoded
-    known = problem.seen & (problem.used.sum(dim=0) > problem.rank)
-    lit = (predicted > _DARK) & (encoded > _DARK / 2)  # far below: a cast shadow
+def _chosen_by_fit(fit: EncodedFit) -> EncodedFit:
+    """Start on entries that a fit predicts to be lit and not saturated, with outlier weights."""
+    encoded, predicted, rank = fit.encoded, fit.predicted, fit.left.shape[1]
+    lit = (predicted > _DARK) & (encoded > _DARK / 2)  # far below: a cast shadow; 0: missing
     lit = lit & (predicted < SATURATED - _DARK / 2) & (encoded < SATURATED)
-    used = enough(known & lit, problem.rank)
-    if int(used.any(dim=0).sum()) <= 4 * problem.rank:
-        used = problem.used
+    used = enough(lit & (fit.used.sum(dim=0) > rank), rank)
+    if int(used.any(dim=0).sum()) <= 4 * rank:
+        used = fit.used
     residual = (encoded - predicted)[used]
     scale = CAUCHY_TUNING * float(robust_deviation(residual, residual.isfinite()))
-    return problem.replace(used=used, scale=max(scale, _MIN_SCALE))
+    return _start(encoded, used, rank, max(scale, _MIN_SCALE))
 
 
-def _grid_search(problem: EncodedMatrix, iterations: int) -> tuple[float, EncodedFit]:
-    trials = torch.logspace(
-        math.log10(MIN_GAMMA), math.log10(MAX_GAMMA), _TRIALS, dtype=torch.float64
-    )
-    fits: list[EncodedFit] = []
-    for exponent in trials.tolist():
-        former = fits[-1] if fits else None
-        fits.append(fit_encoded(problem, Gamma(exponent=exponent), former, iterations))
-    losses = [float(fit.loss.sum()) for fit in fits]
-    best = losses.index(min(losses))
-    return float(trials[best]), fits[best]
+def _grid_search(fit: EncodedFit, iterations: int) -> tuple[float, EncodedFit]:
+    found = []
+    for gamma in np.geomspace(MIN_GAMMA, MAX_GAMMA, _TRIALS).tolist():
+        fit = fit_encoded(fit, Gamma(exponent=gamma), iterations)
+        found.append((gamma, fit))
+    return min(found, key=lambda one: float(one[1].loss.sum()))
 
 
-def _minimise(problem: EncodedMatrix, start: EncodedFit, low: float, high: float) -> _Minimum:
-    r"""Find the minimum, with gamma's sandwich standard error.
+def _inside_range(gamma: float) -> bool:
+    return MIN_GAMMA * 1.01 < gamma < MAX_GAMMA / 1.01
+
+
+def _minimise(fit: EncodedFit, low: float, high: float) -> tuple[float, float, EncodedFit]:
+    r"""Find the gamma of least loss, its sandwich standard error, and the fit there.
 
     With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
     second derivative of the whole, the variance is :math:`\sum_k s_k^2 / h^2`, over samples, or
     over views if that is larger; it needs no model of the noise. Infinite where the loss has next
     to no curvature.
     """
-    fit = start
 
     def loss(logarithm: float) -> float:
         nonlocal fit
-        fit = fit_encoded(problem, Gamma(exponent=math.exp(logarithm)), fit)
+        fit = fit_encoded(fit, Gamma(exponent=math.exp(logarithm)))
         return float(fit.loss.sum())
 
     bounds = (math.log(max(low, MIN_GAMMA)), math.log(min(high, MAX_GAMMA)))
     found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-4})
     gamma = math.exp(found.x)
-    fit = fit_encoded(problem, Gamma(exponent=gamma), fit)
-    step = 0.02 * gamma
-    below = fit_encoded(problem, Gamma(exponent=gamma - step), fit)
-    above = fit_encoded(problem, Gamma(exponent=gamma + step), fit)
-    centre = float(fit.loss.sum())
-    curvature = (float(below.loss.sum()) + float(above.loss.sum()) - 2 * centre) / step**2
-    slope = (above.loss - below.loss) / (2 * step)
+    fit, step = fit_encoded(fit, Gamma(exponent=gamma)), 0.02 * gamma
+    below, above = (
+        fit_encoded(fit, Gamma(exponent=one)).loss for one in (gamma - step, gamma + step)
+    )
+    curvature = float((below + above - 2 * fit.loss).sum()) / step**2
+    slope = (above - below) / (2 * step)
     noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
     # On data without noise everything but the curvature is rounding.
-    curved = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(problem.used.sum())
-    error = noise / curvature if curved else math.inf
-    return _Minimum(problem=problem, gamma=gamma, fit=fit, error=error)
+    curved = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(fit.used.sum())
+    return gamma, noise / curvature if curved else math.inf, fit
 
 
-def _consistent_minimum(problem: EncodedMatrix) -> _Minimum:
+def _consistent_minimum(fit: EncodedFit) -> tuple[float, float, EncodedFit]:
     """Estimate from all entries, or from the brighter ones where theirs differs significantly.
 
     Ambient light in attached shadows is not first-order: it biases the estimate from all entries.
     """
-    best, fit = _grid_search(problem, 1)
+    best, fit = _grid_search(fit, 1)
     step = (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
-    found = [_minimise(problem, fit, best / step, best * step)]
-    predicted = found[0].fit.predicted
+    found = [_minimise(fit, best / step, best * step)]
+    fit = found[0][2]
     for fraction in _DARKEST_FRACTIONS:
-        level = predicted[problem.used].quantile(fraction)
-        used = enough(problem.used & (predicted > level), problem.rank)
-        if freedom(used, problem.rank) < 100:  # no reliable standard error
+        level = fit.predicted[fit.used].quantile(fraction)
+        used = enough(fit.used & (fit.predicted > level), fit.left.shape[1])
+        if (brighter := fit.replace(used=used)).freedom < 100:  # no reliable standard error
             break
-        found.append(_minimise(problem.replace(used=used), found[0].fit, MIN_GAMMA, MAX_GAMMA))
+        found.append(_minimise(brighter, MIN_GAMMA, MAX_GAMMA))
     while any(
-        abs(one.gamma - found[0].gamma) > _MAX_ERRORS * one.error + 1e-3 * found[0].gamma
-        for one in found[1:]
-        if one.inner
+        abs(gamma - found[0][0]) > _MAX_ERRORS * error + 1e-3 * found[0][0]
+        for gamma, error, _ in found[1:]
+        if _inside_range(gamma)
     ):
         found = found[1:]
     return found[0]
