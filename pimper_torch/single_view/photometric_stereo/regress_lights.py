@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
-from pimper_torch.method.photometry.bilinear import Factors
 from pimper_torch.method.photometry.quadratics import PackedCholesky, outer, unpacked
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
@@ -113,8 +113,7 @@ def determined(
 ) -> Bool[Tensor, " pixel"]:
     """Find which pixels have as many samples as unknowns, under lights that span them."""
     count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
-    size = lights.double().norm(dim=0)
-    basis = lights.double() / torch.where(size > 0, size, 1)
+    basis = normalize(lights.double(), dim=0, eps=1e-300)
     unknowns = lights.shape[1]
     values = torch.linalg.eigvalsh(unpacked(outer(basis.mT) @ weight.double(), unknowns))
     # With less, noise of 1 % in the images is as large as the solution.
@@ -157,24 +156,31 @@ def calibrated_stereo(
     r"""Recover normals and albedos of pixels under known distant lights; constant to autograd.
 
     Weights are those of the mean of the colours; see :func:`regress`. Normal and albedos are then
-    the least-squares solution over all colours: with :math:`A = \sum w\, l l^\top = C C^\top`
-    and ``b_c`` the solution of one colour, :math:`C^\top n` is the leading eigenvector of
-    :math:`\sum_c C^\top b_c b_c^\top C`.
+    the least-squares solution over all colours: with :math:`A = \sum w\, l l^\top` and the
+    solutions of single colours the columns of ``B``, that is :math:`n \rho^\top = B v v^\top`,
+    ``v`` the leading eigenvector of :math:`B^\top A B`.
 
     Args:
         lights: Direction to the point light times its irradiance.
     """
     with torch.no_grad():
-        seen = weight > 0
-        x = torch.where(seen[:, None], radiance, 0).double()
+        x = torch.where((weight > 0)[:, None], radiance, 0).double()
         gray = regress(x.mean(dim=1), weight, lights, robust=robust)
-        rows = lights.double()
-        heavy = gray.weight
-        packed = outer(rows.mT) @ heavy
-        factored = PackedCholesky(packed, 3)
-        found = torch.stack([factored.solve(rows.mT @ (heavy * one)) for one in x.unbind(dim=1)])
-        normals, albedo = _shared(unpacked(packed, 3), found)
-        return StereoSolution(normals=normals, albedo=albedo, lights=rows, weight=heavy)
+        rows, heavy = gray.lights, gray.weight
+        factored = PackedCholesky(outer(rows.mT) @ heavy, 3)
+        sides = rows.mT @ (heavy[:, None] * x).movedim(1, 0)
+        single = torch.stack([factored.solve(side) for side in sides])
+        common = torch.einsum("cip,dip->pcd", single, sides)
+        albedo = torch.linalg.eigh(common).eigenvectors[..., -1].mT
+        albedo = torch.where(albedo.sum(dim=0) < 0, -albedo, albedo)
+        shading = (single * albedo[:, None]).sum(dim=0)
+        size = shading.norm(dim=0)
+        return StereoSolution(
+            normals=shading / torch.where(size > 0, size, 1),
+            albedo=(size * albedo).clamp_min(0),
+            lights=rows,
+            weight=heavy,
+        )
 
 
 def chromatic_albedo(
@@ -187,30 +193,6 @@ def chromatic_albedo(
     square = (weight * shade * shade).sum(dim=0)
     product = ((weight * shade)[:, None] * x).sum(dim=0)
     return (product / torch.where(square > 0, square, 1)).clamp_min(0)
-
-
-def _shared(
-    inner: Float[Tensor, "pixel 3 3"], found: Float[Tensor, "channel 3 pixel"]
-) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "channel pixel"]]:
-    """Assign each pixel the least-squares normal over all colours, and the albedos under it."""
-    vectors = found.permute(2, 1, 0)  # pixel, 3, channel
-    scale = inner.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(torch.finfo(inner.dtype).tiny)
-    eye = torch.eye(3).to(inner)
-    root = torch.linalg.cholesky_ex(inner + 1e-12 * scale[:, None, None] * eye).L
-    white = root.mT @ vectors
-    lead = white[..., 0]
-    if white.shape[2] > 1:
-        lead = torch.linalg.eigh(white @ white.mT).eigenvectors[..., -1]
-    normal = torch.linalg.solve_triangular(root.mT, lead[..., None], upper=True)[..., 0]
-    size = normal.norm(dim=1, keepdim=True)
-    normal = normal / torch.where(size > 0, size, 1)
-    weighted = (inner @ normal[..., None])[..., 0]
-    square = (weighted * normal).sum(dim=1, keepdim=True)
-    albedo = (weighted[..., None] * vectors).sum(dim=1) / torch.where(square > 0, square, 1)
-    sign = torch.where(albedo.sum(dim=1, keepdim=True) < 0, -1.0, 1.0)
-    black = (vectors == 0).all(dim=2).all(dim=1)
-    normal = torch.where(black[:, None], 0, sign * normal)
-    return normal.mT, (sign * albedo).clamp_min(0).mT
 
 
 # Steps of variable projection: for the first solution, and after every change of weights, whose
@@ -251,28 +233,18 @@ def factorize_photographs(
         # Lights are estimated from these, shading for all.
         spaced = torch.linspace(0, len(usable) - 1, min(len(usable), 4000)).round().long()
         some = usable[spaced.to(usable.device)]
-        first = given[:, some]
+        few, heavy = x[:, some], given[:, some]
         if robust:
-            first = first * brightness(x[:, some], seen[:, some])
+            heavy = heavy * brightness(few, seen[:, some])
         # Missing samples start as the view's times the pixel's brightness.
-        fraction = first / first.amax().clamp_min(1e-300)
-        filled = fraction * x[:, some] + (1 - fraction) * brightness_guess(x[:, some], first)
+        fraction = heavy / heavy.amax().clamp_min(1e-300)
+        filled = fraction * few + (1 - fraction) * brightness_guess(few, heavy)
         left = torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
-        left = _projected(x[:, some], first, left, _FIRST_STEPS).lights[0]
-        heavy = first
-        for iteration in range(20 if robust else 0):
-            solved = _projected(x[:, some], heavy, left, _NEXT_STEPS)
+        for iteration in range(20 if robust else 1):
+            problem = low_rank_problem(few[None], heavy[None], left[None])
+            steps = _NEXT_STEPS if iteration else _FIRST_STEPS
+            solved = solve_variable_projection(problem, steps)
             left = solved.lights[0]
             widen = max(1.0, _WIDEST * _NARROWING_FACTORED**iteration)
-            predicted = left @ solved.shading[0]
-            heavy = reweigh(x[:, some], given[:, some], predicted, widen)
+            heavy = reweigh(few, given[:, some], left @ solved.shading[0], widen)
         return regress(x, given, left, robust=robust)
-
-
-def _projected(
-    x: Float[Tensor, "view pixel"],
-    weight: Float[Tensor, "view pixel"],
-    left: Float[Tensor, "view rank"],
-    steps: int,
-) -> Factors:
-    return solve_variable_projection(low_rank_problem(x[None], weight[None], left[None]), steps)
