@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.linalg import eigh
 from torch import Tensor
-from torch.nn.functional import conv2d, pad
+from torch.nn.functional import conv2d, max_pool2d, pad
 
 from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.ground.shapes import Mask, Matrix3
@@ -73,14 +73,13 @@ def factorize_in_perspective(
         weight = torch.ones_like(radiance) if seen is None else seen.double()
         found = factorize_photographs(radiance, weight, 3, robust=False)
         left, right = found.lights, found.shading
-        known = (weight > 0).sum(dim=0) >= 3
-        known = known & (right.norm(dim=0) > 0)
+        known = ((weight > 0).sum(dim=0) >= 3) & (right != 0).any(dim=0)
         right = torch.where(known, right, 0)
         inside = torch.zeros_like(mask)
         inside[mask] = known
         pixels = homogeneous(pixel_centers(mask.shape[1], mask.shape[0], weight))
         rays = pixels @ torch.linalg.inv(intrinsics.double()).mT
-        matrix = _between(right, known, mask, inside, intrinsics.double(), rays, radius)
+        matrix = _between(right, mask, inside, intrinsics.double(), rays, radius)
         towards = ((matrix @ right) * rays[mask].mT).sum()
         matrix = torch.where(towards > 0, -matrix, matrix)
         lights = left @ torch.linalg.inv(matrix)
@@ -109,7 +108,6 @@ def integrability_equations(
 
 def _between(
     right: Float[Tensor, "3 pixel"],
-    known: Bool[Tensor, " pixel"],
     mask: Mask,
     inside: Mask,
     intrinsics: Matrix3,
@@ -117,7 +115,7 @@ def _between(
     radius: int,
 ) -> Matrix3:
     """Find the matrix under which the vectors are normals times albedo, up to a factor."""
-    moment = right @ right.mT / known.sum().clamp_min(1)
+    moment = right @ right.mT / inside.sum().clamp_min(1)
     values, axes = torch.linalg.eigh(moment)
     if float(values[0]) <= 1e-12 * float(values[-1]):
         raise InputError(
@@ -129,34 +127,29 @@ def _between(
     size = vectors.norm(dim=0).clamp_min(1e-30)
     raster = right.new_zeros(3, *mask.shape)
     raster[:, mask] = vectors / size
-    size_raster = right.new_ones(mask.shape)
-    size_raster[mask] = size
-    value, along_u, along_v = _derivatives(raster, radius)
     side = 2 * radius + 1
-    whole = conv2d(
-        pad(inside.double(), (radius,) * 4)[None, None], right.new_ones(1, 1, side, side)
-    )
-    whole = (whole[0, 0] > side * side - 0.5) & inside
+    whole = -max_pool2d(-pad(inside.double(), (radius,) * 4)[None], side, stride=1)[0] > 0
     # Nine unknowns up to scale.
     if int(whole.sum()) < 50:
         raise InputError(
             f"{int(whole.sum())} squares of {side} x {side} pixels lie inside the mask and are "
             f"seen in three views; needed: {50}. Lower `radius`, or enlarge the mask."
         )
-    b, bu, bv = value[:, whole], along_u[:, whole], along_v[:, whole]
-    rays = rays[whole].mT
-    (fx, skew), fy = intrinsics[0, :2], intrinsics[1, 1]
-    rows = integrability_equations(b, fx * bu, skew * bu + fy * bv, rays)
+    b, *slopes = _derivatives(raster, radius)[:, :, whole]
+    rays, by_ray = rays[whole].mT, intrinsics[:2, :2]  # derivatives of u and v by x and y
+    rows = integrability_equations(
+        b, *torch.einsum("st,scp->tcp", by_ray, torch.stack(slopes)), rays
+    )
     # Noise of the factors is white; after whitening it has a covariance, and normalization
     # divides it by the vectors' length. Of the cross product of each vector with it:
     cross = torch.linalg.cross(torch.eye(3).to(b)[None], b.mT[:, None], dim=-1)
     noise_covariance = cross @ (white @ white.mT) @ cross.mT
-    noise_covariance = noise_covariance / size_raster[whole].square()[:, None, None]
+    noise_covariance = noise_covariance / size[whole[mask]].square()[:, None, None]
     # The coefficients of noise of b_u and of b_v, for each row of P.
-    x, y, one = rays
-    by_u = torch.stack([fx * one, skew * one, -x * fx - y * skew], dim=1)
-    by_v = torch.stack([0 * one, fy * one, -y * fy], dim=1)
-    cofactors, ratio = _cofactors(rows, noise_covariance, by_u, by_v)
+    by_noise = torch.cat(
+        [by_ray[:, None].expand(2, len(rows), 2), -(by_ray @ rays[:2])[..., None]], dim=-1
+    )
+    cofactors, ratio = _cofactors(rows, noise_covariance, by_noise)
     inverse, singular = torch.linalg.inv_ex(cofactors)
     if ratio < _DISTINCT or bool(singular):
         raise InputError(
@@ -170,8 +163,7 @@ def _between(
 def _cofactors(
     rows: Float[Tensor, "pixel 9"],
     noise_covariance: Float[Tensor, "pixel 3 3"],
-    by_u: Float[Tensor, "pixel 3"],
-    by_v: Float[Tensor, "pixel 3"],
+    by_noise: Float[Tensor, "2 pixel 3"],
 ) -> tuple[Matrix3, float]:
     """Find the cofactors of minimum residual relative to that of noise.
 
@@ -180,16 +172,14 @@ def _cofactors(
     """
     weight = torch.ones_like(rows[:, 0])
     for _ in range(4):
-        both = by_u[:, :, None] * by_u[:, None] + by_v[:, :, None] * by_v[:, None]
-        both = both * weight[:, None, None]
+        both = torch.einsum("p,spi,spk->pik", weight, by_noise, by_noise)
         noise = torch.einsum("pij,pkl->ikjl", both, noise_covariance).reshape(9, 9)
         noise = noise + 1e-12 * noise.trace() * torch.eye(9).to(noise)
         moment = (weight[:, None] * rows).mT @ rows
         ratios, vectors = eigh(moment.cpu().numpy(), noise.cpu().numpy())
         least = torch.from_numpy(vectors[:, 0].reshape(3, 3)).to(rows)
-        variance = torch.zeros_like(weight)
-        for rotated in (by_u @ least, by_v @ least):
-            variance += torch.einsum("pi,pij,pj->p", rotated, noise_covariance, rotated)
+        rotated = by_noise @ least
+        variance = torch.einsum("spi,pij,spj->p", rotated, noise_covariance, rotated)
         weight = 1 / variance.clamp_min(1e-3 * variance.median())
         weight = weight / weight.mean()
     return least, float(ratios[1] / max(ratios[0], 1e-300))
@@ -197,13 +187,12 @@ def _cofactors(
 
 def _derivatives(
     raster: Float[Tensor, "channel height width"], radius: int
-) -> tuple[Float[Tensor, "channel height width"], ...]:
+) -> Float[Tensor, "derivative channel height width"]:
     """Fit a cubic to the square around each pixel; give its value and derivatives by u and v."""
     side = torch.arange(-radius, radius + 1).to(raster)
     v, u = torch.meshgrid(side, side, indexing="ij")
-    powers = [(i, j) for i in range(4) for j in range(4 - i)]
+    # The value and its derivatives first.
+    powers = [(power - j, j) for power in range(4) for j in range(power + 1)]
     basis = torch.stack([u.flatten() ** i * v.flatten() ** j for i, j in powers], dim=1)
-    fit = torch.linalg.pinv(basis)
-    kernels = fit[[powers.index(term) for term in ((0, 0), (1, 0), (0, 1))]]
-    found = conv2d(raster[:, None], kernels.reshape(3, 1, *u.shape), padding=radius)
-    return found[:, 0], found[:, 1], found[:, 2]
+    kernels = torch.linalg.pinv(basis)[:3].reshape(3, 1, *u.shape)
+    return conv2d(raster[:, None], kernels, padding=radius).movedim(1, 0)
