@@ -242,36 +242,24 @@ def solve_transforms(
     gap = mismatches(pulls, fixed)
     given = (pulls.corners * fixed[:, None]).sum(dim=-1)
 
-    weight = stiffness[:, None] * pulls.weight
-    weighted = weight[:, None, :, None] * samples
-    own = torch.einsum("perc,perd->pecd", weighted, samples)
-    cosine = (pulls.normals[:, 0] * pulls.normals[:, 1]).sum(dim=-1)
-    cross = -cosine[:, None, None] * torch.einsum("prc,prd->pcd", weighted[:, 0], samples[:, 1])
-    along = torch.einsum("pex,prx->per", pulls.normals, gap)
-    wanted = torch.einsum("perc,per->pec", weighted, along)
-    wanted = torch.stack([-wanted[:, 0], wanted[:, 1]], dim=1)
-    wanted = wanted + uplift[..., None] * identity[free]
-
-    held = pulls.corner_weight[..., None] * corners
-    diagonal = torch.einsum("fvc,fvd->fcd", held, corners)
-    prior = pulls.prior_weight[free]
-    diagonal = diagonal + torch.diag(prior)
+    # Of the mismatch of each ray, by the unknowns of both patches.
+    normals = torch.stack([pulls.normals[:, 0], -pulls.normals[:, 1]], dim=1)
+    slope = torch.einsum("perc,pex->prxec", samples, normals).flatten(3)
+    weighted = (stiffness[:, None] * pulls.weight)[..., None, None] * slope
+    wanted = uplift[..., None] * identity[free]
+    wanted = wanted.flatten(1) - torch.einsum("prxk,prx->pk", weighted, gap)
+    held, prior = pulls.corner_weight[..., None] * corners, pulls.prior_weight[free]
     rhs = prior * identity[free] - torch.einsum("fvc,fv->fc", held, given)
-    first, second = pulls.facets.unbind(dim=1)
-    diagonal = diagonal.index_add(0, first, own[:, 0]).index_add(0, second, own[:, 1])
-    rhs = rhs.index_add(0, first, wanted[:, 0]).index_add(0, second, wanted[:, 1])
-
-    every = torch.arange(len(transforms), device=first.device)
-    unknown = torch.arange(rhs.numel(), device=first.device).reshape(rhs.shape)
-    blocks = torch.cat([diagonal, cross, cross.mT])
-    rows = unknown[torch.cat([every, first, second]), :, None].expand_as(blocks)
-    cols = unknown[torch.cat([every, second, first]), None].expand_as(blocks)
-    factor = SparseCholesky(
-        rows.flatten(),
-        cols.flatten(),
-        blocks.flatten(),
-        rhs.numel(),
-        "the alignment of the patches",
-    )
-    found = factor.solve(rhs.reshape(-1))
-    return fixed.index_copy(1, free, found.reshape(len(transforms), -1))
+    unknown = torch.arange(rhs.numel(), device=rhs.device).reshape(rhs.shape)
+    of_seam = unknown[pulls.facets].flatten(1)
+    rhs = rhs.flatten().index_add(0, of_seam.flatten(), wanted.flatten())
+    terms = [
+        (unknown, torch.einsum("fvc,fvd->fcd", held, corners) + prior.diag()),
+        (of_seam, torch.einsum("prxk,prxl->pkl", weighted, slope)),
+    ]
+    rows = [index[:, :, None].expand_as(block).flatten() for index, block in terms]
+    cols = [index[:, None].expand_as(block).flatten() for index, block in terms]
+    values = torch.cat([block.flatten() for _, block in terms])
+    what = "the alignment of the patches"
+    factor = SparseCholesky(torch.cat(rows), torch.cat(cols), values, len(rhs), what)
+    return fixed.index_copy(1, free, factor.solve(rhs).reshape(unknown.shape))
