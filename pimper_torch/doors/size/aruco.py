@@ -9,7 +9,11 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixels_from_indices
+from pimper_torch.ground.geometry.pixels import (
+    grid_from_pixels,
+    homogeneous,
+    pixels_from_indices,
+)
 from pimper_torch.ground.shapes import Map, Scalars
 from pimper_torch.records import Record
 
@@ -109,10 +113,11 @@ def _refined_once(
     middle = ((across[:, 1:] + across[:, :-1]) / 2)[:, None, None]
     total = steps.sum(dim=-1)
     off = (steps * middle).sum(dim=-1) / total
-    start, end = _line(share, off)
-    first = corners + start[..., None] * outward
-    second = corners + along + end[..., None] * outward
-    return _crossing(first.roll(1, dims=1), second.roll(1, dims=1), first, second)
+    # Lines as their vectors of homogeneous coordinates: cross products join points and meet lines.
+    ends = torch.stack([corners, corners + along], dim=-2) + _line(share, off) * outward[:, :, None]
+    lines = torch.linalg.cross(*homogeneous(ends).unbind(dim=-2))
+    meeting = torch.linalg.cross(lines.roll(1, dims=1), lines)
+    return meeting[..., :2] / meeting[..., 2:]
 
 
 def _looked_up(picture: Map, places: Float[Tensor, "*batch 2"]) -> Scalars:
@@ -126,34 +131,15 @@ def _looked_up(picture: Map, places: Float[Tensor, "*batch 2"]) -> Scalars:
 
 def _line(
     share: Float[Tensor, " along"], off: Float[Tensor, "square 4 along"]
-) -> tuple[Float[Tensor, "square 4"], Float[Tensor, "square 4"]]:
+) -> Float[Tensor, "square 4 2 1"]:
     """Fit lines to offsets along each side with Cauchy's weights; give them at its ends."""
     known = off.isfinite()
-    values = off.nan_to_num(0)
-    middle = torch.where(known, off, torch.nan).nanmedian(dim=-1, keepdim=True).values
-    predicted = middle.expand_as(off)
+    values = off.nan_to_num(0)[..., None]
+    basis = torch.stack([1 - share, share], dim=1)  # of both ends
+    predicted = off.nanmedian(dim=-1, keepdim=True).values[..., None]
     for _ in range(3):
-        weight = known / (1 + ((values - predicted) / 0.3).square())
-        total = weight.sum(dim=-1)
-        mean_share = (weight * share).sum(dim=-1) / total
-        mean = (weight * values).sum(dim=-1) / total
-        centred = share - mean_share[..., None]
-        slope = (weight * centred * values).sum(dim=-1) / (weight * centred**2).sum(dim=-1)
-        predicted = mean[..., None] + slope[..., None] * centred
-    mean = torch.where(known.double().mean(dim=-1) > 0.5, mean, torch.nan)
-    return mean - slope * mean_share, mean + slope * (1 - mean_share)
-
-
-def _crossing(
-    a: Float[Tensor, "*batch 2"],
-    b: Float[Tensor, "*batch 2"],
-    c: Float[Tensor, "*batch 2"],
-    d: Float[Tensor, "*batch 2"],
-) -> Float[Tensor, "*batch 2"]:
-    """Return where the line through two points crosses that through two others."""
-    one, other = b - a, d - c
-
-    def cross(first: Tensor, second: Tensor) -> Tensor:
-        return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-
-    return a + (cross(c - a, other) / cross(one, other))[..., None] * one
+        weighted = basis * (known[..., None] / (1 + ((values - predicted) / 0.3).square()))
+        # Singular where next to nothing is known, which is left out below.
+        ends = torch.linalg.solve_ex(weighted.mT @ basis, weighted.mT @ values).result
+        predicted = basis @ ends
+    return torch.where(known.double().mean(dim=-1)[..., None, None] > 0.5, ends, torch.nan)

@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from statistics import median
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize, one_hot
 
 from pimper_torch.doors.size.aruco import CELLS, Square, find_squares, refined_corners
 from pimper_torch.doors.size.given import MILLIMETRES, Unit
@@ -66,11 +68,10 @@ def scale_of_markers(
     ]
     if not lengths:
         return None
-    factors = torch.tensor([one.known / one.found for one in lengths], dtype=torch.float64)
-    alike = (factors / factors.quantile(0.5) - 1).abs() <= AGREEING
-    if int(alike.sum()) <= len(lengths) / 2:
+    middle = median(one.known / one.found for one in lengths)
+    kept = [one for one in lengths if abs(one.known / one.found / middle - 1) <= AGREEING]
+    if len(kept) <= len(lengths) / 2:
         return None
-    kept = [one for one, keep in zip(lengths, alike.tolist(), strict=True) if keep]
     return fitted(kept, unit, "markers")
 
 
@@ -126,17 +127,15 @@ def _placed(code: int, cameras: Cameras, pixels: Float[Tensor, "view 4 2"]) -> M
 
     From every two photographs in turn; then from all that agree with the best two.
     """
-    rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)
-    rays = rays / rays.norm(dim=-1, keepdim=True)
+    rays = normalize(rays_through(pixels, cameras.cam_from_world, cameras.intrinsics), dim=-1)
     count = len(pixels)
-    first, second = torch.triu_indices(count, count, 1)
-    pair = torch.zeros(len(first), count, dtype=torch.bool)
-    pair[torch.arange(len(first)), first] = True
-    pair[torch.arange(len(first)), second] = True
-    pair = pair[_widest(rays, pair) >= math.radians(2)]
-    if len(pair) == 0:
+    pairs = torch.combinations(torch.arange(count))
+    cosines = (rays[pairs[:, 0]] * rays[pairs[:, 1]]).sum(dim=-1).mean(dim=-1)
+    pairs = pairs[cosines.clamp(-1, 1).acos() >= math.radians(2)]
+    if len(pairs) == 0:
         return None
-    near = _near(_triangulated(rays, cameras, pair), cameras, pixels)
+    used = one_hot(pairs, count).any(dim=1)
+    near = _near(_triangulated(rays, cameras, used), cameras, pixels)
     best = near[near.sum(dim=1).argmax()]
     # Fewer agree where a marker stands still before an object that turns.
     if not int(best.sum()) >= max(2, 0.6 * count):
@@ -146,15 +145,6 @@ def _placed(code: int, cameras: Cameras, pixels: Float[Tensor, "view 4 2"]) -> M
     if not bool((agreeing | ~best).all()) or not _is_square(corners[0]):
         return None
     return Marker(code=code, corners_world=corners[0], num_views=int(best.sum()))
-
-
-def _widest(
-    rays: Float[Tensor, "view 4 3"], used: Bool[Tensor, "trial view"]
-) -> Float[Tensor, " trial"]:
-    """Return the widest angle between rays to one corner, by two photographs a trial."""
-    cosines = torch.einsum("vki,wki->vwk", rays, rays).mean(dim=-1).clamp(-1, 1)
-    either = used[:, :, None] & used[:, None, :]
-    return torch.where(either, cosines, 1.0).flatten(1).amin(dim=1).acos()
 
 
 def _triangulated(
