@@ -9,8 +9,6 @@ Source: Alldrin, Mallick & Kriegman, Resolving the generalized bas-relief ambigu
 minimization, CVPR 2007.
 """
 
-import itertools
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -37,11 +35,10 @@ def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Int[Te
     values = radiance.double()
     brightest = values.flatten(1).amax(dim=1)[:, None]
     bright = values.amin(dim=1) > 0.02 * brightest
-    log = torch.where(bright[:, None], values, 1).log()
-    log = log - log.mean(dim=1, keepdim=True)
+    values = torch.where(bright[:, None], values, 1)
+    log = values.log() - values.log().mean(dim=1, keepdim=True)
     # Harmonic: the darkest channel has the noisiest logarithm.
-    inverse = torch.where(bright[:, None], values, 1).pow(-2).sum(dim=1)
-    weight = (bright / inverse)[:, None]
+    weight = (bright / values.pow(-2).sum(dim=1))[:, None]
     total_view = weight.sum(dim=2).clamp_min(1e-30)
     total_pixel = weight.sum(dim=0).clamp_min(1e-30)
     point_light = torch.zeros_like(log[:, :, 0])
@@ -198,19 +195,14 @@ def _local_search(
     width: float,
 ) -> tuple[Float[Tensor, "candidate 3"], Float[Tensor, " candidate"]]:
     """Move each candidate to its best neighbour a step away until none is better."""
-    around = torch.tensor(list(itertools.product((-1, 0, 1), repeat=3))).to(b) * step
-    centre = len(around) // 2
+    around = torch.cartesian_prod(*[torch.arange(-1, 2).to(b)] * 3) * step
     best = best.clone()
     least = torch.full_like(best[:, 0], torch.inf)
     moving = torch.arange(len(best), device=b.device)
     for _ in range(4):
-        neighbours = best[moving, None] + around
-        entropy = albedo_entropy(b, labels, neighbours.flatten(0, 1), width).reshape(
-            neighbours.shape[:2]
-        )
+        neighbours = (best[moving, None] + around).flatten(0, 1)
+        entropy = albedo_entropy(b, labels, neighbours, width).view(-1, len(around))
         least[moving], chosen = entropy.min(dim=1)
-        best[moving] = neighbours[torch.arange(len(neighbours), device=b.device), chosen]
-        moving = moving[chosen != centre]
-        if len(moving) == 0:
-            break
+        best[moving] += around[chosen]
+        moving = moving[(around[chosen] != 0).any(dim=1)]
     return best, least

@@ -137,9 +137,8 @@ def _between(
         )
     b, *slopes = _derivatives(raster, radius)[:, :, whole]
     rays, by_ray = rays[whole].mT, intrinsics[:2, :2]  # derivatives of u and v by x and y
-    rows = integrability_equations(
-        b, *torch.einsum("st,scp->tcp", by_ray, torch.stack(slopes)), rays
-    )
+    along_x, along_y = torch.einsum("st,scp->tcp", by_ray, torch.stack(slopes))
+    rows = integrability_equations(b, along_x, along_y, rays)
     # Noise of the factors is white; after whitening it has a covariance, and normalization
     # divides it by the vectors' length. Of the cross product of each vector with it:
     cross = torch.linalg.cross(torch.eye(3).to(b)[None], b.mT[:, None], dim=-1)

@@ -174,10 +174,9 @@ def calibrated_stereo(
         albedo = torch.linalg.eigh(common).eigenvectors[..., -1].mT
         albedo = torch.where(albedo.sum(dim=0) < 0, -albedo, albedo)
         shading = (single * albedo[:, None]).sum(dim=0)
-        size = shading.norm(dim=0)
         return StereoSolution(
-            normals=shading / torch.where(size > 0, size, 1),
-            albedo=(size * albedo).clamp_min(0),
+            normals=normalize(shading, dim=0, eps=1e-300),
+            albedo=(shading.norm(dim=0) * albedo).clamp_min(0),
             lights=rows,
             weight=heavy,
         )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from pimper_torch.ground.shapes import Mask, Masks, Matrix3
 from pimper_torch.records import Record
@@ -106,7 +107,7 @@ def photometric_stereo(
     _refuse(images, mask, method, resolve, lights, intrinsics, weight)
     with torch.no_grad():
         given = images.new_ones(len(images), *mask.shape) if weight is None else weight
-        samples = images.movedim(1, 0)[..., mask].movedim(0, 1)
+        samples = images[:, :, mask]
         seen = samples.isfinite().all(dim=1)
         heavy = torch.where(seen, given[:, mask], 0).double()
         used = (heavy > 0).any(dim=1)
@@ -174,8 +175,7 @@ def _integrable(
 
 def _lambertian(radiance: Float[Tensor, "view channel pixel"], factors: Factored) -> StereoSolution:
     """Return normals and the albedo of each colour, under lights of the median length 1."""
-    size = factors.shading.norm(dim=0)
-    normals = factors.shading / torch.where(size > 0, size, 1)
+    normals = normalize(factors.shading, dim=0, eps=1e-300)
     shade = (factors.lights @ normals).clamp_min(0)
     albedo = chromatic_albedo(radiance, factors.weight, shade)
     length = factors.lights.norm(dim=1)
@@ -195,24 +195,21 @@ def _spread_out(
     used: Bool[Tensor, " view"],
     like: Tensor,
 ) -> PhotometricStereo:
-    rows, (y, x) = used.nonzero(), mask.nonzero(as_tuple=True)
-    valid = torch.zeros_like(mask)
-    valid[y, x] = (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
-    valid[y, x] &= determined(found.weight, found.lights)
-    normals = like.new_zeros(*mask.shape, 3)
-    normals[y, x] = found.normals.mT.to(like)
-    albedo = like.new_zeros(*mask.shape, len(found.albedo))
-    albedo[y, x] = found.albedo.mT.to(like)
-    lit = valid.new_zeros(len(used), *mask.shape)
-    lit[rows, y, x] = (given > 0) & (found.weight >= 0.5 * given)
-    lights = like.new_zeros(len(used), 3)
+    def raster(values: Tensor) -> Tensor:
+        whole = values.new_zeros(len(values), *mask.shape)
+        whole[:, mask] = values
+        return whole
+
+    valid = (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
+    lit, lights = mask.new_zeros(len(used), *mask.shape), like.new_zeros(len(used), 3)
+    lit[used] = raster((given > 0) & (found.weight >= 0.5 * given))
     lights[used] = found.lights.to(like)
     return PhotometricStereo(
-        normals=normals,
-        albedo=albedo,
+        normals=raster(found.normals.to(like)).movedim(0, -1).contiguous(),
+        albedo=raster(found.albedo.to(like)).movedim(0, -1).contiguous(),
         lights=lights,
         lit=lit,
-        valid=valid,
+        valid=raster((valid & determined(found.weight, found.lights))[None])[0],
     )
 
 
