@@ -15,6 +15,7 @@ from pimper_torch.paper.paper_config import AlignConfig
 from pimper_torch.paper.seams import (
     Pulls,
     Seams,
+    Transforms,
     curvature_along,
     find_seams,
     meet_overlaps,
@@ -166,11 +167,7 @@ class Align(Stage):
         )
 
     def _met(
-        self,
-        depths: DepthPatches,
-        seams: Seams,
-        anchors: Anchors,
-        transforms: Float[Tensor, "face 4"],
+        self, depths: DepthPatches, seams: Seams, anchors: Anchors, transforms: Transforms
     ) -> Pulls:
         """Meet the overlaps as transformed so far, and anchor every height field at vertices."""
         unit, coarse = seams.units[3], depths.patches.coarse
@@ -200,9 +197,7 @@ class Align(Stage):
         weight = torch.where(coarse.is_point[coarse.mesh.faces], certain, 0.1) * anchors.known
         return pulls.replace(corner_weight=self.config.anchor * weight)
 
-    def _solve_round(
-        self, pulls: Pulls, transforms: Float[Tensor, "face 4"], fresh: bool
-    ) -> Float[Tensor, "face 4"]:
+    def _solve_round(self, pulls: Pulls, transforms: Transforms, fresh: bool) -> Transforms:
         touching = pulls.facets[(pulls.weight > 0).any(dim=1)].flatten()
         moves = torch.zeros_like(transforms[:, 0]).index_fill(0, touching, 1)
         pulls = pulls.replace(corner_weight=pulls.corner_weight * moves[:, None])
@@ -222,18 +217,18 @@ class Align(Stage):
         return transforms
 
 
-def _limit_scales(transforms: Float[Tensor, "face 4"], limit: float) -> Float[Tensor, "face 4"]:
+def _limit_scales(transforms: Transforms, limit: float) -> Transforms:
     hx, hy, hz, h0 = transforms.unbind(dim=-1)
     return torch.stack([hx, hy, hz.clamp(1 / limit, limit), h0], dim=-1)
 
 
-def _root_mean_square(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Scalar:
+def _root_mean_square(pulls: Pulls, transforms: Transforms) -> Scalar:
     square = mismatches(pulls, transforms).square().sum(dim=-1)
     return average(square[pulls.weight > 0]).sqrt()
 
 
 def _apply(
-    depths: DepthPatches, transforms: Float[Tensor, "face 4"], status: Int[Tensor, " face"]
+    depths: DepthPatches, transforms: Transforms, status: Int[Tensor, " face"]
 ) -> tuple[Depths, ...]:
     buckets = []
     for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):

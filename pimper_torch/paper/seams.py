@@ -21,6 +21,10 @@ from pimper_torch.ground.shapes import Faces
 from pimper_torch.records import PatchSet, Record
 from pimper_torch.records.patches import Depths
 
+Transforms = Float[Tensor, "face 4"]
+PerSide = Float[Tensor, "seam 2"]
+PerSeam = Float[Tensor, " seam"]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Seams(Record):
@@ -38,7 +42,7 @@ class Seams(Record):
     origins: Float[Tensor, "seam row column 3"]
     directions: Float[Tensor, "seam 3"]
     normals: Float[Tensor, "seam 2 3"]
-    edge_lengths: Float[Tensor, " seam"]
+    edge_lengths: PerSeam
     seam_of: Faces
     place_of: Int[Tensor, "seam 2"]
 
@@ -87,10 +91,7 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
 
 
 def meet_overlaps(
-    seams: Seams,
-    patches: PatchSet,
-    buckets: tuple[Depths, ...],
-    transforms: Float[Tensor, "face 4"],
+    seams: Seams, patches: PatchSet, buckets: tuple[Depths, ...], transforms: Transforms
 ) -> tuple[
     Float[Tensor, "seam 2 row column 3"],
     Float[Tensor, "seam 2 row column 3"],
@@ -165,13 +166,13 @@ class Pulls(Record):
     samples: Float[Tensor, "seam 2 ray 4"]
     gap: Float[Tensor, "seam ray 3"]
     weight: Float[Tensor, "seam ray"]
-    curvature: Float[Tensor, "seam 2"]
+    curvature: PerSide
     corners: Float[Tensor, "face 3 4"]
     corner_weight: Float[Tensor, "face 3"]
     prior_weight: Float[Tensor, " 4"]
 
 
-def mismatches(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tensor, "seam ray 3"]:
+def mismatches(pulls: Pulls, transforms: Transforms) -> Float[Tensor, "seam ray 3"]:
     r"""Return :math:`P_\mu + N_\mu h_\mu^T S_\mu - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'}`."""
     heights = torch.einsum("perc,pec->per", pulls.samples, transforms[pulls.facets])
     lifted = heights[..., None] * pulls.normals[:, :, None]
@@ -181,8 +182,8 @@ def mismatches(pulls: Pulls, transforms: Float[Tensor, "face 4"]) -> Float[Tenso
 def curvature_along(
     heights: Float[Tensor, "seam 2 row column"],
     met: Bool[Tensor, "seam row column"],
-    edge_lengths: Float[Tensor, " seam"],
-) -> Float[Tensor, "seam 2"]:
+    edge_lengths: PerSeam,
+) -> PerSide:
     r"""Return the mean square of a height field's curvature along the edge, times its length.
 
     :math:`C = \overline{(\ell\,\kappa)^2}`, :math:`\kappa` by second differences over a
@@ -198,11 +199,7 @@ def curvature_along(
     return square / known.sum(dim=(-2, -1)).clamp_min(1)[:, None]
 
 
-def seam_stiffness(
-    curvature: Float[Tensor, "seam 2"],
-    scales: Float[Tensor, "seam 2"],
-    apart: Float[Tensor, " seam"],
-) -> tuple[Float[Tensor, " seam"], Float[Tensor, "seam 2"]]:
+def seam_stiffness(curvature: PerSide, scales: PerSide, apart: PerSeam) -> tuple[PerSeam, PerSide]:
     r"""Return the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, and its derivative's part.
 
     Args:
@@ -218,11 +215,8 @@ def seam_stiffness(
 
 
 def solve_transforms(
-    pulls: Pulls,
-    transforms: Float[Tensor, "face 4"],
-    stiffness: Float[Tensor, " seam"],
-    uplift: Float[Tensor, "seam 2"],
-) -> Float[Tensor, "face 4"]:
+    pulls: Pulls, transforms: Transforms, stiffness: PerSeam, uplift: PerSide
+) -> Transforms:
     r"""Find the transforms that minimise the weighted squares of all terms.
 
     .. math::

@@ -9,11 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from pimper_torch.ground.geometry.pixels import (
-    grid_from_pixels,
-    homogeneous,
-    pixels_from_indices,
-)
+from pimper_torch.ground.geometry.pixels import grid_from_pixels, homogeneous, pixels_from_indices
 from pimper_torch.ground.shapes import Map, Scalars
 from pimper_torch.records import Record
 

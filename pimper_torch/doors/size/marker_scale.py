@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from statistics import median
 
 import torch
 from jaxtyping import Bool, Float
@@ -68,7 +67,8 @@ def scale_of_markers(
     ]
     if not lengths:
         return None
-    middle = median(one.known / one.found for one in lengths)
+    factors = torch.tensor([one.known / one.found for one in lengths], dtype=torch.float64)
+    middle = float(factors.quantile(0.5))
     kept = [one for one in lengths if abs(one.known / one.found / middle - 1) <= AGREEING]
     if len(kept) <= len(lengths) / 2:
         return None

@@ -20,6 +20,8 @@ from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
 
+Vector = Float[Tensor, "3"]
+
 # Confidence of a surface below which a warning says that it may be elsewhere. A choice: a half is
 # that of normals which are 8 degrees off.
 _UNSURE = 0.5
@@ -40,7 +42,7 @@ def view_of(name: str, scene: SparseScene) -> int:
     return number_of(name, names)
 
 
-def place_of(mark: Mark, result: Reconstruction) -> Float[Tensor, "3"]:
+def place_of(mark: Mark, result: Reconstruction) -> Vector:
     """Find where a mark is, world frame, float64.
 
     A mark in one photograph is where its ray first meets the surface; beside the surface, it is on
@@ -60,7 +62,7 @@ def place_of(mark: Mark, result: Reconstruction) -> Float[Tensor, "3"]:
     return _met(mark.pointers[0], result, views[0], eyes[0], rays[0])
 
 
-def _ray(pointer: Pointer, view: int, scene: SparseScene) -> Float[Tensor, "3"]:
+def _ray(pointer: Pointer, view: int, scene: SparseScene) -> Vector:
     """Return the direction behind a pixel, as long as it goes while its depth grows by 1."""
     lens = scene.lenses[view]
     width, height = pointer.size_px or (lens.width, lens.height)
@@ -84,7 +86,7 @@ def _meeting(
     views: Sequence[int],
     eyes: Float[Tensor, "ray 3"],
     rays: Float[Tensor, "ray 3"],
-) -> Float[Tensor, "3"]:
+) -> Vector:
     """Find the point nearest to rays in the least-squares sense."""
     unit = rays / rays.norm(dim=1, keepdim=True)
     widest = float((unit @ unit.mT).clamp(-1, 1).acos().rad2deg().max())
@@ -108,13 +110,7 @@ def _meeting(
     return point
 
 
-def _met(
-    pointer: Pointer,
-    result: Reconstruction,
-    view: int,
-    eye: Float[Tensor, "3"],
-    ray: Float[Tensor, "3"],
-) -> Float[Tensor, "3"]:
+def _met(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: Vector) -> Vector:
     """Find where a ray first meets the surface, else touches it, else meets the ground."""
     mesh = result.mesh.detach().to("cpu", torch.float64)
     hits = RayCaster(mesh.vertices_world, mesh.faces).cast(eye, ray[None])
@@ -160,13 +156,8 @@ def _tell_unsure(pointer: Pointer, mesh: Mesh, face: int) -> None:
 
 
 def _beside(
-    pointer: Pointer,
-    result: Reconstruction,
-    mesh: Mesh,
-    view: int,
-    eye: Float[Tensor, "3"],
-    ray: Float[Tensor, "3"],
-) -> Float[Tensor, "3"] | None:
+    pointer: Pointer, result: Reconstruction, mesh: Mesh, view: int, eye: Vector, ray: Vector
+) -> Vector | None:
     """Return the point of a ray beside the nearest vertex, if the surface is close to the pixel."""
     cameras = result.cameras.detach().to("cpu", torch.float64)
     pose, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]

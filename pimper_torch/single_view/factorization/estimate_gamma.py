@@ -15,24 +15,21 @@ exponent, and does not shift the minimum.
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from pimper_torch.ground.linalg.robust import (
-    CAUCHY_TUNING,
-    cauchy_weights,
-    robust_deviation,
-    with_slope,
-)
+from pimper_torch.ground.linalg import robust
 from pimper_torch.ground.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.ground.shapes import Mask
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record, Views
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization import low_rank
+
+Samples = Float[Tensor, "view sample"]
+Seen = Bool[Tensor, "view sample"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -46,15 +43,15 @@ class EncodedFit(Record):
         left: Left factor.
     """
 
-    encoded: Float[Tensor, "view sample"]
-    used: Bool[Tensor, "view sample"]
+    encoded: Samples
+    used: Seen
     scale: float
-    predicted: Float[Tensor, "view sample"]
-    weight: Float[Tensor, "view sample"]
+    predicted: Samples
+    weight: Samples
     left: Float[Tensor, "view rank"]
 
     @property
-    def loss(self) -> Float[Tensor, "view sample"]:
+    def loss(self) -> Samples:
         """Of each entry; 0 where not used."""
         square = (self.used * (self.encoded - self.predicted)).square()
         return self.scale**2 * (square / self.scale**2).log1p() if self.scale else square
@@ -70,7 +67,7 @@ class EncodedFit(Record):
     def spread(self) -> float:
         """The residuals' robust standard deviation, corrected for the degrees of freedom."""
         residual = (self.encoded - self.predicted)[self.used]
-        size = float(robust_deviation(residual, residual.isfinite()))
+        size = float(robust.robust_deviation(residual, residual.isfinite()))
         return size * (len(residual) / max(self.freedom, 1)) ** 0.5
 
 
@@ -86,7 +83,7 @@ def fit_encoded(start: EncodedFit, response: Response, iterations: int = 1) -> E
     """
     about, weight, left = start.predicted, start.used * start.weight, start.left
     for iteration in range(iterations + 1):
-        linear, rate = with_slope(response.linear_from_encoded, about)
+        linear, rate = robust.with_slope(response.linear_from_encoded, about)
         target = linear + rate * (start.encoded - about)
         heavy = weight / rate.square()
         matrix = low_rank.low_rank_problem(target[None], (heavy / heavy.max())[None], left[None])
@@ -95,11 +92,11 @@ def fit_encoded(start: EncodedFit, response: Response, iterations: int = 1) -> E
         about = response.encoded_from_linear(left @ solved.shading[0]).clamp_min(0.02)
         if iteration < iterations:
             scale = torch.tensor(start.scale).to(about)
-            weight = start.used * cauchy_weights(start.encoded - about, scale)
+            weight = start.used * robust.cauchy_weights(start.encoded - about, scale)
     return start.replace(predicted=about, weight=weight, left=left)
 
 
-def enough(used: Bool[Tensor, "view sample"], rank: int) -> Bool[Tensor, "view sample"]:
+def enough(used: Seen, rank: int) -> Seen:
     """Leave out samples and views with too few entries to constrain the factors."""
     for _ in range(2):
         used = used & (used.sum(dim=0) > rank) & (used.sum(dim=1, keepdim=True) > 2 * rank)
@@ -164,9 +161,7 @@ class GammaEstimate(Record):
         return f"gamma is not determined by these photographs, {why} ({found})."
 
 
-def estimate_gamma(
-    encoded: Float[Tensor, "view sample"], seen: Bool[Tensor, "view sample"], *, rank: int = 4
-) -> GammaEstimate:
+def estimate_gamma(encoded: Samples, seen: Seen, *, rank: int = 4) -> GammaEstimate:
     """Estimate gamma from the same surface samples under several lights.
 
     Dark and saturated values are left out: first by their observed values, then by those the fit
@@ -237,9 +232,7 @@ def gamma_of_photographs(views: Views, *, mask: Mask | None = None, rank: int = 
     return estimate_gamma(encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank)
 
 
-def _sampled(
-    encoded: Float[Tensor, "view sample"], seen: Bool[Tensor, "view sample"], rank: int
-) -> EncodedFit:
+def _sampled(encoded: Samples, seen: Seen, rank: int) -> EncodedFit:
     """Subsample, and use entries that are neither dark nor saturated."""
     used = enough(seen & (encoded > _DARK) & (encoded < SATURATED), rank)
     views, samples = used.any(dim=1), used.any(dim=0).nonzero().flatten()
@@ -256,12 +249,7 @@ def _sampled(
     return _start(torch.where(seen, encoded, 0)[views][:, chosen].double(), used, rank, 0.0)
 
 
-def _start(
-    encoded: Float[Tensor, "view sample"],
-    used: Bool[Tensor, "view sample"],
-    rank: int,
-    scale: float,
-) -> EncodedFit:
+def _start(encoded: Samples, used: Seen, rank: int, scale: float) -> EncodedFit:
     """Start from the values, with the left factor under the least gamma."""
     mask, about = used.double(), torch.where(used, encoded, 0.5)
     radiance = Gamma(exponent=MIN_GAMMA).linear_from_encoded(about)
@@ -281,13 +269,14 @@ def _chosen_by_fit(fit: EncodedFit) -> EncodedFit:
     if int(used.any(dim=0).sum()) <= 4 * rank:
         used = fit.used
     residual = (encoded - predicted)[used]
-    scale = CAUCHY_TUNING * float(robust_deviation(residual, residual.isfinite()))
+    scale = robust.CAUCHY_TUNING * float(robust.robust_deviation(residual, residual.isfinite()))
     return _start(encoded, used, rank, max(scale, _MIN_SCALE))
 
 
 def _grid_search(fit: EncodedFit, iterations: int) -> tuple[float, EncodedFit]:
-    found = []
-    for gamma in np.geomspace(MIN_GAMMA, MAX_GAMMA, _TRIALS).tolist():
+    found, step = [], (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
+    for trial in range(_TRIALS):
+        gamma = MIN_GAMMA * step**trial
         fit = fit_encoded(fit, Gamma(exponent=gamma), iterations)
         found.append((gamma, fit))
     return min(found, key=lambda one: float(one[1].loss.sum()))

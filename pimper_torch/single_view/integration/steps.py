@@ -23,6 +23,9 @@ from pimper_torch.ground.shapes import Mask, Matrix3, Scalars
 from pimper_torch.paper.integrate import fill_smoothly
 from pimper_torch.records import Record
 
+Changes = Float[Tensor, "line step"]
+Known = Bool[Tensor, "line step"]
+
 # Cosine between ray and normal below which a normal is not used: a choice, its slope is 1000.
 _GRAZING = 1e-3
 
@@ -182,11 +185,7 @@ def _steps(
     )
 
 
-def _curved(
-    step: Float[Tensor, "line step"],
-    rotation: Float[Tensor, "line step"],
-    known: Bool[Tensor, "line step"],
-) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
+def _curved(step: Changes, rotation: Changes, known: Known) -> tuple[Changes, Changes]:
     """Correct steps to those of the cubic through four slopes, and give kinks.
 
     The step between tangent planes is wrong by a twelfth of the surface's third derivative,
@@ -201,18 +200,14 @@ def _curved(
     return step - torch.where(smooth, difference, 0) / 24, kink
 
 
-def _excess(
-    change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
-) -> Float[Tensor, "line step"]:
+def _excess(change: Changes, known: Known) -> Changes:
     """Return the excess of a slope's change over its neighbours'; no gradient."""
     before, after = _beside(change.detach(), known)
     beside = torch.maximum(before.abs(), after.abs())
     return torch.where(known, (change.detach().abs() - beside).clamp_min(0), 0)
 
 
-def _beside(
-    change: Float[Tensor, "line step"], known: Bool[Tensor, "line step"]
-) -> tuple[Float[Tensor, "line step"], Float[Tensor, "line step"]]:
+def _beside(change: Changes, known: Known) -> tuple[Changes, Changes]:
     """Return the changes on the steps before and after each; 0 where those are not reliable."""
     wide = pad(torch.where(known, change, 0), (1, 1))
     return wide[:, :-2], wide[:, 2:]

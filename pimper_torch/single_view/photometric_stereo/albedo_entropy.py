@@ -16,8 +16,12 @@ from torch import Tensor
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import BasRelief, standard_relief
 
+Shading = Float[Tensor, "3 pixel"]
+Labels = Int[Tensor, " pixel"]
+Candidates = Float[Tensor, "candidate 3"]
 
-def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Int[Tensor, " pixel"]:
+
+def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Labels:
     """Cluster pixels of similar chromaticity, the lights' colours removed.
 
     The logarithms ``e`` and ``a`` are estimated in turn by weighted least squares, weights the
@@ -82,9 +86,7 @@ _REACH = 3.0
 _CANDIDATES, _FEW_PIXELS = 200, 1000
 
 
-def resolve_by_albedo_entropy(
-    shading: Float[Tensor, "3 pixel"], groups: Int[Tensor, " pixel"] | None = None
-) -> BasRelief:
+def resolve_by_albedo_entropy(shading: Shading, groups: Labels | None = None) -> BasRelief:
     r"""Find the bas-relief transformation of minimum albedo entropy; constant to autograd.
 
     Minimizes the entropy of :math:`\log \lVert G b \rVert`, smoothed by a kernel: first on a grid
@@ -126,10 +128,7 @@ def resolve_by_albedo_entropy(
 
 
 def albedo_entropy(
-    shading: Float[Tensor, "3 pixel"],
-    labels: Int[Tensor, " pixel"],
-    candidates: Float[Tensor, "candidate 3"],
-    width: float,
+    shading: Shading, labels: Labels, candidates: Candidates, width: float
 ) -> Float[Tensor, " candidate"]:
     """Return the entropy of log-albedo within groups after each transformation.
 
@@ -165,7 +164,7 @@ def albedo_entropy(
     return torch.cat(found)
 
 
-def _minimized(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> Float[Tensor, " 3"]:
+def _minimized(b: Shading, labels: Labels) -> Float[Tensor, " 3"]:
     few, many = (slice(None, None, -(-len(labels) // limit)) for limit in (_FEW_PIXELS, 20_000))
     tilts = torch.linspace(-_MAX_TILT, _MAX_TILT, _TILTS).to(b)
     flat, steep = (torch.tensor(value).to(b).log() for value in (_MIN_LAMBDA, _MAX_LAMBDA))
@@ -188,12 +187,8 @@ def _minimized(b: Float[Tensor, "3 pixel"], labels: Int[Tensor, " pixel"]) -> Fl
 
 
 def _local_search(
-    b: Float[Tensor, "3 pixel"],
-    labels: Int[Tensor, " pixel"],
-    best: Float[Tensor, "candidate 3"],
-    step: Float[Tensor, " 3"],
-    width: float,
-) -> tuple[Float[Tensor, "candidate 3"], Float[Tensor, " candidate"]]:
+    b: Shading, labels: Labels, best: Candidates, step: Float[Tensor, " 3"], width: float
+) -> tuple[Candidates, Float[Tensor, " candidate"]]:
     """Move each candidate to its best neighbour a step away until none is better."""
     around = torch.cartesian_prod(*[torch.arange(-1, 2).to(b)] * 3) * step
     best = best.clone()

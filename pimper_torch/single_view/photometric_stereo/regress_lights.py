@@ -23,6 +23,10 @@ from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.low_rank import brightness_guess, low_rank_problem
 
+Samples = Float[Tensor, "view pixel"]
+Lights = Float[Tensor, "view unknown"]
+Colours = Float[Tensor, "view channel pixel"]
+
 # The scale of the weights starts at this multiple and is multiplied by the second per iteration,
 # down to 1: choices, so that the initial fit does not decide which samples are outliers.
 _WIDEST, _NARROWING = 4.0, 0.7
@@ -38,18 +42,12 @@ class Factored(Record):
         weight: Final weight of each sample; 0 where missing or in shadow.
     """
 
-    lights: Float[Tensor, "view unknown"]
+    lights: Lights
     shading: Float[Tensor, "unknown pixel"]
-    weight: Float[Tensor, "view pixel"]
+    weight: Samples
 
 
-def regress(
-    radiance: Float[Tensor, "view pixel"],
-    weight: Float[Tensor, "view pixel"],
-    lights: Float[Tensor, "view unknown"],
-    *,
-    robust: bool = True,
-) -> Factored:
+def regress(radiance: Samples, weight: Samples, lights: Lights, *, robust: bool = True) -> Factored:
     r"""Fit each pixel's shading vector to its radiance; float64, constant to autograd.
 
     Plain: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
@@ -76,12 +74,7 @@ def regress(
         return found
 
 
-def reweigh(
-    radiance: Float[Tensor, "view pixel"],
-    weight: Float[Tensor, "view pixel"],
-    predicted: Float[Tensor, "view pixel"],
-    widen: float,
-) -> Float[Tensor, "view pixel"]:
+def reweigh(radiance: Samples, weight: Samples, predicted: Samples, widen: float) -> Samples:
     """Return the samples' weights by their residuals; 0 where a light comes from behind.
 
     Args:
@@ -97,9 +90,7 @@ def reweigh(
     return weight * cauchy_weights(residual, widen * scale.maximum(1e-4 * level)) * lit
 
 
-def brightness(
-    radiance: Float[Tensor, "view pixel"], seen: Bool[Tensor, "view pixel"]
-) -> Float[Tensor, "view pixel"]:
+def brightness(radiance: Samples, seen: Bool[Tensor, "view pixel"]) -> Samples:
     """Return weights proportional to brightness, up to the median of the pixel."""
     x = torch.where(seen, radiance, torch.nan)
     centre = x.nanmedian(dim=0).values.nan_to_num(nan=0.0)
@@ -108,9 +99,7 @@ def brightness(
     return fraction.clamp_max(1)
 
 
-def determined(
-    weight: Float[Tensor, "view pixel"], lights: Float[Tensor, "view unknown"]
-) -> Bool[Tensor, " pixel"]:
+def determined(weight: Samples, lights: Lights) -> Bool[Tensor, " pixel"]:
     """Find which pixels have as many samples as unknowns, under lights that span them."""
     count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
     basis = normalize(lights.double(), dim=0, eps=1e-300)
@@ -121,11 +110,7 @@ def determined(
     return (count >= unknowns) & spanned & (values[:, -1] > 0)
 
 
-def _fit(
-    x: Float[Tensor, "view pixel"],
-    weight: Float[Tensor, "view pixel"],
-    rows: Float[Tensor, "view unknown"],
-) -> Factored:
+def _fit(x: Samples, weight: Samples, rows: Lights) -> Factored:
     factored = PackedCholesky(outer(rows.mT) @ weight, rows.shape[1])
     shading = factored.solve(rows.mT @ (weight * x))
     return Factored(lights=rows, shading=shading, weight=weight)
@@ -143,15 +128,11 @@ class StereoSolution(Record):
     normals: Float[Tensor, "3 pixel"]
     albedo: Float[Tensor, "channel pixel"]
     lights: Float[Tensor, "view 3"]
-    weight: Float[Tensor, "view pixel"]
+    weight: Samples
 
 
 def calibrated_stereo(
-    radiance: Float[Tensor, "view channel pixel"],
-    weight: Float[Tensor, "view pixel"],
-    lights: Float[Tensor, "view 3"],
-    *,
-    robust: bool = True,
+    radiance: Colours, weight: Samples, lights: Float[Tensor, "view 3"], *, robust: bool = True
 ) -> StereoSolution:
     r"""Recover normals and albedos of pixels under known distant lights; constant to autograd.
 
@@ -183,9 +164,7 @@ def calibrated_stereo(
 
 
 def chromatic_albedo(
-    radiance: Float[Tensor, "view channel pixel"],
-    weight: Float[Tensor, "view pixel"],
-    shade: Float[Tensor, "view pixel"],
+    radiance: Colours, weight: Samples, shade: Samples
 ) -> Float[Tensor, "channel pixel"]:
     """Fit the albedo of each colour, not negative, to the shading of albedo 1."""
     x = torch.where((weight > 0)[:, None], radiance, 0).to(shade)
@@ -200,11 +179,7 @@ _FIRST_STEPS, _NEXT_STEPS, _NARROWING_FACTORED = 100, 5, 0.8
 
 
 def factorize_photographs(
-    radiance: Float[Tensor, "view pixel"],
-    weight: Float[Tensor, "view pixel"],
-    rank: int,
-    *,
-    robust: bool = True,
+    radiance: Samples, weight: Samples, rank: int, *, robust: bool = True
 ) -> Factored:
     """Factorize photographs with missing samples, shadows and highlights; constant to autograd.
 

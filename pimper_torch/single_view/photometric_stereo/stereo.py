@@ -18,7 +18,9 @@ from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
 from pimper_torch.single_view.photometric_stereo.integrability import integrable
 from pimper_torch.single_view.photometric_stereo.perspective import factorize_in_perspective
 from pimper_torch.single_view.photometric_stereo.regress_lights import (
+    Colours,
     Factored,
+    Samples,
     StereoSolution,
     calibrated_stereo,
     chromatic_albedo,
@@ -148,11 +150,7 @@ _FACTOR = "a factor between albedo and light"
 
 
 def _integrable(
-    radiance: Float[Tensor, "view channel pixel"],
-    weight: Float[Tensor, "view pixel"],
-    mask: Mask,
-    resolve: str,
-    robust: bool,
+    radiance: Colours, weight: Samples, mask: Mask, resolve: str, robust: bool
 ) -> tuple[Factored, bas_relief.BasRelief]:
     """Factorize the mean of the colours, make it integrable, and resolve its bas-relief."""
     factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)
@@ -173,7 +171,7 @@ def _integrable(
     return moved, relief
 
 
-def _lambertian(radiance: Float[Tensor, "view channel pixel"], factors: Factored) -> StereoSolution:
+def _lambertian(radiance: Colours, factors: Factored) -> StereoSolution:
     """Return normals and the albedo of each colour, under lights of the median length 1."""
     normals = normalize(factors.shading, dim=0, eps=1e-300)
     shade = (factors.lights @ normals).clamp_min(0)
@@ -189,11 +187,7 @@ def _lambertian(radiance: Float[Tensor, "view channel pixel"], factors: Factored
 
 
 def _spread_out(
-    found: StereoSolution,
-    given: Float[Tensor, "view pixel"],
-    mask: Mask,
-    used: Bool[Tensor, " view"],
-    like: Tensor,
+    found: StereoSolution, given: Samples, mask: Mask, used: Bool[Tensor, " all"], like: Tensor
 ) -> PhotometricStereo:
     def raster(values: Tensor) -> Tensor:
         whole = values.new_zeros(len(values), *mask.shape)
