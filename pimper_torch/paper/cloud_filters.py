@@ -26,15 +26,12 @@ def behind_others(
     nearest = nearest_in_image(pixels, 24)
     steps = points_cam[nearest] - points_cam[:, None]
     front = (steps[..., 2] < 0) & (_steepness(points_cam, nearest) > 3.0)
-    count = front.sum(dim=1)
     aside = pixels[nearest] - pixels[:, None]
     angle = torch.atan2(aside[..., 1], aside[..., 0])
     ordered = torch.where(front, angle, torch.inf).sort(dim=1).values
-    gaps = torch.diff(ordered, dim=1)
-    widest = torch.where(gaps.isfinite(), gaps, 0).amax(dim=1)
-    last = ordered.gather(1, (count - 1).clamp_min(0)[:, None])[:, 0]
-    widest = torch.maximum(widest, ordered[:, 0] + 2 * torch.pi - last)
-    return (count >= 3) & ((widest < torch.pi) | ~observed)
+    around = ordered[:, :1] + 2 * torch.pi  # the first once more, after the last
+    gaps = torch.cat([ordered.minimum(around), around], dim=1).diff(dim=1)
+    return (front.sum(dim=1) >= 3) & ((gaps.amax(dim=1) < torch.pi) | ~observed)
 
 
 def neighbours_agree(
@@ -164,9 +161,8 @@ def delaunay(pixels: Pixels) -> Faces:
     """Triangulate points of an image, so that faces show their front to its camera."""
     simplices = Delaunay(pixels.detach().cpu().double().numpy()).simplices
     faces = torch.from_numpy(simplices.astype(np.int64)).to(pixels.device)
-    a, b, c = pixels[faces].unbind(dim=1)
-    ab, ac = b - a, c - a
-    rotated = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0
+    corners = pixels[faces]
+    rotated = torch.linalg.det(corners[:, 1:] - corners[:, :1]) > 0
     return torch.where(rotated[:, None], faces.flip(1), faces)
 
 

@@ -101,15 +101,12 @@ def solve_poisson(
     """
     height, width = source.shape[-2:]
     rows, cols = cosine_basis(height, source), cosine_basis(width, source)
-    stiffness = _stiffness(height, source)[:, None] + _stiffness(width, source)
+    # The steps of a cosine are orthogonal to those of the others.
+    down, right = (basis.diff(dim=1).square().sum(dim=1) for basis in (rows, cols))
+    stiffness = down[:, None] + right
     # No height answers to the mean; dividing it by infinity removes it.
     stiffness = stiffness.masked_fill(stiffness == 0, torch.inf)
     return rows.mT @ ((rows @ source @ cols.mT) / stiffness) @ cols
-
-
-def _stiffness(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, " {size}"]:
-    frequency = torch.arange(size, device=like.device, dtype=like.dtype)
-    return 4 * (math.pi / (2 * size) * frequency).sin() ** 2
 
 
 class Integrate(Stage):
@@ -142,12 +139,9 @@ class Integrate(Stage):
             offset = (found[:, 0] - corners[..., 2]).mean(dim=1)
             depth = height_field - offset[:, None, None]
             has_data = photometry.valid.flatten(1).any(dim=1)
-            depths = Depths(
-                depth=depth,
-                valid=templates.inside & has_data[:, None, None],
-                transform=depth.new_tensor([0, 0, 1, 0]).expand(len(depth), 4),
-            )
-            buckets.append(depths)
+            identity = depth.new_tensor([0, 0, 1, 0]).expand(len(depth), 4)
+            valid = templates.inside & has_data[:, None, None]
+            buckets.append(Depths(depth=depth, valid=valid, transform=identity))
         return DepthPatches(photometric=photometric, buckets=tuple(buckets))
 
 

@@ -193,10 +193,9 @@ def factorize_from_many(
         )
     best: Factors | None = None
     residuals: list[float] = []
-    repeated = False
     seen = weight > 0
     level = float((weight[seen] * matrix[seen].square()).sum() / weight[seen].sum()) ** 0.5
-    while len(residuals) < max_starts:
+    for _ in range(max_starts):
         start = random_left(1, matrix.shape[0], rank, generator).to(matrix.device)
         problem = low_rank_problem(matrix[None], weight[None], start)
         found = solve_variable_projection(problem, 300, 1e-9)

@@ -119,10 +119,8 @@ class RasterSystem:
     def _find_free(self, edges: Tensor, anchored: Tensor) -> None:
         """Find the connected components without anchor, but for single pixels."""
         label = graph_components(edges, len(anchored)).long()
-        known = torch.zeros(len(label) + 1, dtype=torch.bool)
-        known[label[anchored]] = True
-        connected = torch.zeros(len(label), dtype=torch.bool)
-        connected[edges.flatten()] = True
+        known = label[anchored].bincount(minlength=len(label) + 1) > 0
+        connected = edges.flatten().bincount(minlength=len(label)) > 0
         self._pixel = (connected & ~known[label]).nonzero()[:, 0]
         free, self._component = torch.unique(label[self._pixel], return_inverse=True)
         root = self._pixel.new_full((len(free),), len(label))

@@ -98,13 +98,13 @@ def curls(pseudo: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"], mas
             "needed: 6 or more. Widen the mask."
         )
     mean = blocks[some, :-1] / total[some, None]
-    axes = torch.eye(len(s)).to(s)
-    parts = [wedge(unit.mT, (inverse * axis[:, None]).mT) for axis in axes]
+    axes = inverse[:, None, None] * torch.eye(len(s)).to(s)
+    parts = wedge(unit.mT[:, None].expand_as(axes), axes)
     return Curls(
         across=mean[:, :3],
         down=mean[:, 3:],
         weight=total[some],
-        noise=torch.stack([(reliability[:, None] * part).mT @ part for part in parts]).sum(dim=0),
+        noise=torch.einsum("p,pai,paj->ij", reliability, parts, parts),
     )
 
 
