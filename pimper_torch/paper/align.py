@@ -16,6 +16,7 @@ from pimper_torch.paper.seams import (
     Pulls,
     Seams,
     Transforms,
+    by_facet,
     curvature_along,
     find_seams,
     meet_overlaps,
@@ -56,24 +57,21 @@ class Anchors(Record):
 
 def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
     """Anchor every height field at its facet's three vertices."""
-    faces, covariance = patches.coarse.mesh.faces, patches.coarse.covariance_world
-    vertices = patches.coarse.mesh.vertices_world[faces].double()
-    samples = torch.zeros_like(vertices)
-    variance = torch.zeros_like(samples[..., 0])
-    known = torch.zeros_like(faces, dtype=torch.bool)
+    mesh, covariance = patches.coarse.mesh, patches.coarse.covariance_world
+    vertices = mesh.vertices_world[mesh.faces].double()
+    if covariance is None:
+        covariance = vertices.new_zeros(len(mesh.vertices_world), 3, 3)
+    found = []
     for templates, depths in zip(patches.buckets, buckets, strict=True):
         facet, frames = templates.facet, templates.patch_from_world.double()
         across = transform(frames, vertices[facet])[..., :2]
         grid = templates.origin.double(), templates.spacing.double()
         height = sample_raster(depths.depth[:, None], across, *grid, valid=depths.valid)
         support = sample_raster(depths.valid[:, None].to(depths.depth), across, *grid)
-        found = torch.cat([across, height.mT], dim=-1)
-        samples = samples.index_copy(0, facet, found)
-        known[facet] = support[:, 0] > 0.5
-        if covariance is not None:
-            along = frames[:, None, 2, :3, None]
-            spread = along.mT @ covariance[faces[facet]].double() @ along
-            variance[facet] = spread[..., 0, 0].clamp_min(0)
+        along, spread = frames[:, 2, :3], covariance[mesh.faces[facet]].double()
+        variance = torch.einsum("fi,fvij,fj->fv", along, spread, along).clamp_min(0)
+        found.append((torch.cat([across, height.mT], dim=-1), variance, support[:, 0] > 0.5))
+    samples, variance, known = (by_facet(patches, parts) for parts in zip(*found, strict=True))
     return Anchors(samples=samples, variance=variance, known=known)
 
 
@@ -159,8 +157,7 @@ class Align(Stage):
             transforms = torch.where(aligned, transforms, on_mesh)
             with torch.no_grad():
                 pulls = self._met(depths, seams, anchors, transforms)
-        with torch.no_grad():
-            mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * seams.units[3]
+        mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * seams.units[3]
         return depths.replace(
             buckets=_apply(depths, transforms * seams.units, status),
             mismatch=mismatch.detach().to(depths.buckets[0].depth),

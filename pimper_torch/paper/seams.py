@@ -23,6 +23,7 @@ from pimper_torch.records.patches import Depths
 
 Transforms = Float[Tensor, "face 4"]
 PerSide = Float[Tensor, "seam 2"]
+PerRay = Float[Tensor, "seam 2 row column 3"]
 PerSeam = Float[Tensor, " seam"]
 
 
@@ -59,8 +60,8 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
     Args:
         reach_samples: Distance of the outermost lines from the edge, in template samples.
     """
-    frames = _by_facet(patches, [one.patch_from_world for one in patches.buckets]).double()
-    spacing = _by_facet(patches, [one.spacing for one in patches.buckets]).double()
+    frames = by_facet(patches, [one.patch_from_world for one in patches.buckets]).double()
+    spacing = by_facet(patches, [one.spacing for one in patches.buckets]).double()
     vertices = patches.coarse.mesh.vertices_world.double()
     edges, edge_of = face_edges(patches.coarse.mesh.faces)
     shared = face_counts(edge_of) == 2
@@ -92,11 +93,7 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
 
 def meet_overlaps(
     seams: Seams, patches: PatchSet, buckets: tuple[Depths, ...], transforms: Transforms
-) -> tuple[
-    Float[Tensor, "seam 2 row column 3"],
-    Float[Tensor, "seam 2 row column 3"],
-    Bool[Tensor, "seam row column"],
-]:
+) -> tuple[PerRay, PerRay, Bool[Tensor, "seam row column"]]:
     """Meet both height fields of every seam, as transformed now, with the seam's rays.
 
     Returns:
@@ -133,7 +130,7 @@ def meet_overlaps(
         met = hit.reshape(shape[:3]) & (own >= 0)[..., None]
         found.append((points.reshape(shape), feet_world.reshape(shape), met))
     raster = seams.origins.shape[1:3]
-    joined = [_by_facet(patches, parts).flatten(0, 1) for parts in zip(*found, strict=True)]
+    joined = [by_facet(patches, parts).flatten(0, 1) for parts in zip(*found, strict=True)]
     samples, feet, met = (
         part[seams.place_of].reshape(*seams.place_of.shape, *raster, *part.shape[2:])
         for part in joined
@@ -141,7 +138,7 @@ def meet_overlaps(
     return samples, feet, met.all(dim=1)
 
 
-def _by_facet(patches: PatchSet, parts: Iterable[Tensor]) -> Tensor:
+def by_facet(patches: PatchSet, parts: Iterable[Tensor]) -> Tensor:
     """Join values of all buckets in the order of the facets."""
     order = torch.argsort(torch.cat([templates.facet for templates in patches.buckets]))
     return torch.cat(list(parts))[order]

@@ -83,25 +83,23 @@ def integrate_normal_map(
     """
     normals = torch.as_tensor(normals)
     mask, weight, known_depth = (
-        None if raster is None else torch.as_tensor(raster)
-        for raster in (mask, weight, known_depth)
+        torch.full(normals.shape[:2], value, device=normals.device)
+        if raster is None
+        else torch.as_tensor(raster)
+        for raster, value in ((mask, True), (weight, 1.0), (known_depth, math.nan))
     )
     _refuse(normals, mask, weight, known_depth, spacing)
-    mask = torch.ones_like(normals[..., 0], dtype=torch.bool) if mask is None else mask.bool()
+    mask = mask.bool()
     intrinsics = None if intrinsics is None else torch.as_tensor(intrinsics).to(normals)
     rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
     box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
     frame = (box[1].start, mask.shape[1] - box[1].stop, box[0].start, mask.shape[0] - box[0].stop)
     if intrinsics is not None:
         intrinsics = crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
-    mask = mask[box]  # the box of the mask, to save time and memory
-    weight, known_depth = (
-        None if raster is None else raster[box] for raster in (weight, known_depth)
-    )
+    # The box of the mask, to save time and memory.
+    mask, weight, known_depth = mask[box], weight[box], known_depth[box]
     length = normals[box].norm(dim=-1)
-    usable = mask & (length > 0) & length.isfinite()
-    if weight is not None:
-        usable = usable & (weight > 0)
+    usable = mask & (length > 0) & length.isfinite() & (weight > 0)
     unit = normals[box] / torch.where(usable, length, 1)[..., None]
     unit = torch.where(usable[..., None], unit, torch.nan)
     if intrinsics is None:
@@ -127,18 +125,14 @@ def integrate_normal_map(
     )
 
 
-def _weights(steps: Steps, weight: Map | None) -> Float[Tensor, " step"]:
+def _weights(steps: Steps, weight: Map) -> Float[Tensor, " step"]:
     """Return the weights of squared differences of the unknown, zero outside the mask."""
-    reliability = torch.where(steps.valid, 1.0 if weight is None else weight.double(), 0).double()
+    reliability = torch.where(steps.valid, weight.double(), 0)
     least = torch.where(steps.reliable, at_both_ends(torch.minimum, reliability), _FILLED_WEIGHT)
     return at_both_ends(torch.logical_and, steps.inside) * least / steps.unit**2
 
 
-def _known(
-    depth: Map | None, mask: Mask, steps: Steps, intrinsics: Matrix3 | None
-) -> tuple[Tensor | None, Tensor | None]:
-    if depth is None:
-        return None, None
+def _known(depth: Map, mask: Mask, steps: Steps, intrinsics: Matrix3 | None) -> tuple[Map, Map]:
     given = depth.isfinite() & mask
     if intrinsics is not None and bool((depth[given] <= 0).any()):
         raise InputError(
@@ -151,11 +145,7 @@ def _known(
 
 
 def _refuse(
-    normals: Tensor,
-    mask: Tensor | None,
-    weight: Tensor | None,
-    known_depth: Tensor | None,
-    spacing: tuple[float, float],
+    normals: Tensor, mask: Tensor, weight: Tensor, known: Tensor, spacing: tuple[float, float]
 ) -> None:
     """Refuse unusable rasters, and normals that are coded as colours or face away."""
     if normals.ndim != 3 or normals.shape[-1] != 3 or not normals.is_floating_point():
@@ -164,18 +154,18 @@ def _refuse(
             f"{tuple(normals.shape)}; needed: floating point, height width 3."
         )
     size = tuple(normals.shape[:2])
-    for name, raster in {"mask": mask, "weight": weight, "known_depth": known_depth}.items():
-        if raster is not None and raster.shape != size:
+    for name, raster in {"mask": mask, "weight": weight, "known_depth": known}.items():
+        if raster.shape != size:
             shape = tuple(raster.shape)
             raise InputError(f"{name} is {shape}, the normals are {size}; needed: one size.")
-    if weight is not None and not bool((weight >= 0).all()):
+    if not bool((weight >= 0).all()):
         count = int((~(weight >= 0)).sum())
         raise InputError(f"weight has {count} values that are negative or NaN; needed: 0 or more.")
-    if mask is not None and not bool(mask.any()):
+    if not bool(mask.any()):
         raise InputError("mask has no pixel; at least one must be inside.")
     if not all(0 < step < math.inf for step in spacing):
         raise InputError(f"spacing is {spacing}; both distances must be above 0.")
-    some = normals.detach().flatten(0, 1) if mask is None else normals.detach()[mask.bool()]
+    some = normals.detach()[mask.bool()]
     some = some[some.isfinite().all(dim=-1) & (some != 0).any(dim=-1)]
     axes = "needed: x right, y down, z into the surface, n_z < 0 where it faces the viewer"
     if len(some) > 1 and bool(((some >= 0) & (some <= 1)).all()):

@@ -106,9 +106,9 @@ def photometric_stereo(
     """
     if method not in METHODS:
         raise InputError(f"method is {method!r}; needed: one of {', '.join(METHODS)}.")
-    _refuse(images, mask, method, resolve, lights, intrinsics, weight)
+    given = images.new_ones(len(images), *mask.shape) if weight is None else weight
+    _refuse(images, mask, method, resolve, lights, intrinsics, given)
     with torch.no_grad():
-        given = images.new_ones(len(images), *mask.shape) if weight is None else weight
         samples = images[:, :, mask]
         seen = samples.isfinite().all(dim=1)
         heavy = torch.where(seen, given[:, mask], 0).double()
@@ -214,11 +214,10 @@ def _refuse(
     resolve: str | None,
     lights: Tensor | None,
     intrinsics: Tensor | None,
-    weight: Tensor | None,
+    given: Tensor,
 ) -> None:
     size, seen, count = tuple(mask.shape), tuple(images.shape[2:]), len(images)
     num_lights = 0 if lights is None else len(lights)
-    given = torch.ones(count, *size) if weight is None else weight
     resolvers = METHODS[method]
     for wrong, found, needed in (
         (seen != size, f"images are {seen}, the mask {size}", "one size; resize the mask"),
