@@ -147,7 +147,6 @@ def _deviation(
     design = torch.cat([scaled[..., :2], torch.ones_like(scaled[..., :1])], dim=-1)
     ridge = 1e-3 * torch.eye(3, dtype=design.dtype, device=design.device)
     weight = 1 / (1 + scaled[..., 2].square())  # start from those on the point's own side
-    plane = torch.zeros_like(design[:, 0])
     for _ in range(5):  # re-weighted: a neighbour across a depth edge must not tilt the plane
         normal = (weight[..., None] * design).mT @ design + ridge
         right = ((weight * scaled[..., 2])[..., None] * design).sum(dim=1)

@@ -34,30 +34,21 @@ def fill_smoothly(
 
     Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.4.
     """
-    fraction = weight[:, None]
-    return _blended(torch.where(fraction > 0, values, 0) * fraction, fraction)
-
-
-def _blended(
-    weighted: Float[Tensor, "patch channel height width"],
-    weight: Float[Tensor, "patch 1 height width"],
-) -> Float[Tensor, "patch channel height width"]:
-    size = weight.shape[-2:]
-    known = torch.where(weight > 0, weighted / torch.where(weight > 0, weight, 1), 0)
+    size, fraction = weight.shape[-2:], weight[:, None]
+    known = torch.where(fraction > 0, values, 0)
     if max(size) == 1:
         return known
     window = [min(2, side) for side in size]
-    coarse_weight, coarse_weighted = (
+    mean_weight, mean = (
         avg_pool2d(raster, kernel_size=window, stride=window, ceil_mode=True)
-        for raster in (weight, weighted)
+        for raster in (fraction, fraction * known)
     )
     # A parent of one known child knows as much as that child: without saturation, thin
     # evidence would fade on its way up, and the mean of the whole patch would win.
-    full = (4 * coarse_weight).clamp_max(1)
-    gain = full / torch.where(coarse_weight > 0, coarse_weight, 1)
-    coarse = _blended(coarse_weighted * gain, full)
+    full = (4 * mean_weight[:, 0]).clamp_max(1)
+    coarse = fill_smoothly(mean / torch.where(mean_weight > 0, mean_weight, 1), full)
     around = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
-    return weight * known + (1 - weight) * around
+    return fraction * known + (1 - fraction) * around
 
 
 def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:

@@ -76,8 +76,7 @@ def scaled(record: AnyRecord, factor: float) -> AnyRecord:
             [25.4000, 25.4000,  0.0000]])
     """
     require(0 < factor < float("inf"), "factor", factor, "above 0 and finite")
-    copies: dict[int, Any] = {}
-    found: AnyRecord = record if factor == 1 else _copy(record, factor, copies)
+    found: AnyRecord = record if factor == 1 else _copy(record, factor, {})
     return found
 
 
