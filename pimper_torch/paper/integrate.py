@@ -10,7 +10,7 @@ import math
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
 from pimper_torch.ground.geometry.height_fields import sample_raster
 from pimper_torch.ground.geometry.rigid import transform
@@ -54,9 +54,7 @@ def fill_smoothly(
 def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:
     """Return the orthonormal cosines (DCT-II), one a row, with device and dtype of ``like``."""
     frequency = torch.arange(size, device=like.device, dtype=like.dtype)
-    basis = (math.pi / size * frequency[:, None] * (frequency + 0.5)).cos()
-    basis = basis * math.sqrt(2 / size)
-    return torch.cat([basis[:1] * math.sqrt(0.5), basis[1:]])
+    return normalize((math.pi / size * frequency[:, None] * (frequency + 0.5)).cos(), dim=1)
 
 
 def differences(
@@ -71,7 +69,6 @@ def differences_transposed(
     down: Float[Tensor, "*batch steps_down width"],
 ) -> Float[Tensor, "*batch height width"]:
     """Apply the transpose of :func:`differences`: minus the divergence."""
-    pad = torch.nn.functional.pad
     across = pad(right, (1, 0)) - pad(right, (0, 1))
     return across + pad(down, (0, 0, 1, 0)) - pad(down, (0, 0, 0, 1))
 

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import map_coordinates
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
-from pimper_torch.ground.geometry.pixels import grid_from_pixels, homogeneous, pixels_from_indices
-from pimper_torch.ground.shapes import Map, Scalars
+from pimper_torch.ground.geometry import pixels
+from pimper_torch.ground.shapes import Map
 from pimper_torch.records import Record
 
 # Of 2^36 squares of random cells 587 x 4 are read as a marker where no cell may be wrong: 3 in
@@ -50,13 +50,11 @@ def find_squares(picture: UInt8[Tensor, "height width"]) -> list[Square]:
     corners, codes, _ = detector.detectMarkers(np.ascontiguousarray(picture.numpy()))
     if codes is None:
         return []
-    numbers = [int(code) for code in np.ravel(codes)]
+    numbers = np.ravel(codes).tolist()
+    indices = torch.from_numpy(np.array(corners, np.float64).reshape(-1, 4, 2))
     return [
-        Square(
-            code=code,
-            corners=pixels_from_indices(torch.from_numpy(np.array(four, np.float64).reshape(4, 2))),
-        )
-        for code, four in zip(numbers, corners, strict=True)
+        Square(code=code, corners=four)
+        for code, four in zip(numbers, pixels.pixels_from_indices(indices), strict=True)
         if numbers.count(code) == 1
     ]
 
@@ -105,24 +103,17 @@ def _refined_once(
     across = reach[:, None] * torch.linspace(-1, 1, count).to(corners)
     base = corners[:, :, None] + share[:, None] * along[:, :, None]
     places = base[:, :, :, None] + across[:, None, None, :, None] * outward[:, :, None, None]
-    steps = _looked_up(picture, places).diff(dim=-1).clamp_min(0)  # keeps NaN
+    at = pixels.indices_from_pixels(places).flip(-1).movedim(-1, 0).numpy()
+    read = map_coordinates(picture.numpy(force=True), at, order=1, mode="nearest")
+    steps = torch.from_numpy(read).diff(dim=-1).clamp_min(0)  # keeps NaN
     middle = ((across[:, 1:] + across[:, :-1]) / 2)[:, None, None]
     total = steps.sum(dim=-1)
     off = (steps * middle).sum(dim=-1) / total
     # Lines as their vectors of homogeneous coordinates: cross products join points and meet lines.
     ends = torch.stack([corners, corners + along], dim=-2) + _line(share, off) * outward[:, :, None]
-    lines = torch.linalg.cross(*homogeneous(ends).unbind(dim=-2))
+    lines = torch.linalg.cross(*pixels.homogeneous(ends).unbind(dim=-2))
     meeting = torch.linalg.cross(lines.roll(1, dims=1), lines)
     return meeting[..., :2] / meeting[..., 2:]
-
-
-def _looked_up(picture: Map, places: Float[Tensor, "*batch 2"]) -> Scalars:
-    height, width = picture.shape
-    grid = grid_from_pixels(places.reshape(1, 1, -1, 2), width, height)
-    found = grid_sample(
-        picture[None, None], grid, mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return found.reshape(places.shape[:-1])
 
 
 def _line(

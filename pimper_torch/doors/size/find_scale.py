@@ -7,7 +7,7 @@ import torch
 
 from pimper_torch.doors.size.given import CameraDistance, ScaleBar, Unit
 from pimper_torch.doors.size.marker_scale import scale_of_markers
-from pimper_torch.doors.size.marks import place_of, view_of
+from pimper_torch.doors.size.marks import Vector, place_of, view_of
 from pimper_torch.doors.size.scale import Length, Scale, fitted, most_accurate
 from pimper_torch.records import Reconstruction
 from pimper_torch.runtime.errors import caution
@@ -15,14 +15,7 @@ from pimper_torch.runtime.errors import caution
 
 def scale_of_bars(result: Reconstruction, bars: Sequence[ScaleBar], unit: Unit = "mm") -> Scale:
     """Find the scale of a result from places that are known distances apart."""
-    lengths = [
-        Length(
-            found=float((place_of(bar.first, result) - place_of(bar.second, result)).norm()),
-            known=bar.length,
-            what=f"{bar.first} to {bar.second}",
-        )
-        for bar in bars
-    ]
+    lengths = [_length([place_of(mark, result) for mark in bar.ends], bar) for bar in bars]
     return fitted(lengths, unit, "scale bars")
 
 
@@ -31,12 +24,16 @@ def scale_of_cameras(
 ) -> Scale:
     """Find the scale of a result from cameras that are known distances apart."""
     centers = result.cameras.detach().to("cpu", torch.float64).centers_world
-    lengths = []
-    for one in distances:
-        first, second = (centers[view_of(name, result.scene)] for name in (one.first, one.second))
-        found = float((first - second).norm())
-        lengths.append(Length(found=found, known=one.length, what=f"{one.first} to {one.second}"))
+    lengths = [
+        _length([centers[view_of(name, result.scene)] for name in (one.first, one.second)], one)
+        for one in distances
+    ]
     return fitted(lengths, unit, "camera distances")
+
+
+def _length(ends: Sequence[Vector], given: ScaleBar | CameraDistance) -> Length:
+    found = float((ends[0] - ends[1]).norm())
+    return Length(found=found, known=given.length, what=f"{given.first} to {given.second}")
 
 
 def find_scale(

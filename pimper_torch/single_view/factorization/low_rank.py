@@ -126,10 +126,9 @@ def singular_left(
     if guess is None:
         guess = known.sum(dim=2, keepdim=True) / seen.sum(dim=2, keepdim=True).clamp_min(1)
     filled = torch.where(seen, known, guess.double())
-    left = _leading(filled, rank)
-    for _ in range(imputations):
+    for _ in range(imputations + 1):
+        left = torch.linalg.eigh(filled @ filled.mT).eigenvectors[..., -rank:]
         filled = torch.where(seen, known, left @ (left.mT @ filled))
-        left = _leading(filled, rank)
     return left
 
 
@@ -149,10 +148,6 @@ def random_left(
     """Draw orthonormal left factors, evenly over all subspaces."""
     drawn = torch.randn(batch, rows, rank, generator=generator, dtype=torch.float64)
     return torch.linalg.qr(drawn).Q
-
-
-def _leading(filled: Float[Tensor, "batch row column"], rank: int) -> Float[Tensor, "..."]:
-    return torch.linalg.eigh(filled @ filled.mT).eigenvectors[..., -rank:]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
