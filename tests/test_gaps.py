@@ -19,7 +19,7 @@ SETTINGS = {"default": {"scales": [0.5, 1.0]}, "paper": {}}
 GAPS = {
     "default": (
         *("reconstruct", "silhouettes", "contours", "coarse_surface", "decompose", "warp", "light"),
-        *("factorize", "sweep", "gauge", "fuse", "repair", "remesh", "extract"),
+        *("depth_from_light", "factorize", "sweep", "gauge", "fuse", "repair", "remesh", "extract"),
     ),
     "paper": (
         *("reconstruct", "silhouettes", "triangulate", "decompose", "warp", "light", "factorize"),

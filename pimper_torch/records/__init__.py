@@ -47,6 +47,7 @@ from pimper_torch.records.scene import pairs_table as pairs_table
 from pimper_torch.records.silhouettes import ContourPoints as ContourPoints
 from pimper_torch.records.silhouettes import ContourRays as ContourRays
 from pimper_torch.records.silhouettes import Explained as Explained
+from pimper_torch.records.silhouettes import OrientedPoints as OrientedPoints
 from pimper_torch.records.silhouettes import Silhouettes as Silhouettes
 from pimper_torch.records.stored import load_record as load_record
 from pimper_torch.records.stored import save_record as save_record

@@ -108,6 +108,20 @@ class ContourPoints(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class OrientedPoints(Record):
+    """Points of surfaces with normals and noise.
+
+    Attributes:
+        normals_world: Unit, towards the cameras.
+        noise: Standard deviation along the normal, scene units.
+    """
+
+    points_world: Points
+    normals_world: Points
+    noise: Float[Tensor, " point"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Explained(Record):
     """How a surface differs from silhouettes, in fractions of the area of each.
 

@@ -20,6 +20,7 @@ from pimper_torch.records import (
     DepthPatches,
     Explained,
     Mesh,
+    OrientedPoints,
     PatchSet,
     PatchViews,
     PhotometricPatches,
@@ -229,6 +230,11 @@ def _(found: Explained) -> dict[str, int | float]:
 @figures.register
 def _(contours: Contours) -> dict[str, int | float]:
     return {"contour_rays": len(contours.rays.view)}
+
+
+@figures.register
+def _(cloud: OrientedPoints) -> dict[str, int | float]:
+    return {"points": len(cloud.points_world)}
 
 
 @figures.register

@@ -1,8 +1,9 @@
 """Every stage and chain, under one name: ``pt.stages.Warp``.
 
 ``CoarseToFine`` (presets ``default`` and ``fast``) runs ``Reconstruct``, ``FindSilhouettes``,
-``TraceContours`` and ``CoarseSurface``; for each scale ``Decompose``, ``Warp``, ``FitLight``,
-``Factorize``, ``Sweep``, ``FixGauge``, ``Fuse``, ``Repair`` and ``Remesh``; then ``Extract``.
+``TraceContours``, ``CoarseSurface`` and ``DepthFromLight``; for each scale ``Decompose``, ``Warp``,
+``FitLight``, ``Factorize``, ``Sweep``, ``FixGauge``, ``Fuse``, ``Repair`` and ``Remesh``; then
+``Extract``.
 ``Chain.finish`` runs ``Simplify``, ``Relight`` and ``Texture``.
 """
 
@@ -24,6 +25,7 @@ from pimper_torch.method.meshing.extract import Extract as Extract
 from pimper_torch.method.meshing.repair import Repair as Repair
 from pimper_torch.method.patches.decompose import Decompose as Decompose
 from pimper_torch.method.patches.warp import Warp as Warp
+from pimper_torch.method.photometry.depth_from_light import DepthFromLight as DepthFromLight
 from pimper_torch.method.photometry.factorize import Factorize as Factorize
 from pimper_torch.method.photometry.fit_light import FitLight as FitLight
 from pimper_torch.method.photometry.fit_light import Illumination as Illumination

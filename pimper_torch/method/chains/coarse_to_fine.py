@@ -20,6 +20,7 @@ from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.method.meshing.repair import Repair
 from pimper_torch.method.patches.decompose import Decompose
 from pimper_torch.method.patches.warp import Warp
+from pimper_torch.method.photometry.depth_from_light import DepthFromLight
 from pimper_torch.method.photometry.factorize import Factorize
 from pimper_torch.method.photometry.fit_light import FitLight, Illumination
 from pimper_torch.method.photometry.gauge import FixGauge
@@ -35,6 +36,7 @@ from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     Mesh,
+    OrientedPoints,
     PatchSet,
     PatchViews,
     PhotometricPatches,
@@ -98,12 +100,11 @@ class CoarseToFine(Chain):
         self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
-        self.coarse_surface: Callable[[SparseScene, Contours, Mesh | None], CoarseMesh] = (
-            CoarseSurface(config.coarse_surface)
-        )
+        self.coarse_surface: Callable[..., CoarseMesh] = CoarseSurface(config.coarse_surface)
         self.decompose = Decompose(config.decompose)
         self.warp: Warping = Warp(config.warp)
         self.light: Callable[[PatchViews], Illumination] = FitLight(config.light)
+        self.depth_from_light: Callable[..., OrientedPoints] = DepthFromLight()
         self.factorize: Factorizing = Factorize(config.factorize)
         self.sweep: Sweeping = Sweep(config.sweep)
         self.gauge: Callable[[PhotometricPatches], PhotometricPatches] = FixGauge(config.factorize)
@@ -142,11 +143,20 @@ class CoarseToFine(Chain):
         by_blocks: tuple[float, ...] = ()
         for scale, last in run.passes(self.config.scales):
             patches = run(self.decompose, coarse, cameras, surface, scale)
-            if surface is None:
-                by_blocks = self._by_blocks(patches)
             seen = run(self.warp, scene.views, cameras, thinned(patches), sources)
             light = run(self.light, seen)
             del seen
+            if surface is None and mesh is None and shown is scene:
+                found = run(self.depth_from_light, scene, contours, coarse.mesh, light.field)
+                if len(found.points_world):
+                    coarse = run(self.coarse_surface, scene, contours, None, found)
+                    self.show(scene, coarse)
+                    patches = run(self.decompose, coarse, cameras, surface, scale)
+                    seen = run(self.warp, scene.views, cameras, thinned(patches), sources)
+                    light = run(self.light, seen)
+                    del seen
+            if surface is None:
+                by_blocks = self._by_blocks(patches)
             heights = run(photometric, scene.views, cameras, patches, light, sources)
             heights = heights.replace(photometric=run(self.gauge, heights.photometric))
             if last:

@@ -18,13 +18,21 @@ from pimper_torch.ground.shapes import Faces, VertexMask, Vertices
 from pimper_torch.method.coarse import trim
 from pimper_torch.method.coarse.densify import factors
 from pimper_torch.method.coarse.oriented import (
-    OrientedPoints,
     matched_cloud,
     no_points,
     pixel_size_at,
+    thinned,
 )
 from pimper_torch.method.coarse.window_matching import level_of
-from pimper_torch.records import Cameras, ContourPoints, Record, Silhouettes, SparseScene
+from pimper_torch.records import (
+    Cameras,
+    ContourPoints,
+    OrientedPoints,
+    Record,
+    Silhouettes,
+    SparseScene,
+    Support,
+)
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view, each, zeros
@@ -64,7 +72,11 @@ class FineSurface(Record):
 
 
 def fine_surface(
-    scene: SparseScene, reliable: Int[Tensor, " reliable"], contours: Contours, levels: int
+    scene: SparseScene,
+    reliable: Int[Tensor, " reliable"],
+    contours: Contours,
+    levels: int,
+    more: OrientedPoints | None = None,
 ) -> FineSurface:
     """Put a surface through matched points and contours, smooth where there are neither.
 
@@ -92,6 +104,8 @@ def fine_surface(
     else:
         factor = factors(max(part.views.images.shape[-2:]), levels)[-1]
         pixel, level = factor * pixel_size_at(centre, scene.cameras), level_of(part, factor)
+    if more is not None:
+        cloud = OrientedPoints.cat([cloud, thinned(more, pixel)])
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
     reach = REACH_PX * pixel
     counts = trim.view_counts(vertices, faces, level, maps, cloud.points_world, reach)
@@ -103,8 +117,10 @@ def fine_surface(
         near = trim.near_points(faces, centres, cloud, support, counts, pixel)
         leave_out("coarse.far", inside & ~near, at=centres)
         inside &= near
+    # Where light shows what silhouettes do not, it shows all of the surface, and none in the air.
+    least = Support.CONTOUR if more is None else Support.POINTS
     fraction = trim.min_fraction(contours)
-    kept = trim.seen_surface(vertices, faces, support, counts, inside, pixel, fraction)
+    kept = trim.seen_surface(vertices, faces, support, counts, inside, pixel, fraction, least)
     if not bool(kept.any()):
         raise ReconstructionError(
             f"coarse mesh: none of {len(faces)} faces is seen by the photographs inside the "

@@ -1,7 +1,6 @@
 """Depth maps of many views as one cloud of points with normals and noise."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,7 +14,7 @@ from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.shapes import Map, Mask, Points
 from pimper_torch.method.coarse.densify import DepthMaps, depth_maps
 from pimper_torch.method.coarse.window_matching import RADIUS, shifted
-from pimper_torch.records import Cameras, Record, SparseScene
+from pimper_torch.records import Cameras, OrientedPoints, SparseScene
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import zeros
 from pimper_torch.runtime.parallel import side_by_side
@@ -35,20 +34,6 @@ _NEIGHBOURS, _FLAT, _FACING = 12, 0.3, 0.2
 # Neighbours of a dense point that its normal is fitted to, a choice, and how many normals are
 # fitted at once, which bounds memory to tens of MB a thread.
 _COMMON, _AT_ONCE = 24, 10_000
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class OrientedPoints(Record):
-    """Points of surfaces with normals and noise.
-
-    Attributes:
-        normals_world: Unit, towards the cameras.
-        noise: Standard deviation along the normal, scene units.
-    """
-
-    points_world: Points
-    normals_world: Points
-    noise: Float[Tensor, " point"]
 
 
 def no_points(like: Float[Tensor, "..."]) -> OrientedPoints:

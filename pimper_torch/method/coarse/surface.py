@@ -19,7 +19,14 @@ from pimper_torch.method.coarse.given_mesh import oriented_outward, prepared
 from pimper_torch.method.coarse.oriented import pixel_size
 from pimper_torch.method.coarse.reference import reference_view
 from pimper_torch.method.coarse.trim import min_fraction, supported_components
-from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Silhouettes, SparseScene
+from pimper_torch.records import (
+    CoarseMesh,
+    FacetPoints,
+    Mesh,
+    OrientedPoints,
+    Silhouettes,
+    SparseScene,
+)
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
@@ -42,7 +49,11 @@ class CoarseSurface(Stage):
 
     @torch.no_grad()
     def forward(
-        self, scene: SparseScene, contours: Contours, mesh: Mesh | None = None
+        self,
+        scene: SparseScene,
+        contours: Contours,
+        mesh: Mesh | None = None,
+        more: OrientedPoints | None = None,
     ) -> CoarseMesh:
         """Make the coarse mesh of depth maps and silhouettes, or of a given mesh.
 
@@ -75,7 +86,7 @@ class CoarseSurface(Stage):
                     f"reliable ({_MIN_TRACK} views, {_MAX_ERROR_PX} px, {_MIN_ANGLE_DEG} "
                     "degrees), and at least 4 are needed. Take more photographs."
                 )
-            fine = fine_surface(scene, reliable, contours, self.config.levels)
+            fine = fine_surface(scene, reliable, contours, self.config.levels, more)
             few = reduced(Mesh(vertices_world=fine.vertices_world, faces=fine.faces), count)
             vertices, crowded = few.vertices_world, len(few.faces)
             faces = two_faces_an_edge(vertices, few.faces)

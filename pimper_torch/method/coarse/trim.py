@@ -16,9 +16,8 @@ from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.shapes import FaceMask, Faces, Points, Vertices
 from pimper_torch.method.coarse.densify import DepthMaps
-from pimper_torch.method.coarse.oriented import OrientedPoints
 from pimper_torch.method.coarse.window_matching import MatchingLevel
-from pimper_torch.records import ContourPoints, Record, Support
+from pimper_torch.records import ContourPoints, OrientedPoints, Record, Support
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.parallel import num_workers, side_by_side
 
@@ -212,6 +211,7 @@ def seen_surface(
     inside: FaceMask,
     pixel: float,
     fraction: float,
+    least: Support = Support.CONTOUR,
 ) -> FaceMask:
     """Find the faces that stay: in the visual hull, and seen or supported.
 
@@ -222,6 +222,7 @@ def seen_surface(
     Args:
         inside: True for faces in the visual hull.
         fraction: Of the supported area, that a component needs.
+        least: Support of the faces whose area that is.
     """
     known = support >= Support.CONTOUR
     small = (HOLE_PX * pixel) ** 2
@@ -249,7 +250,7 @@ def seen_surface(
     leave_out("coarse.fringes", strips, at=(vertices, faces))
     kept &= ~strips
     (chosen,) = torch.nonzero(kept, as_tuple=True)
-    stays = supported_components(vertices, faces[chosen], known[chosen], fraction)
+    stays = supported_components(vertices, faces[chosen], support[chosen] >= least, fraction)
     leave_out("coarse.components", ~stays, at=(vertices, faces[chosen]))
     kept[chosen[~stays]] = False
     return kept

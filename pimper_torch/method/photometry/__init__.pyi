@@ -5,6 +5,7 @@ from .bilinear import Bilinear as Bilinear
 from .bilinear import Factors as Factors
 from .bilinear import Solver as Solver
 from .cone import Cone as Cone
+from .depth_from_light import DepthFromLight as DepthFromLight
 from .factor_gradients import differentiable as differentiable
 from .factorize import Factorize as Factorize
 from .fit_light import FitLight as FitLight

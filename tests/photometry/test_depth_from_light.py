@@ -1,0 +1,118 @@
+"""A ball without texture that an arc of views sees, and the surface of its visual hull."""
+
+import pytest
+import torch
+from skimage.measure import marching_cubes
+
+from pimper_bench.scenes.render_in_memory import Sphere, render_shape
+from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_bench.scenes.scene_lights import wandering_lights
+from pimper_bench.scenes.true_clouds import sparse_scene
+from pimper_torch.ground.geometry.contours import Contours
+from pimper_torch.method.photometry.depth_from_light import DepthFromLight
+from pimper_torch.method.photometry.light_field import LightField
+from pimper_torch.method.silhouettes.trace import TraceContours
+from pimper_torch.records import Mesh, Silhouettes
+
+VIEWS = 16
+
+
+def scene_of(num_views=VIEWS, texture=None):
+    """Return the scene of a ball of radius 1, its silhouettes' contours, and its light."""
+    generator = torch.Generator().manual_seed(3)
+    cameras = arc_cameras(
+        num_views, width=120, height=90, focal_px=112.5, distance=3.0, span_deg=50.0
+    )
+    lights = wandering_lights(num_views, generator, distance=8.0, spread_deg=50.0)
+    white = texture or (lambda points: torch.full_like(points, 0.6))
+    rendered = render_shape(Sphere(), cameras, lights.harmonics_world(), white)
+    scene = sparse_scene(rendered, 20, generator, dtype=torch.float64)
+    silhouettes = Silhouettes(
+        inside=rendered.depth.isfinite().double(),
+        reliable=torch.ones(num_views, dtype=torch.bool),
+        source="masks",
+    )
+    contours = TraceContours()(silhouettes, scene.cameras)
+    field = LightField(
+        origin=torch.zeros(3).double(),
+        soft=torch.nn.functional.pad(lights.harmonics_world(), (0, 5)),
+        point_light=torch.zeros(num_views, 3).double(),
+        closeness=torch.zeros(num_views).double(),
+    )
+    return scene, contours, field
+
+
+@pytest.fixture(scope="module")
+def arc():
+    return scene_of()
+
+
+def surface_of(contours):
+    """Return the surface of the visual hull."""
+    hull = contours.hull
+    distance = torch.nn.functional.pad(hull.distance, (1,) * 6, value=-float(hull.spacing))
+    vertices, faces, _, _ = marching_cubes(distance.clamp(-1, 1).numpy(), 0.0)
+    step = float(hull.spacing)
+    world = hull.origin_world + step * (torch.from_numpy(vertices.copy()) - 1)
+    return Mesh(vertices_world=world.double(), faces=torch.from_numpy(faces.copy()).long())
+
+
+def ball(radius=1.0):
+    steps = torch.linspace(-1.2, 1.2, 60)
+    grid = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1)
+    vertices, faces, _, _ = marching_cubes((radius - grid.norm(dim=-1)).numpy(), 0.0)
+    world = -1.2 + torch.from_numpy(vertices.copy()) * float(steps[1] - steps[0])
+    return Mesh(vertices_world=world.double(), faces=torch.from_numpy(faces.copy()).long())
+
+
+def off(cloud):
+    """Return distances from the ball, and angles of the normals to its own."""
+    radius = cloud.points_world.norm(dim=1)
+    cosine = (cloud.points_world * cloud.normals_world).sum(dim=1) / radius
+    return (radius - 1).abs(), torch.rad2deg(cosine.clamp(-1, 1).acos())
+
+
+def test_the_ball_is_found_inside_its_hull(arc):
+    scene, contours, field = arc
+    hull = surface_of(contours)
+    # Seen from an arc the hull is far from the ball.
+    assert (hull.vertices_world.norm(dim=1) - 1).abs().median() > 0.02
+    cloud = DepthFromLight()(scene, contours, hull, field)
+    distance, angle = off(cloud)
+    assert len(distance) > 500
+    assert distance.median() < 0.02  # 1 % of its diameter
+    assert angle.median() < 3
+    assert (cloud.noise > 0).all()
+    assert cloud.points_world.dtype == torch.float64
+
+
+def test_lights_that_a_wrong_surface_turned_do_not_move_depths(arc):
+    scene, contours, field = arc
+    turn = torch.matrix_exp(torch.tensor([[0, 0, 0.35], [0, 0, 0], [-0.35, 0, 0]]).double())
+    turned = torch.cat([field.soft[:, :1], field.soft[:, 1:4] @ turn.mT, field.soft[:, 4:]], dim=1)
+    cloud = DepthFromLight()(scene, contours, surface_of(contours), field.replace(soft=turned))
+    distance, angle = off(cloud)
+    assert distance.median() < 0.02
+    assert angle.median() < 8  # of 20 degrees
+
+
+def test_a_surface_that_is_right_is_not_contradicted(arc):
+    scene, contours, field = arc
+    assert len(DepthFromLight()(scene, contours, ball(), field).points_world) == 0
+
+
+def test_few_views_or_silhouettes_that_leave_nothing_out_find_nothing(arc):
+    scene, contours, field = scene_of(num_views=7)
+    hull = surface_of(contours)
+    assert len(DepthFromLight()(scene, contours, hull, field).points_world) == 0
+    scene, contours, field = arc
+    everything = Contours.none(Silhouettes.everything(scene.views), scene.cameras)
+    found = DepthFromLight()(scene, everything, surface_of(contours), field)
+    assert len(found.points_world) == 0
+
+
+def test_photographs_without_shading_contradict_nothing(arc):
+    scene, contours, field = arc
+    even = scene.views.replace(images=torch.full_like(scene.views.images, 0.3))
+    found = DepthFromLight()(scene.replace(views=even), contours, surface_of(contours), field)
+    assert len(found.points_world) == 0
