@@ -28,7 +28,7 @@ LINES = {
     "doors/outputs": 518,
     "doors/size": 1042,
     "ground": 26,
-    "ground/geometry": 3591,
+    "ground/geometry": 3633,
     "ground/kernels": 5133,
     "ground/linalg": 1359,
     "ground/radiometry": 484,
@@ -40,7 +40,7 @@ LINES = {
     "method/patches": 977,
     "method/photometry": 4315,
     "method/sfm": 4616,
-    "method/silhouettes": 1686,
+    "method/silhouettes": 1726,
     "method/sweep": 705,
     "paper": 1211,
     "priors": 791,
@@ -64,9 +64,9 @@ LINES = {
 
 # Numbers of module constants, in tuples and mappings, too; lines of signatures and of imports.
 BARS = {
-    "numbers in module constants": 916,
-    "lines of signatures": 5239,
-    "lines of imports": 4351,
+    "numbers in module constants": 919,
+    "lines of signatures": 5241,
+    "lines of imports": 4356,
 }
 
 

@@ -13,6 +13,7 @@ from pimper_torch.method.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.method.silhouettes.parallax import (
     plane_agreement,
     room_agreement,
+    room_at_rest,
     working_pictures,
 )
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
@@ -319,6 +320,24 @@ def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator
     assert (found[inside] > 0.75).float().mean() < 0.03
     wrong = room_agreement(pictures, torch.eye(3).repeat(9, 1, 1))
     assert (wrong[wrong.isfinite()] > 0.75).float().mean() < 0.2
+
+
+def test_a_room_that_shifts_is_found_without_maps_and_none_where_the_camera_moves(
+    staged, generator
+):
+    images, maps, covered = before_a_room(generator)
+    views = Views(
+        images=images,
+        sizes_px=torch.tensor([[480, 360]] * 9),
+        focals_px=torch.full((9,), torch.nan),
+        names=tuple("abcdefghi"),
+    )
+    pictures = working_pictures(views, staged.scene.cameras.take(list(range(9))), 240)
+    found = room_at_rest(pictures, covered[:, ::2, ::2])
+    shifts = (found[:, :2, 2] - maps[:, :2, 2]).float()
+    assert (shifts - shifts[0]).abs().max() <= 2.5  # a pixel of the reduced photographs and a half
+    pictures = working_pictures(staged.scene.views, staged.scene.cameras, 240)
+    assert len(room_at_rest(pictures, staged.truth)) == 0
 
 
 def test_the_region_keeps_what_is_outside_from_being_the_object(staged):

@@ -235,7 +235,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
     on_object, background = split_cloud(scene, focus, plane, tolerance, region)
     half, centre = _BOX * focus.distance, focus.fixation_world
     turns = plane is None and len(scene.background_from_view) > 0
-    return Cues(
+    cues = Cues(
         pictures=pictures,
         object_px=pixels_of(scene, cameras, on_object, observed=not turns),
         background_px=pixels_of(scene, cameras, background),
@@ -245,7 +245,11 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
         fixation=focus,
         box_world=torch.stack([centre - half, centre + half]) if region is None else region,
         soft=soft_masks_of(scene.views, pictures),
-    ).relearned(None)
+    )
+    if not len(cues.background_from_view):
+        rests = parallax.room_at_rest(pictures, cues.surrounded())
+        cues = cues.replace(background_from_view=rests)
+    return cues.relearned(None)
 
 
 def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 3"]:

@@ -172,7 +172,10 @@ def _without_shadow(mask: Mask, margin: Map, grey: Map) -> Mask:
     shown, far = grey[mask & (margin > 0)], 1 / 200 * max(mask.shape)
     if len(shown) == 0:
         return mask
-    shadow = mask & (margin < -far / 2) & (grey < shown.median() - _SHADOW)
+    dark, around = shown.median() - _SHADOW, grey[~mask].median() - _SHADOW
+    if shown.median() < around:
+        dark = around  # an object as dark as shadows are
+    shadow = mask & (margin < -far / 2) & (grey < dark)
     return mask & ~components_of(shadow, margin < -far)
 
 

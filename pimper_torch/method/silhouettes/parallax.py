@@ -15,13 +15,14 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_torch.ground.geometry.image_shifts import shift_between
 from pimper_torch.ground.geometry.opencv import shrunk, warped, window_means
 from pimper_torch.ground.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.ground.geometry.supporting_plane import Fixation, Plane
 from pimper_torch.ground.radiometry.response import srgb_from_linear
 from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, Matrix3
 from pimper_torch.records import Cameras, Record, Views
-from pimper_torch.runtime.mapped import stacked, zeros
+from pimper_torch.runtime.mapped import by_view, stacked, zeros
 from pimper_torch.runtime.parallel import side_by_side
 
 _FAINT = 0.03  # of white; ratios of darker colours tell noise
@@ -92,6 +93,11 @@ def _opponent(radiance: Float[Tensor, "3 height width"]) -> UInt8[Tensor, "heigh
     return torch.stack([luma, *ratios], dim=-1).clamp(0, 255).round().byte()
 
 
+# A room is at rest where the median photograph correlates with one of them, and shows it (agreement
+# above the second) on so much of what the object leaves. A turntable before a room: 0.26 and 0.58;
+# objects along arcs and carried round 0.5 and 0.05 at most.
+_ALIKE, _SHOWN, _AT_REST = 0.2, 0.75, 0.25
+
 DISPUTED = 0.5  # agreement where views do not agree on what the background looks like
 # Fractions of the pictures' longer side.
 _WINDOW = 1 / 80  # windows that are compared: 9 px of 640
@@ -146,6 +152,33 @@ def room_agreement(
     """
     raster = _room_raster(pictures, background_from_view.cpu().double())
     return texture_agreement(pictures, raster, raster, hidden)
+
+
+def room_at_rest(pictures: WorkingPictures, surrounded: Masks) -> Float[Tensor, "mapped 3 3"]:
+    """Find a room before which the object turned, also where the camera was shifted meanwhile.
+
+    Args:
+        surrounded: Where the object is, as far as is known.
+
+    Returns:
+        As :func:`room_agreement` takes them; none where photographs do not look alike there.
+    """
+    longer, nowhere = max(pictures.grey.shape[1:]), torch.zeros_like(surrounded[0])
+    textures = by_view(
+        lambda grey, at: _textured(grey, nowhere, longer).masked_fill(at, 0),
+        pictures.grey,
+        surrounded,
+    )
+    axes = pictures.cameras.cam_from_world[:, 2, :3]
+    middle = int((axes @ axes.mT).sum(dim=1).argmax())
+    found = [shift_between(one, textures[middle]) for one in textures]
+    maps = torch.eye(3).double().repeat(len(found), 1, 1)
+    maps[:, :2, 2] = torch.stack([shift for shift, _ in found]) / torch.tensor(pictures.factors)
+    if torch.stack([alike for _, alike in found]).median() > _ALIKE:
+        shown = (room_agreement(pictures, maps) > _SHOWN) & ~surrounded
+        if (shown.sum(dim=(1, 2)) / (~surrounded).sum(dim=(1, 2))).median() > _AT_REST:
+            return maps
+    return maps[:0]
 
 
 def texture_agreement(
