@@ -15,7 +15,7 @@ from pimper_torch.runtime.store import digest
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 # Of two passes over given facets, in order.
-STAGES = ["silhouettes", "light", "photometry", "fuse", "remesh"]
+STAGES = ["silhouettes", "light", "depth_from_light", "photometry", "fuse", "remesh"]
 STAGES += ["light", "photometry", "fuse", "extract"]
 
 
@@ -95,10 +95,10 @@ def test_a_changed_setting_runs_what_depends_on_it(given, whole):
     assert "extract" in listener.done
     assert listener.kept.count("photometry") == 2
     _, listener = run(given, folder, factorize={"light_prior": 2.0})
-    assert listener.kept == ["silhouettes", "light"]
+    assert listener.kept == STAGES[:3]
     # What the first pass gives doesn't depend on the second one's scale.
     _, listener = run(given, folder, scales=[0.25, 0.4])
-    assert listener.kept == ["silhouettes", "light", "photometry", "fuse", "remesh"]
+    assert listener.kept == STAGES[:6]
 
 
 def test_other_photographs_are_another_run(given, whole):
