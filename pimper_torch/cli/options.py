@@ -318,7 +318,10 @@ def check(job: Job) -> Job:
         f"{least} at least, better 10 or more: a normal comes from {least} lights or more "
         "(`factorize.min_views`)",
     )
-    for name in _references(job.config):
+    references = [job.config.coarse_surface.reference]
+    if isinstance(job.config, PublishedConfig):
+        references.append(job.config.triangulate.reference)
+    for name in filter(None, references):
         view_named(name, present)
     pointed = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
     for name in (*measured_in(job.inputs.bars, job.inputs.distances), *pointed):
@@ -338,14 +341,6 @@ def inputs_of(job: Job) -> dict[str, Path | None]:
         "--depth": job.inputs.depth,
         "--cache": job.common.cache,
     }
-
-
-def _references(config: Config) -> set[str]:
-    """Return the names of photographs that settings ask for."""
-    of_stages = [config.coarse_surface.reference]
-    if isinstance(config, PublishedConfig):
-        of_stages.append(config.triangulate.reference)
-    return {name for name in of_stages if name}
 
 
 def bundled_photographs() -> Path:

@@ -51,7 +51,11 @@ from pimper_torch.runtime.store import Store
 
 def carry_out(job: Job, output: Output) -> None:
     """Reconstruct, and write and show what the arguments ask for."""
-    _check_device(job.common.device)
+    if job.common.device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(
+            f"--device is cuda, but torch {torch.__version__} finds no CUDA device. Run on the CPU "
+            "(--device cpu), or install the CUDA build of torch and check the driver."
+        )
     with Viewer() if job.common.view else nullcontext() as viewer:
         if viewer is not None:
             tell_place(viewer, output)
@@ -121,8 +125,7 @@ def _preview(
 def _store(job: Job) -> Store:
     common = job.common
     folder = common.cache or job.out / STAGES
-    max_bytes = bytes_of(common.max_kept)
-    return Store(folder=folder, max_bytes=max_bytes, fresh=common.fresh)
+    return Store(folder=folder, max_bytes=bytes_of(common.max_kept), fresh=common.fresh)
 
 
 def _read(job: Job) -> Views:
@@ -158,15 +161,12 @@ def _examine(job: Job, views: Views) -> None:
 
 
 def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
+    given = ("masks", "sparse", "mesh", "silhouettes", "normals", "depth")
+    paths: dict[str, Path | None] = {name: getattr(job.inputs, name) for name in given}
     about: dict[str, object] = {
         "photographs": str(job.photos.absolute()),
-        "masks": _text(job.inputs.masks),
-        "sparse": _text(job.inputs.sparse),
-        "mesh": _text(job.inputs.mesh),
-        "silhouettes": _text(job.inputs.silhouettes),
+        **{name: path and str(path) for name, path in paths.items()},
         "object_at": [str(mark) for mark in job.inputs.object_at],
-        "normals": _text(job.inputs.normals),
-        "depth": _text(job.inputs.depth),
         "response": str(job.config.photographs.response),
         "max_size_px": job.common.max_size_px,
         "preset": job.common.preset,
@@ -186,14 +186,6 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
     )
 
 
-def _check_device(device: str) -> None:
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(
-            f"--device is cuda, but torch {torch.__version__} finds no CUDA device. Run on the CPU "
-            "(--device cpu), or install the CUDA build of torch and check the driver."
-        )
-
-
 def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
     fewer = " (simplified; --faces all writes every one)" if job.common.faces is None else ""
     output.remark(f"{_costs(result)}\n{headline(result)}")
@@ -209,19 +201,11 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
 
 
 def _costs(result: Reconstruction) -> str:
-    return "\n".join(
-        ["stage             seconds   peak MB"]
-        + [
-            f"{report.name:<16}"
-            + ("     kept" if report.kept else f"{report.seconds:9.1f}")
-            + f"{report.peak_memory_mb:10.0f}"
-            for report in result.report
-        ]
-    )
-
-
-def _text(path: object) -> str | None:
-    return None if path is None else str(path)
+    rows = [
+        f"{one.name:<16}{'kept' if one.kept else f'{one.seconds:.1f}':>9}{one.peak_memory_mb:10.0f}"
+        for one in result.report
+    ]
+    return "\n".join(["stage             seconds   peak MB", *rows])
 
 
 def in_files(job: Job, views: Views, mark: Mark) -> Mark:

@@ -20,7 +20,7 @@ from typing import Literal, TypeVar, Union
 
 import yaml
 
-from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.runtime.errors import ConfigError, shortened
 
 Config = TypeVar("Config")
 
@@ -213,8 +213,8 @@ def read_mapping(path: Path | str) -> dict[str, object]:
     except (ValueError, TypeError, OverflowError, AttributeError) as error:
         # PyYAML's constructors of numbers and dates raise these.
         raise ConfigError(
-            f"{path}: holds a value that is none ({_cut(str(error))}); needed: numbers, texts, "
-            "lists and sections."
+            f"{path}: holds a value that is none ({shortened(str(error))}); needed: numbers, "
+            "texts, lists and sections."
         ) from error
     if content is None:
         return {}
@@ -326,20 +326,16 @@ def _convert(hint: object, value: object, field: str) -> object:
 
 
 def _shown(value: object) -> str:
-    return f"{_cut(repr(value))} ({_kind(value)})"
-
-
-def _cut(text: str, most: int = 200) -> str:
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+    return f"{shortened(repr(value))} ({_kind(value)})"
 
 
 def _unknown(key: object, cls: type[object], where: str, section: str, root: type[object]) -> str:
     homes = [path for path in _paths(root, "") if path.rpartition(".")[2] == key]
     elsewhere = f" Did you mean `{'` or `'.join(homes)}`?"
-    hint = elsewhere if homes else nearest(_cut(str(key)), _names(cls))
+    hint = elsewhere if homes else nearest(shortened(str(key)), _names(cls))
     return (
         f"{where}: {'section `' + section + '`' if section else 'the top level'} has no setting "
-        f"`{_cut(str(key))}`.{hint} Settings there: {', '.join(_names(cls))}."
+        f"`{shortened(str(key))}`.{hint} Settings there: {', '.join(_names(cls))}."
     )
 
 

@@ -94,3 +94,8 @@ def some(names: Sequence[str], most: int = 8) -> str:
     """
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def shortened(text: str, most: int = 200) -> str:
+    """Cut a text that is longer."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."

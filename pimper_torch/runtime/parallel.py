@@ -72,8 +72,7 @@ def over_rows(
         _idle(workers - 1).submit(kernel, *arguments, first, last)
         for first, last in pairwise(bounds[1:])
     ]
-    own = kernel(*arguments, bounds[0], bounds[1])
-    return [own, *(other.result() for other in others)]
+    return [kernel(*arguments, *bounds[:2]), *(other.result() for other in others)]
 
 
 @cache

@@ -195,12 +195,11 @@ def figures(record: object) -> dict[str, int | float]:
 
 @figures.register
 def _(scene: SparseScene) -> dict[str, int | float]:
-    length = len(scene.observation_point) / max(1, len(scene.points_world))
     return {
         "views": scene.views.num_views + len(scene.unregistered),
         "registered": scene.views.num_views,
         "sparse_points": len(scene.points_world),
-        "mean_track_length": length,
+        "mean_track_length": len(scene.observation_point) / max(1, len(scene.points_world)),
         "mean_reprojection_px": _mean(scene.reprojection_errors_px),
         "doubtful": int(bool(scene.doubt)),
     }

@@ -100,7 +100,8 @@ def _in_table(path: Path) -> list[Object]:
         )
     if taken := {"out", "o", "overwrite", "view"} & {*columns}:
         raise ConfigError(f"{path}: has the column {min(taken)}, which is the batch's own.")
-    found, kinds = [], _kinds()
+    kinds = {name: one.value for one in every_option("reconstruct") for name in one.names}
+    found = []
     for row in table:
         where = f"{path}, row {table.line_num}"
         cells = {
@@ -135,8 +136,3 @@ def _words(option: str, cell: str, kinds: Mapping[str, str], base: Path) -> list
     if kind in _PATHS or (option == "--preset" and (base / cell).is_file()):
         cell = str((base / cell).absolute())
     return [option, *(cell.split() if kind and " " in kind else [cell])]
-
-
-def _kinds() -> dict[str, str]:
-    """Return what follows every option of ``pimper reconstruct``, of any preset."""
-    return {name: one.value for one in every_option("reconstruct") for name in one.names}

@@ -45,8 +45,7 @@ def edge_blur_px(grey: Map) -> float:
     found = [
         _blur(strength, torch.hypot(wide[0], wide[1]), peaks & (bins == one)) for one in range(4)
     ]
-    known = [one for one in found if one == one]
-    return max(known, default=float("nan"))
+    return max((one for one in found if one == one), default=float("nan"))
 
 
 def _blur(fine: Map, wide: Map, edges: Mask) -> float:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.runtime.errors import InputError, some
+from pimper_torch.runtime.errors import InputError, shortened, some
 
 T = TypeVar("T")
 
@@ -38,8 +38,8 @@ class DataSetPath(NamedTuple):
         """
         found = contents(self.path) if found is None else found
         raise InputError(
-            f"{self.path}: not the layout of {self.kind}. Needed: {_shortened(needed, 400)}. "
-            f"Found: {_shortened(found, 400)}. Point to the folder that holds it, or choose "
+            f"{self.path}: not the layout of {self.kind}. Needed: {shortened(needed, 400)}. "
+            f"Found: {shortened(found, 400)}. Point to the folder that holds it, or choose "
             "the reader of another layout."
         )
 
@@ -149,8 +149,4 @@ def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
 
 
 def _shown(value: object) -> str:
-    return "nothing" if value is None else _shortened(repr(value), 80)
-
-
-def _shortened(text: str, most: int) -> str:
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+    return "nothing" if value is None else shortened(repr(value), 80)

@@ -175,17 +175,13 @@ def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[
     if kind == "fisheye":
         model, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
         readable = not any((p1, p2, p3, p4, b2))
+    told = [one.tag for one in calibration if (one.text or "").strip() not in ("", "0", "0.0")]
     file.expect(
         readable,
         f"a frame camera with k1, k2, k3, p1, p2, b1, or a fisheye with k1 to k4 and b1, for the "
         f"sensor {label}",
-        f"a {kind} camera with {_nonzero(calibration)}; export undistorted photographs with their "
+        f"a {kind} camera with {', '.join(told)}; export undistorted photographs with their "
         "cameras, or align anew without the others",
     )
     lens = Lens(camera=number, model=model, params=(*pinhole, *params), width=width, height=height)
     return lens, b2
-
-
-def _nonzero(calibration: ElementTree.Element) -> str:
-    tags = [one.tag for one in calibration if (one.text or "").strip() not in ("", "0", "0.0")]
-    return ", ".join(tags)

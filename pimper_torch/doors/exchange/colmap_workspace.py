@@ -41,15 +41,11 @@ def write_colmap(
     refuse_skew(cameras, views.names, "a COLMAP model")
     files = write_pictures(views, folder, ".png")
     points = torch.zeros(0, 3) if points_world is None else points_world.detach().cpu()
-    nothing = torch.zeros(0, dtype=torch.long)
     model = SparseModel(
         names=files,
         lenses=pinhole_lenses(cameras),
         cam_from_world=cameras.cam_from_world.detach().cpu().double(),
         points_world=points.double(),
-        observation_point=nothing,
-        observation_view=nothing,
-        observation_pixels=torch.zeros(0, 2, dtype=torch.float64),
     )
     colors = torch.zeros(len(points), 3, dtype=torch.uint8)
     write_binary(model, colors, folder / "sparse" / "0")

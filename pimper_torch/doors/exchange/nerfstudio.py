@@ -84,12 +84,5 @@ def thinned(count: int) -> Int[Tensor, " point"]:
 def _said(cameras: Cameras, index: int) -> dict[str, float | int]:
     """Put a pinhole in the words of the format."""
     K = cameras.intrinsics[index].detach().cpu().double()
-    width, height = (int(side) for side in cameras.sizes_px[index])
-    return {
-        "w": width,
-        "h": height,
-        "fl_x": float(K[0, 0]),
-        "fl_y": float(K[1, 1]),
-        "cx": float(K[0, 2]),
-        "cy": float(K[1, 2]),
-    }
+    values = (*cameras.sizes_px[index].tolist(), *K.diagonal()[:2].tolist(), *K[:2, 2].tolist())
+    return dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), values, strict=True))

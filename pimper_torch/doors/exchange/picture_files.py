@@ -19,12 +19,9 @@ def write_picture(views: Views, index: int, path: Path) -> None:
     to the same bytes.
     """
     width, height = (int(side) for side in views.sizes_px[index])
-    radiance = views.images[index, :, :height, :width].detach()
-    array = to_bytes(radiance).permute(1, 2, 0).cpu().numpy()
+    picture = to_bytes(views.images[index, :, :height, :width].detach()).movedim(0, -1)
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.ascontiguousarray(array[..., 0] if array.shape[-1] == 1 else array)).save(
-        path
-    )
+    Image.fromarray(picture.squeeze(-1).cpu().numpy()).save(path)
 
 
 def write_mask(views: Views, index: int, path: Path) -> None:
@@ -33,7 +30,7 @@ def write_mask(views: Views, index: int, path: Path) -> None:
     shown = views.inside if views.masks is None else views.masks
     array = shown[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.ascontiguousarray(array)).save(path)
+    Image.fromarray(array).save(path)
 
 
 def write_pictures(views: Views, folder: Path, mask_suffix: str = "") -> tuple[str, ...]:

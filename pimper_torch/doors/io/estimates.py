@@ -66,12 +66,11 @@ def read_estimate(path: Path | str) -> Estimate:
     if (path / "sparse").is_dir():
         model = read_model(path / "sparse")
         names, cameras = model.names, pinholes_of(model)
-    lights = read_lights(path / "lights.json", names)
     return Estimate(
         mesh=mesh,
         names=names,
         cameras=cameras,
-        lights_world=lights,
+        lights_world=read_lights(path / "lights.json", names),
         reference=read_reference(path / "depth.npz"),
     )
 

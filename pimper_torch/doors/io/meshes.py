@@ -17,14 +17,14 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.ground.geometry.rigid import rotate, transform
-from pimper_torch.ground.geometry.surfaces import side_lengths, unit_face_normals, vertex_normals
+from pimper_torch.ground.geometry.surfaces import side_lengths, unit_face_normals
 from pimper_torch.ground.geometry.topology import corners_of
 from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.ground.shapes import FaceMask, Vertices
 from pimper_torch.records import Mesh
 from pimper_torch.records.value_checks import beyond, not_finite
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
-from pimper_torch.result.viz.maps import base_color
+from pimper_torch.result.viz.maps import base_color, carried_normals
 from pimper_torch.runtime.errors import InputError
 
 # One number a vertex, written and read under the names of the record's fields.
@@ -52,7 +52,9 @@ def write_ply(
     """
     path = Path(path)
     columns = dict(zip("xyz", _positions(mesh, offset_world).unbind(dim=1), strict=True))
-    columns |= dict(zip(("nx", "ny", "nz"), _normals(mesh).float().unbind(dim=1), strict=True))
+    columns |= dict(
+        zip(("nx", "ny", "nz"), carried_normals(mesh).float().unbind(dim=1), strict=True)
+    )
     if mesh.albedo is not None:
         colors = to_bytes(_colors(mesh)).unbind(dim=1)
         columns |= dict(zip(("red", "green", "blue"), colors, strict=True))
@@ -184,7 +186,7 @@ def write_glb(
         offset_world: Of the node; see ``SparseScene.offset_world``.
         measured: The attribute ``_MEASURED`` is 0 at vertices of no such face.
     """
-    attributes = {"POSITION": mesh.vertices_world, "NORMAL": _normals(mesh)}
+    attributes = {"POSITION": mesh.vertices_world, "NORMAL": carried_normals(mesh)}
     if mesh.albedo is not None:
         attributes["COLOR_0"] = _colors(mesh)
     if measured is not None:
@@ -235,7 +237,7 @@ def write_obj(
     with Path(path).open("w", encoding="ascii") as file:
         digits = 9 if offset_world == NO_OFFSET else 15
         _rows_of("v", f"%.{digits}g " * 3 + "%.6g " * (rows.shape[1] - 3), rows, file)
-        _rows_of("vn", "%.6g %.6g %.6g", _normals(mesh).detach().cpu(), file)
+        _rows_of("vn", "%.6g %.6g %.6g", carried_normals(mesh).detach().cpu(), file)
         for group, chosen in (("measured", kept), ("caps", ~kept)):
             if bool(chosen.any()):
                 file.write(f"g {group}\n")
@@ -305,12 +307,6 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
 
 def _colors(mesh: Mesh) -> Vertices:
     return base_color(mesh).expand(-1, 3)
-
-
-def _normals(mesh: Mesh) -> Vertices:
-    if mesh.normals_world is None:
-        return vertex_normals(mesh.vertices_world, mesh.faces)
-    return mesh.normals_world
 
 
 # glTF's name for vertex colours, and one that trimesh takes over as it stands in the file: those of

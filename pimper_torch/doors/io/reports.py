@@ -199,12 +199,8 @@ def relighting_report(found: Relighting) -> dict[str, object]:
     vertices = torch.bincount(found.materials.cluster, minlength=len(found.materials.metallic))
     shares = (vertices / vertices.sum()).tolist()
     rows = zip(shares, found.materials.values.tolist(), strict=True)
-    judged = zip(
-        found.judged.names,
-        found.judged.psnr_db.tolist(),
-        found.matte.psnr_db.tolist(),
-        strict=True,
-    )
+    decibels = [one.psnr_db.tolist() for one in (found.judged, found.matte)]
+    judged = zip(found.judged.names, *decibels, strict=True)
     return {
         "photographs": "held out" if found.held_out else "used",
         "psnr_db": _mean(found.judged.psnr_db),

@@ -207,8 +207,7 @@ def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
 
 
 def _write_png(picture: Float[Tensor, "height width channel"] | Tensor, path: Path) -> None:
-    array = picture.detach().to(torch.uint8).numpy()
-    Image.fromarray(array[..., 0] if array.shape[-1] == 1 else array).save(path)
+    Image.fromarray(picture.detach().to(torch.uint8).squeeze(-1).numpy()).save(path)
 
 
 def _array(values: Scalars) -> np.ndarray:

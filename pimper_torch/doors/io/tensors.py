@@ -11,6 +11,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, local_origin, to_local
 from pimper_torch.ground.geometry.projection import project
+from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.runtime.errors import InputError, caution
@@ -69,7 +70,9 @@ def scene_of(
         focals_px=torch.full_like(pictures[:, 0, 0, 0], torch.nan),
     )
     matrices = _floats(intrinsics, "intrinsics", "K in pixels").to(pictures)
-    poses = _squared(_floats(_digits(cam_from_world), "cam_from_world", "rigid matrices"))
+    poses = _floats(_digits(cam_from_world), "cam_from_world", "rigid matrices")
+    if poses.shape[1:] == (3, 4):
+        poses = rigid(poses[..., :3], poses[..., 3])
     points = poses.new_zeros(0, 3)
     if points_world is not None:
         points = _floats(_digits(points_world), "points_world", "a cloud, point 3")
@@ -149,14 +152,6 @@ def _floats(values: Array, name: str, what: str) -> Tensor:
 def _digits(values: Array) -> Tensor | np.ndarray:
     """Keep all digits of numbers in lists, of which torch keeps those of single precision."""
     return values if isinstance(values, Tensor) else np.asarray(values)
-
-
-def _squared(poses: Tensor) -> Tensor:
-    """Add the last row to matrices of three rows."""
-    if poses.ndim != 3 or poses.shape[1:] != (3, 4):
-        return poses
-    row = poses.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(poses), 1, 4)
-    return torch.cat([poses, row], dim=1)
 
 
 def _observations(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
 from pimper_torch.ground.geometry.lens_models import camera_of, distort, lens_of
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.model_files import read_model as read_model
 from pimper_torch.runtime.errors import OutputError
@@ -52,12 +52,12 @@ def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see camera_o
             tracks.append((index, number[element.image_id]))
             places.append(pixels[element.image_id][element.point2D_idx])
     track = torch.tensor(tracks, dtype=torch.long).reshape(-1, 2)
-    poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
-    bottom = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(images), 1, 4))
+    matrices = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+    poses = torch.from_numpy(matrices)
     return SparseModel(
         names=tuple(image.name for image in images),
         lenses=tuple(lens_of(reconstruction.camera(image.camera_id)) for image in images),
-        cam_from_world=torch.from_numpy(np.concatenate([poses, bottom], axis=1)),
+        cam_from_world=rigid(poses[..., :3], poses[..., 3]),
         points_world=torch.from_numpy(np.array(points, dtype=np.float64).reshape(-1, 3)),
         observation_point=track[:, 0],
         observation_view=track[:, 1],

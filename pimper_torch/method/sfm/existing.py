@@ -145,11 +145,8 @@ def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[
     """Return the sizes of photographs in their files, which others' programs count pixels of."""
     where = place(path)
     found = match_files(views.names, names, folder=views.folder, where=where, what="camera")
-    sizes: list[tuple[int, int] | None] = [None] * len(names)
-    for view, camera in enumerate(found):
-        if camera is not None:
-            sizes[camera] = _stored_size(views, view)
-    return sizes
+    sizes = {at: _stored_size(views, view) for view, at in enumerate(found) if at is not None}
+    return [sizes.get(at) for at in range(len(names))]
 
 
 def _stored_size(views: Views, view: int) -> tuple[int, int]:

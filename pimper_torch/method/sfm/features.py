@@ -81,9 +81,7 @@ def _write(views: Views, index: int, space: Workspace) -> None:
     """Write a photograph in 8-bit sRGB without its padding, and its mask if there is one."""
     width, height = (int(side) for side in views.sizes_px[index])
     pixels = to_bytes(views.images[index, :, :height, :width].detach()).cpu()
-    array = pixels.permute(1, 2, 0).numpy()
-    gray = array.shape[-1] == 1
-    picture = Image.fromarray(np.ascontiguousarray(array[..., 0] if gray else array))
+    picture = Image.fromarray(pixels.movedim(0, -1).squeeze(-1).numpy())
     # Fast compression: the files live for seconds. COLMAP looks for features in luma alone.
     picture.convert("L").save(space.images / space.files[index], compress_level=1)
     if views.masks is not None:
@@ -138,8 +136,7 @@ def find_features(
         with pycolmap.Database.open(space.database) as stored:
             _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
         step = 2 * settings.num_threads  # photographs between two reports of progress
-        starts = range(0, len(space.files), step)
-        for start in track(starts):
+        for start in track(range(0, len(space.files), step)):
             pycolmap.extract_features(
                 space.database,
                 space.images,

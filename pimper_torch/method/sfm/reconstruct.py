@@ -73,35 +73,27 @@ class Reconstruct(Stage):
         if sparse_model is None:
             model, _ = find_model(pictures_of_poses(bare), self.config, self.store)
             return placed_scene(views, of_photographs(model, views))
-        return placed_scene(views, self._given(bare, Path(sparse_model)))
+        path = Path(sparse_model)
+        model = existing_model(bare, path)
+        if lacks_points(model):
+            model = self._triangulated(taken(bare, model), model, place(path))
+        return placed_scene(views, model)
 
     def with_points(self, scene: SparseScene) -> SparseScene:
         """Triangulate points for a scene whose views observe hardly any, its cameras held fixed."""
         model = model_of_scene(scene)
         if not lacks_points(model) or not scene.lenses:
             return scene
-        bare = scene.views.replace(priors=())
-        found = self._triangulated(bare, model, "The scene")
+        found = self._triangulated(scene.views.replace(priors=()), model, "The scene")
         return scene if found is model else with_model_points(scene, found)
 
-    def _given(self, views: Views, path: Path) -> SparseModel:
-        """Read cameras, and triangulate points where they come without."""
-        model = existing_model(views, path)
-        if not lacks_points(model):
-            return model
-        return self._triangulated(taken(views, model), model, place(path))
-
     def _triangulated(self, views: Views, model: SparseModel, where: str) -> SparseModel:
-        """Take points that were kept, or triangulate them and keep them."""
         alone = replace(self.config, threads=0)
         hashed = digest(code(), views, model, alone) if self.store else None
-        found, _ = kept(
-            self.store,
-            f"triangulate-{hashed}" if hashed else None,
-            SparseModel,
-            lambda: triangulate(views, model, self.config, where),
-        )
-        return found
+        key = f"triangulate-{hashed}" if hashed else None
+        return kept(
+            self.store, key, SparseModel, lambda: triangulate(views, model, self.config, where)
+        )[0]
 
 
 def placed_scene(views: Views, model: SparseModel) -> SparseScene:
@@ -173,9 +165,10 @@ def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
     Its views are in the photographs' order, with maps to a room at rest and numbers of series.
     """
     lenses = choose_lenses(views, shared=config.shared_camera, own=config.own_cameras)
+    focals_px = [one if 0 < one < float("inf") else None for one in views.focals_px.tolist()]
     release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
     with workspace(views, config.num_threads) as space:
-        counts = find_features(space, config, _known_focals(views), lenses)
+        counts = find_features(space, config, focals_px, lenses)
         _require_features(counts, views.names)
         release_memory()
         found = register(space, config)
@@ -208,12 +201,6 @@ def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
     if found.around:
         model = with_series(model, series_in(model, views.names, found.around), views.names)
     return model
-
-
-def _known_focals(views: Views) -> list[float | None]:
-    return [
-        float(focal) if torch.isfinite(focal) and focal > 0 else None for focal in views.focals_px
-    ]
 
 
 def _require_finite(views: Views) -> None:

@@ -67,8 +67,7 @@ def refine_tracks(
         limit = torch.where(aligned, 10 * scale, 2.0)  # features are less exact
         before = len(model.points_world)
         model = model.without(observation_errors(model) > limit)
-        lost = before - len(model.points_world)
-        leave_out("sfm.tracks", lost, total=before)
+        leave_out("sfm.tracks", before - len(model.points_world), total=before)
     return model
 
 

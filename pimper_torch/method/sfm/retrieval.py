@@ -38,8 +38,7 @@ def pairs_to_match(space: Workspace) -> list[PhotographPair]:
         def descriptors(number: int) -> Descriptors:
             return read_features(stored, image_of[number]).descriptors
 
-        vectors = global_descriptors(descriptors, len(space.files))
-        return nearest_pairs(vectors, _NEIGHBOURS)
+        return nearest_pairs(global_descriptors(descriptors, len(space.files)), _NEIGHBOURS)
 
 
 def global_descriptors(

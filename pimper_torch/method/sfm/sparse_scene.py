@@ -13,8 +13,8 @@ from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local, loca
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import SATURATED, to_bytes
-from pimper_torch.method.sfm import colmap
-from pimper_torch.method.sfm.colmap import reprojection_errors
+from pimper_torch.method.sfm.colmap import reprojection_errors, write_binary
+from pimper_torch.method.sfm.existing import taken
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.undistort import undistort, with_undistorted_priors
 from pimper_torch.records import Cameras, Failure, SparseScene, Views
@@ -38,10 +38,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
             cam_from_world=to_local(model.cam_from_world, offset),
             points_world=model.points_world - model.points_world.new_tensor(offset),
         )
-    number = {name: index for index, name in enumerate(views.names)}
-    undistorted, intrinsics = undistort(
-        views.take([number[name] for name in model.names]), model.lenses
-    )
+    undistorted, intrinsics = undistort(taken(views, model), model.lenses)
     like = views.images
     scene = SparseScene(
         views=undistorted.replace(folder=""),  # the scene is the same from another folder
@@ -103,7 +100,7 @@ def write_model(scene: SparseScene, folder: Path) -> None:
     reading it back with them gives the same scene.
     """
     model = model_of_scene(scene).replace(lenses=scene.lenses)
-    colmap.write_binary(model, point_colors(scene), folder)
+    write_binary(model, point_colors(scene), folder)
 
 
 def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
@@ -113,11 +110,8 @@ def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
     total = images.new_zeros(len(scene.points_world), images.shape[1])
     for index in range(scene.views.num_views):
         seen = scene.observation_point[scene.observation_view == index]
-        pixels, _ = project(
-            scene.points_world[seen],
-            scene.cameras.cam_from_world[index],
-            scene.cameras.intrinsics[index],
-        )
+        pose, K = scene.cameras.cam_from_world[index], scene.cameras.intrinsics[index]
+        pixels, _ = project(scene.points_world[seen], pose, K)
         grid = grid_from_pixels(pixels, width, height)[None, None]
         colors = grid_sample(images[index][None], grid, mode="bilinear", align_corners=False)
         total = total.index_add(0, seen, colors[0, :, 0].T)

@@ -14,7 +14,6 @@ features in the place of the logarithm.
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
@@ -279,7 +278,9 @@ def _sight(
         (own,) = torch.nonzero(found, as_tuple=True)
         point = torch.cat([point, own])
         view_ = torch.cat([view_, tangents.reference[own]])
-        pixels = torch.cat([pixels, _reference_pixels(tangents, cameras)[own]])
+        there = cameras.take(tangents.reference[own])
+        mine, _ = project(tangents.points_world[own, None], there.cam_from_world, there.intrinsics)
+        pixels = torch.cat([pixels, mine[:, 0]])
         order = torch.argsort(point * len(pictures.log) + view_)
         return TrackObservations(point=point[order], view=view_[order], pixels=pixels[order])
 
@@ -325,39 +326,18 @@ def _aligned(
 
     shift = homographies.new_empty(len(homographies), 2)
     deviation, correlation = torch.empty_like(shift).mT.contiguous()
-    align(
-        pictures.log[view].numpy(),
-        homographies.contiguous().numpy(),
-        chosen.contiguous().numpy(),
-        templates.values.contiguous().numpy(),
-        templates.slopes.contiguous().numpy(),
-        templates.inverse.contiguous().numpy(),
-        window.places.contiguous().numpy(),
-        window.root.contiguous().numpy(),
-        window.light.contiguous().numpy(),
-        np.array([*_LIMITS, max_shift_px], dtype=np.float64),
-        shift.numpy(),
-        deviation.numpy(),
-        correlation.numpy(),
-    )
+    limits = torch.tensor([*_LIMITS, max_shift_px], dtype=torch.float64)
+    own = (templates.values, templates.slopes, templates.inverse)
+    given = (homographies, chosen, *own, window.places, window.root, window.light, limits)
+    found = (shift, deviation, correlation)  # written to: these are contiguous
+    align(*(one.contiguous().numpy() for one in (pictures.log[view], *given, *found)))
     arrived = shift.isfinite().all(dim=1)
-    final = _shifted(homographies, torch.where(arrived[:, None], shift, 0))
-    found = arrived & (correlation >= 0.8) & (deviation <= 0.5)
-    found &= _complete(pictures.unusable[view], final, window)
-    return found, final[:, :2, 2] / final[:, 2:, 2]
-
-
-def _shifted(homographies: Float[Tensor, "point 3 3"], shift: Pixels) -> Float[Tensor, "point 3 3"]:
-    """Begin the plane's steps elsewhere."""
-    centre = homographies[:, :, 2] + (homographies[:, :, :2] @ shift[..., None])[..., 0]
-    return torch.cat([homographies[:, :, :2], centre[..., None]], dim=2)
-
-
-def _reference_pixels(tangents: Tangents, cameras: Cameras) -> Pixels:
-    frames = cameras.cam_from_world[tangents.reference]
-    points = (frames[:, :3, :3] @ tangents.points_world[..., None])[..., 0] + frames[:, :3, 3]
-    homogeneous = (cameras.intrinsics[tangents.reference] @ points[..., None])[..., 0]
-    return homogeneous[:, :2] / homogeneous[:, 2:]
+    axes = homographies[:, :, :2]
+    centre = homographies[:, :, 2:] + axes @ torch.where(arrived[:, None], shift, 0)[..., None]
+    final = torch.cat([axes, centre], dim=2)
+    kept = arrived & (correlation >= 0.8) & (deviation <= 0.5)
+    kept &= _complete(pictures.unusable[view], final, window)
+    return kept, final[:, :2, 2] / final[:, 2:, 2]
 
 
 def _complete(

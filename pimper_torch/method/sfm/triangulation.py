@@ -148,12 +148,11 @@ def _match_along_lines(
     kinds = loaded().TwoViewGeometryConfiguration
     with quiet(), loaded().Database.open(space.database) as stored:
         image_of = image_ids(stored, space)
-        features = []
-        for view, image in enumerate(image_of):
-            its = matching.read_features(stored, image)
-            features.append(
-                its.replace(pixels=epipolar.undistorted_pixels(model, view, its.pixels))
-            )
+        bent = [matching.read_features(stored, image) for image in image_of]
+        features = [
+            its.replace(pixels=epipolar.undistorted_pixels(model, view, its.pixels))
+            for view, its in enumerate(bent)
+        ]
 
         def matches(pair: matching.PhotographPair) -> Tensor:
             first, second = (features[number] for number in pair)

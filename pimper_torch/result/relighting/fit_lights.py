@@ -232,8 +232,7 @@ def _fit(
     ) -> Float[Tensor, "start most 4"]:
         """Return the best lights of every start, best first."""
         losses = fit_strengths(seen, *rendered(seen, lights.flatten(0, 1), shadows), scale)[2]
-        loss = losses.reshape(lights.shape[:2])
-        order = loss.argsort(dim=1, stable=True)[:, :most]
+        order = losses.reshape(lights.shape[:2]).argsort(dim=1, stable=True)[:, :most]
         return lights.gather(1, order[..., None].expand(-1, -1, 4))
 
     lights = pad(even_directions(_DIRECTIONS).float(), (0, 1))
@@ -241,7 +240,7 @@ def _fit(
         lights = torch.cat([start.direction_world, start.closeness[:, None]], dim=1)
     else:
         far = best(few, lights[None], shadows=False, most=_CANDIDATES)[0]
-        starts = best(few, torch.stack([_with(far, one) for one in _CLOSENESS]))
+        starts = best(few, torch.stack([pad(far[:, :3], (0, 1), value=one) for one in _CLOSENESS]))
         for step in _COARSE:
             starts = best(few, torch.stack([_neighbours(one[0], step) for one in starts]))
         lights = best(many, starts.flatten(0, 1)[None])[0]
@@ -254,10 +253,6 @@ def _fit(
         ambient=ambient,
         directed=directed,
     )
-
-
-def _with(lights: Float[Tensor, "light 4"], closeness: float) -> Float[Tensor, "light 4"]:
-    return torch.cat([lights[:, :3], torch.full_like(lights[:, 3:], closeness)], dim=1)
 
 
 def _neighbours(light: Float[Tensor, " 4"], step: float) -> Float[Tensor, "11 4"]:

@@ -44,7 +44,8 @@ def materials_under(
     values = torch.tensor([_MATTE])
     if len(trial.observed) < 2:
         return Materials.of(cluster, values)
-    values = trial.improved(cluster, values, 0, _grid())
+    grid = torch.cartesian_prod(torch.zeros(1), torch.tensor(_ROUGHNESS), torch.tensor(_SPECULAR))
+    values = trial.improved(cluster, values, 0, grid)
     if bool((values == torch.tensor(_MATTE)).all()):
         return Materials.of(cluster, values)
     values = trial.improved(cluster, values, 0, _metals(values[0]))
@@ -129,10 +130,6 @@ def _agreed(losses: Float[Tensor, "view candidate"]) -> bool:
     gain, before = float(gains.mean()), float(losses[:, 0].mean())
     error = float(gains.std()) / len(gains) ** 0.5
     return gain > _LEAST_GAIN * before and gain > _SIGNIFICANT * error
-
-
-def _grid() -> Float[Tensor, "candidate 3"]:
-    return torch.cartesian_prod(torch.zeros(1), torch.tensor(_ROUGHNESS), torch.tensor(_SPECULAR))
 
 
 def _metals(value: Float[Tensor, " 3"]) -> Float[Tensor, "candidate 3"]:

@@ -6,12 +6,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import rotate, transform
-from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.report.vertex_layers import surface_layers
-from pimper_torch.result.viz.maps import base_color, normal_colors
+from pimper_torch.result.viz.maps import base_color, carried_normals, normal_colors
 
 LAYERS = ("lit", "shape", "albedo", "normals")
 """Of colours; those of numbers are the report's."""
@@ -36,10 +35,7 @@ def painted(mesh: Mesh, name: str, viewer_from_world: Float[Tensor, "4 4"]) -> t
     """
     if name == "shape":
         mesh = mesh.replace(normals_world=None, albedo=None)
-    normals = mesh.normals_world
-    if normals is None:
-        normals = vertex_normals(mesh.vertices_world, mesh.faces)
-    normals = normalize(rotate(viewer_from_world, normals.double()), dim=1)
+    normals = normalize(rotate(viewer_from_world, carried_normals(mesh).double()), dim=1)
     colors, legend = base_color(mesh).expand(-1, 3), ""
     if name == "normals":
         right_down_ahead = normals[:, [1, 2, 0]] * normals.new_tensor([1.0, -1.0, -1.0])
