@@ -234,10 +234,8 @@ def _entry(option: Option, width: int) -> list[str]:
     if value != option.value:
         text += f" One of {option.value[1:-1].replace(',', ', ')}."
     if option.default not in (REQUIRED, None, "", ()) and option.default is not False:
-        default = str(option.default)
-        if isinstance(option.default, tuple):
-            default = ",".join(map(str, option.default))
-        text += f" (default: {default})"
+        default = option.default if isinstance(option.default, tuple) else (option.default,)
+        text += f" (default: {','.join(map(str, default))})"
     column = " " * _COLUMN
     lines = textwrap.wrap(
         text, width, initial_indent=column, subsequent_indent=column, break_on_hyphens=False

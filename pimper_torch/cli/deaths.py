@@ -35,12 +35,11 @@ def write_report(error: BaseException) -> Path | None:
     """
     lines = [f"{name} {version}" for name, version in versions().items()]
     lines += [f"at {datetime.now(UTC).isoformat(' ', 'seconds')}", shlex.join(sys.argv), ""]
-    text = "\n".join([*lines, *traceback.format_exception(error)])
     try:
         with tempfile.NamedTemporaryFile(
             *("w", -1, "utf-8"), prefix="pimper-", suffix=".txt", delete=False, errors="replace"
         ) as file:
-            file.write(text)
+            file.write("\n".join([*lines, *traceback.format_exception(error)]))
     except OSError:
         return None
     return Path(file.name)

@@ -279,8 +279,7 @@ def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
     written = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
     named = {argument for argument in written if argument.startswith("--")}
     for option in sorted(named - options(preset)):
-        having = [name for name in presets() if option in options(name)]
-        if having:
+        if having := [name for name in presets() if option in options(name)]:
             raise ConfigError(
                 f"{option} is no option of the preset {preset}, but of {', '.join(having)}. Leave "
                 f"it out, or choose `--preset {having[0]}`."

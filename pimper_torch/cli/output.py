@@ -110,8 +110,7 @@ class Output:
         if self.as_json:
             shown = nullcontext(Events(self.event, 0.5, forecast))
         elif self.shows("info"):
-            figures = None if self.shows("debug") else 3
-            shown = Bars(Console(stderr=True), forecast, figures)
+            shown = Bars(Console(stderr=True), forecast, None if self.shows("debug") else 3)
         with shown as observer, recorded(observer):
             yield observer
 

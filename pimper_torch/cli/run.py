@@ -216,8 +216,7 @@ def in_files(job: Job, views: Views, mark: Mark) -> Mark:
     paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
     def sized_pointer(pointer: Pointer) -> Pointer:
-        name = views.names[number_of(pointer.name, views.names)]
-        header = read_header(paths[name])
+        header = read_header(paths[views.names[number_of(pointer.name, views.names)]])
         require_inside(pointer, header.width, header.height)
         return replace(pointer, size_px=(header.width, header.height))
 

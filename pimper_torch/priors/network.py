@@ -69,8 +69,7 @@ def priors_of(
         picture = photographs.images[view : view + 1, :, :height, :width].expand(-1, 3, -1, -1)
         picture = picture if linear else srgb_from_linear(picture)
         if size_px is not None:
-            size = size_px[::-1]
-            picture = interpolate(picture, size, mode="bilinear", antialias=True)
+            picture = interpolate(picture, size_px[::-1], mode="bilinear", antialias=True)
         return _map(run((picture - means) / deviations), kind)
 
     numbers = range(photographs.num_views)

@@ -73,13 +73,11 @@ def _of_one_folder(
 ) -> list[int | None]:
     """Leave out files of other folders where some are of the wanted ones' folder."""
     others = ["" if place is None else present[place] for place in found]
-    tied = [_common(*pair) > 0 for pair in zip(paths, others, strict=True)]
-    apart = [all(map(_folders, pair)) for pair in zip(paths, others, strict=True)]
-    if not any(tied):
-        return found
+    pairs = list(zip(paths, others, strict=True))
+    tied = any(_common(*pair) for pair in pairs)
     return [
-        None if elsewhere and not ties else place
-        for place, ties, elsewhere in zip(found, tied, apart, strict=True)
+        None if tied and not _common(*pair) and all(map(_folders, pair)) else place
+        for place, pair in zip(found, pairs, strict=True)
     ]
 
 

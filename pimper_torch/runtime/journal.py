@@ -98,5 +98,4 @@ def aside(line: str) -> Iterator[None]:
     journal, began = current(), time.perf_counter()
     yield
     if journal.observer is not None:
-        took = time.perf_counter() - began
-        journal.aside[line] = journal.aside.get(line, 0.0) + took
+        journal.aside[line] = journal.aside.get(line, 0.0) + time.perf_counter() - began

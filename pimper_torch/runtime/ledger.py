@@ -102,13 +102,12 @@ def leave_out(
         return
     mask = taken if isinstance(taken, Tensor) else None
     if mask is not None:
-        total = mask.numel()
-    if mask is not None and names:
-        names = [name for name, gone in zip(names, mask.tolist(), strict=True) if gone]
+        taken, total = int(mask.count_nonzero()), mask.numel()
+        if names:
+            names = [name for name, gone in zip(names, mask.tolist(), strict=True) if gone]
     what, reason = GUARDS[guard]
-    count = int(taken) if mask is None else int(mask.count_nonzero())
     entry = LeftOut(
-        guard=guard, what=what, count=count, total=total, reason=reason, names=tuple(names)
+        guard=guard, what=what, count=int(taken), total=total, reason=reason, names=tuple(names)
     )
     if journal.collects:
         journal.tell(entry)

@@ -106,5 +106,4 @@ def recomputed(work: Callable[[*Given], Result], *given: *Given) -> Result:
     """
     if not any(getattr(leaf, "requires_grad", False) for leaf in pytree.tree_leaves(given)):
         return work(*given)  # the first checkpoint of a process imports a compiler, for seconds
-    found: Result = checkpoint(work, *given, use_reentrant=False, preserve_rng_state=False)
-    return found
+    return checkpoint(work, *given, use_reentrant=False, preserve_rng_state=False)

@@ -89,8 +89,7 @@ def run(given: tuple[_Job, list[str]], output: Output) -> None:
     counts = Counter(one.status for one in outcomes)
     totals = ", ".join(f"{count} {status}" for status, count in counts.items())
     output.remark(f"{totals}; {job.out / HTML} shows them.")
-    lost = [one for one in outcomes if one.status not in ("ended", "kept")]
-    if lost:
+    if lost := [one for one in outcomes if one.status not in ("ended", "kept")]:
         first = lost[0]
         raise ReconstructionError(
             f"{len(lost)} of {len(outcomes)} objects have no result, as {first.name}: "

@@ -86,8 +86,7 @@ class SlurmExecutor(ThreadPoolExecutor):
         while not task.stopped:
             with self._lock:
                 if job.done():
-                    outcome: Outcome = job.result()
-                    return outcome
+                    return job.result()
             time.sleep(1.0)
         job.cancel(check=False)
         raise CancelledError

@@ -112,14 +112,13 @@ def _in_table(path: Path) -> list[Object]:
         photos, name = cells.pop("photos"), cells.pop("name", "")
         if not photos:
             raise InputError(f"{where}: `photos` is empty; needed: a folder of photographs.")
-        folder = path.parent / photos
         settings = [
             word
             for column, cell in cells.items()
             if cell
             for word in _words(f"--{column.replace('_', '-')}", cell, kinds, path.parent)
         ]
-        one = _in_folder(folder)
+        one = _in_folder(path.parent / photos)
         found.append(
             Object(name=name or one.name, photos=one.photos, settings=(*settings,), where=where)
         )

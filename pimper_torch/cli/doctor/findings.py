@@ -23,7 +23,6 @@ class Finding:
     advice: str = ""
 
     def __str__(self) -> str:
-        """State it in a sentence or two."""
         needed = f"; needed: {self.needed}" if self.needed else ""
         advice = f" {self.advice}" if self.advice else ""
         return f"{self.found}{needed}.{advice}"

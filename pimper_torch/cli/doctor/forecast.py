@@ -61,8 +61,7 @@ class Forecast:
 
     def _factor(self, name: str, taken: Sequence[tuple[str, float, float]]) -> float:
         """Return real over planned seconds: of the pass before, or of all stages."""
-        own = [real / planned for one, planned, real in self._ended if one == name]
-        if own:
+        if own := [real / planned for one, planned, real in self._ended if one == name]:
             return own[-1]
         # What the plan's own scale is worth, beside what this machine took so far.
         weight = 0.05 * sum(seconds for _, seconds in self.plan)

@@ -37,14 +37,12 @@ def edge_blur_px(grey: Map) -> float:
     top, left = (max(0, (side - 1024) // 2) for side in grey.shape)
     grey = grey[top : top + 1024, left : left + 1024].float()  # the centre, where the object is
     fine, wide = _gradient(grey, _FINE), _gradient(grey, _WIDE)
-    strength = torch.hypot(fine[0], fine[1])
+    strength = torch.hypot(*fine)
     peaks = max_pool2d(strength[None, None], 3, 1, 1)[0, 0] == strength
     peaks &= strength > 6 * strength.median() + 1e-4  # else noise
     angle = torch.atan2(fine[1], fine[0]) % torch.pi
     bins = (angle * (4 / torch.pi) + 0.5).floor() % 4
-    found = [
-        _blur(strength, torch.hypot(wide[0], wide[1]), peaks & (bins == one)) for one in range(4)
-    ]
+    found = [_blur(strength, torch.hypot(*wide), peaks & (bins == one)) for one in range(4)]
     return max((one for one in found if one == one), default=float("nan"))
 
 

@@ -57,8 +57,7 @@ def thumbnail(luma: UInt8[Tensor, "height width"]) -> UInt8[np.ndarray, "height 
     """Shrink a frame to where motion is measured."""
     height, width = luma.shape
     size = (_WIDTH_PX, max(16, round(height * _WIDTH_PX / width)))
-    small: np.ndarray = cv2.resize(luma.numpy(), size, interpolation=cv2.INTER_AREA)
-    return small
+    return cv2.resize(luma.numpy(), size, interpolation=cv2.INTER_AREA)
 
 
 def motion(

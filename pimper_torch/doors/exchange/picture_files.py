@@ -76,8 +76,7 @@ def file_names(names: Sequence[str]) -> tuple[str, ...]:
 def refuse_skew(cameras: Cameras, names: Sequence[str], kind: str) -> None:
     """Refuse cameras whose pixels are sheared noticeably, for formats that cannot represent it."""
     K = cameras.intrinsics.detach().cpu().double()
-    height = cameras.sizes_px[:, 1].cpu().double()
-    moved = (K[:, 0, 1] / K[:, 1, 1]).abs() * height / 2
+    moved = (K[:, 0, 1] / K[:, 1, 1]).abs() * cameras.sizes_px[:, 1].cpu().double() / 2
     # Less is below what calibration knows.
     sheared = [name for name, shift in zip(names, moved.tolist(), strict=True) if shift > 0.01]
     if sheared:

@@ -75,12 +75,15 @@ def read_result(folder: Path | str, photographs: Path | str | None = None) -> Re
             they were, or others.
     """
     folder = Path(folder)
-    _require_result(folder)
+    if missing := [name for name in _FILES if not (folder / name).exists()]:
+        found = f"holds no {some(missing)}" if folder.is_dir() else "is no folder"
+        raise InputError(f"{folder}: {found}; needed: a folder written by `pimper reconstruct`.")
     summary = DataSetPath(folder / "summary.json", _KIND).read_json()
     model = read_model(folder / "sparse")
     views = _photographs(folder, photographs or summary.get("photographs"), model)
     scene = assemble_scene(views, model)
     mesh = read_mesh(folder / "mesh.ply")
+    reference = summary.get("reference") or read_reference(folder / "depth.npz")
     local = mesh.vertices_world - mesh.vertices_world.new_tensor(scene.offset_world)
     return Result(
         mesh=mesh.replace(vertices_world=local).to(scene.points_world.dtype),
@@ -92,16 +95,9 @@ def read_result(folder: Path | str, photographs: Path | str | None = None) -> Re
         ),
         silhouettes=_silhouettes(folder, scene.views, summary, given=views.masks is not None),
         lights_world=read_lights(folder / "lights.json", model.names),
-        reference=_reference(folder, summary, model.names),
+        reference=str(reference) if reference in model.names else model.names[0],
         summary=summary,
     )
-
-
-def _require_result(folder: Path) -> None:
-    missing = [name for name in _FILES if not (folder / name).exists()]
-    if missing:
-        found = f"holds no {some(missing)}" if folder.is_dir() else "is no folder"
-        raise InputError(f"{folder}: {found}; needed: a folder written by `pimper reconstruct`.")
 
 
 def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
@@ -117,8 +113,7 @@ def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
         )
     path = Path(named)
     names = {image_name(file, path) for file in list_images(path)} if path.is_dir() else set()
-    missing = [name for name in model.names if name not in names]
-    if missing:
+    if missing := [name for name in model.names if name not in names]:
         raise InputError(
             f"{folder}: its photographs {some(missing)} are not in {path.absolute()}; needed: all "
             f"{model.num_views} that it was made from. Name their folder by `--photos DIR` "
@@ -175,9 +170,3 @@ def _left_out(summary: Mapping[str, object], guards: Sequence[str]) -> set[objec
         if isinstance(entry, dict) and entry.get("guard") in guards
         for name in entry.get("names") or ()
     }
-
-
-def _reference(folder: Path, summary: Mapping[str, object], names: tuple[str, ...]) -> str:
-    """Return the reference view; the first where nothing names one."""
-    named = summary.get("reference") or read_reference(folder / "depth.npz")
-    return str(named) if named in names else names[0]

@@ -180,8 +180,7 @@ def _match_masks(names: Sequence[str], folder: Path) -> list[Path]:
         places = match_files(wanted, called, where=str(folder), what="mask")
         for index, at in zip(lost, places, strict=True):
             found[index] = None if at is None else free[at]
-    missing = [name for name, mask in zip(names, found, strict=True) if mask is None]
-    if missing:
+    if missing := [name for name, mask in zip(names, found, strict=True) if mask is None]:
         raise InputError(
             f"{folder}: no mask for {some(missing)}; needed: one for each photograph, of the same "
             f"name (such as {missing[0].rpartition('.')[0]}.png). There are "

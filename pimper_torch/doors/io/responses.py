@@ -82,8 +82,7 @@ def read_curve(path: Path | str) -> Curve:
 
 
 def _read_csv(path: Path) -> np.ndarray:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        text = file.read()
+    text = path.read_text(encoding="utf-8-sig")
     comma = ";" if ";" in text else ","
     rows = [row for row in csv.reader(text.splitlines(), delimiter=comma) if any(row)]
     if rows and not any(_is_number(cell) for cell in rows[0]):

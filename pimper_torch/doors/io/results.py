@@ -21,7 +21,6 @@ from pimper_torch.doors.io.reports import (
 from pimper_torch.doors.outputs.folders import written_whole
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.ground.radiometry import to_bytes
-from pimper_torch.ground.shapes import Scalars
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.sfm.sparse_scene import write_model
 from pimper_torch.records import Finished, Reconstruction, Silhouettes, SparseScene
@@ -32,6 +31,7 @@ from pimper_torch.result.report.predictions import predictions
 from pimper_torch.result.report.vertex_layers import surface_layers
 from pimper_torch.result.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
 from pimper_torch.result.viz.overview import draw_overview, headline
+from pimper_torch.result.viz.tiles import array
 from pimper_torch.result.viz.turn import draw_turn
 from pimper_torch.runtime.config import to_yaml
 from pimper_torch.runtime.mapped import each
@@ -195,12 +195,12 @@ def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
     far = offset != NO_OFFSET
     np.savez_compressed(
         path,
-        depth=_array(maps.depth),
+        depth=array(maps.depth),
         mask=maps.seen.numpy(),
-        confidence=_array(maps.confidence),
-        **({} if error is None else {"expected_error": _array(error)}),
-        intrinsics=_array(cameras.intrinsics[reference]),
-        cam_from_world=from_local(pose[None], offset)[0].detach().numpy() if far else _array(pose),
+        confidence=array(maps.confidence),
+        **({} if error is None else {"expected_error": array(error)}),
+        intrinsics=array(cameras.intrinsics[reference]),
+        cam_from_world=from_local(pose[None], offset)[0].detach().numpy() if far else array(pose),
         name=np.array(result.scene.views.names[reference]),
         allow_pickle=False,
     )
@@ -208,8 +208,3 @@ def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
 
 def _write_png(picture: Float[Tensor, "height width channel"] | Tensor, path: Path) -> None:
     Image.fromarray(picture.detach().to(torch.uint8).squeeze(-1).numpy()).save(path)
-
-
-def _array(values: Scalars) -> np.ndarray:
-    array: np.ndarray = values.detach().float().numpy()
-    return array

@@ -51,8 +51,7 @@ MOVE = (
 
 def count_spread_views(model: SparseModel, fewest: int) -> int:
     """Count the views that see enough points under a triangulation angle that tells depth."""
-    seen = model.observed[wide_points(model)].sum(dim=0)
-    return int((seen >= fewest).sum())
+    return int((model.observed[wide_points(model)].sum(dim=0) >= fewest).sum())
 
 
 def wide_points(model: SparseModel) -> Bool[Tensor, " point"]:

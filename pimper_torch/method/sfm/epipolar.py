@@ -27,8 +27,7 @@ def sampson_errors(
 ) -> Float[Tensor, " match"]:
     """Return the first-order distance of matches from an epipolar geometry, in pixels."""
     ends = first.double(), second.double()
-    errors: Tensor = sampson_epipolar_distance(*ends, geometry, squared=False)
-    return errors
+    return sampson_epipolar_distance(*ends, geometry, squared=False)
 
 
 def fundamental_matrix(
@@ -89,8 +88,7 @@ def epipolar_geometry(cameras: Cameras, views: PhotographPair) -> Matrix3:
     poses = (cameras.cam_from_world[view] for view in views)
     motion = (part for pose in poses for part in (pose[:3, :3], pose[:3, 3:]))
     intrinsics = (cameras.intrinsics[view] for view in views)
-    geometry: Tensor = fundamental_from_essential(essential_from_Rt(*motion), *intrinsics)
-    return geometry
+    return fundamental_from_essential(essential_from_Rt(*motion), *intrinsics)
 
 
 def undistorted_pixels(
@@ -98,8 +96,7 @@ def undistorted_pixels(
 ) -> Float[Tensor, "match 2"]:
     """Return where a pinhole of the lens's own focal length has pixels of a photograph."""
     K = pinhole_of(model.lenses[view])
-    plane = undistort_pixels(model.lenses[view], pixels)
-    return plane * K.diagonal()[:2] + K[:2, 2]
+    return undistort_pixels(model.lenses[view], pixels) * K.diagonal()[:2] + K[:2, 2]
 
 
 def undistorted_pairs(

@@ -108,8 +108,7 @@ def place(path: Path) -> str:
 
 def taken(views: Views, model: SparseModel) -> Views:
     """Take the photographs of a model, in its order."""
-    number = {name: index for index, name in enumerate(views.names)}
-    return views.take([number[name] for name in model.names])
+    return views.take([views.names.index(name) for name in model.names])
 
 
 def _model_of_file(views: Views, path: Path) -> SparseModel:
@@ -122,10 +121,9 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
         )
     names = [camera.name.replace("\\", "/") for camera in cameras]
     skewed = [
-        camera.name
-        for camera in cameras
-        if abs(camera.skew_px) * camera.lens.height
-        > 0.2 * camera.lens.params[1]  # of 0.1 px in the corners
+        one.name
+        for one in cameras
+        if abs(one.skew_px) * one.lens.height > 0.2 * one.lens.params[1]  # 0.1 px in the corners
     ]
     twice = sorted({name for name in names if names.count(name) > 1})
     if skewed or twice:

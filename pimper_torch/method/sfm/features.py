@@ -174,8 +174,7 @@ def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # no
 def _set_focals(stored: Any, focals_px: dict[str, float | None]) -> None:  # noqa: ANN401 - no types
     known: dict[int, list[float]] = {}
     for image in stored.read_all_images():
-        focal = focals_px[image.name]
-        if focal is not None:
+        if (focal := focals_px[image.name]) is not None:
             known.setdefault(image.camera_id, []).append(focal)
     for camera in stored.read_all_cameras():
         if camera.camera_id not in known:

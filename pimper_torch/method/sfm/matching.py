@@ -250,20 +250,14 @@ class Matched:
 
 def read_matched(stored: Any) -> Matched:  # noqa: ANN401 - pycolmap has no types before it is loaded
     """Read features and matches."""
-    pycolmap = loaded()
-
     images = sorted(stored.read_all_images(), key=lambda image: image.name)
-    number = {image.image_id: index for index, image in enumerate(images)}
+    ids = tuple(image.image_id for image in images)
     cameras = {camera.camera_id: camera for camera in stored.read_all_cameras()}
-    pairs = {}
-    for pair_id, rows in zip(*stored.read_all_matches(), strict=True):
-        first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        pairs[number[first], number[second]] = indices(rows)
     return Matched(
-        ids=tuple(image.image_id for image in images),
+        ids=ids,
         cameras=tuple(cameras[image.camera_id] for image in images),
-        keypoints=[read_pixels(stored, image.image_id) for image in images],
-        pairs=pairs,
+        keypoints=[read_pixels(stored, image) for image in ids],
+        pairs={pair: indices(rows) for pair, rows in _pairs(stored.read_all_matches(), ids)},
     )
 
 
@@ -317,12 +311,15 @@ class Verifier:
 
 def read_geometries(stored: Any, images: Sequence[int]) -> dict[PhotographPair, Any]:  # noqa: ANN401
     """Read the geometries of verified pairs, by positions among images."""
+    return dict(_pairs(stored.read_two_view_geometries(), images))
+
+
+def _pairs(listed: Any, images: Sequence[int]) -> Iterator[tuple[PhotographPair, Any]]:  # noqa: ANN401
+    """Go through what COLMAP lists of pairs of images, by their positions among some."""
     number = {image: index for index, image in enumerate(images)}
-    found = {}
-    for pair_id, geometry in zip(*stored.read_two_view_geometries(), strict=True):
+    for pair_id, one in zip(*listed, strict=True):
         first, second = loaded().pair_id_to_image_pair(pair_id)
-        found[number[first], number[second]] = geometry
-    return found
+        yield (number[first], number[second]), one
 
 
 def read_pixels(stored: Any, image: int) -> Float[Tensor, "feature 2"]:  # noqa: ANN401

@@ -77,10 +77,8 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
     Returns:
         Points in their old order. Observations are sorted by point, then view.
     """
-    views, counts = (
-        torch.tensor(chosen, dtype=torch.long),
-        torch.bincount(model.observation_view, minlength=model.num_views),
-    )
+    views = torch.tensor(chosen, dtype=torch.long)
+    counts = torch.bincount(model.observation_view, minlength=model.num_views)
     by_view = torch.split(torch.argsort(model.observation_view, stable=True), counts.tolist())
     rows = torch.cat([views[:0], *(by_view[view] for view in chosen)])
     view = torch.arange(len(chosen)).repeat_interleave(counts[views])
@@ -150,7 +148,6 @@ def match_names(
             f"{some(model.names)}; the photographs are {some(names)}. Rename the "
             "photographs to match, or leave the model out to run structure from motion."
         )
-    renamed = select_views(model, chosen)
-    return renamed.replace(
+    return select_views(model, chosen).replace(
         names=tuple(name for name, index in zip(names, found, strict=True) if index is not None)
     )

@@ -54,12 +54,11 @@ class _Point(NamedTuple):
 def camera_models() -> dict[int, tuple[str, int]]:
     """List COLMAP's camera models by their number in binary files: name, count of parameters."""
     pycolmap = loaded()
-    kinds = {int(kind): name for name, kind in pycolmap.CameraModelId.__members__.items()}
     blank = pycolmap.Camera.create_from_model_name
     return {
-        kind: (name, len(blank(1, name, 1.0, 1, 1).params))
-        for kind, name in kinds.items()
-        if kind >= 0
+        int(kind): (name, len(blank(1, name, 1.0, 1, 1).params))
+        for name, kind in pycolmap.CameraModelId.__members__.items()
+        if int(kind) >= 0
     }
 
 

@@ -131,13 +131,12 @@ def object_votes(
 
     Features that match are of one body, and so are those of one geometry in a pair that has two.
     """
-    inside = [
+    votes = [  # how central: 1 in the middle, 0 half a side from it
         1 - 2 * ((pixels - size / 2) / size).norm(dim=1)
         for pixels, size in zip(keypoints, sizes_px.to(keypoints[0]), strict=True)
     ]
-    votes = inside  # how central: 1 in the middle, 0 half a side from it
     for _ in range(4):
-        cast = [torch.zeros_like(one) for one in inside]
+        cast = [torch.zeros_like(one) for one in votes]
         for pair, second in seconds.items():
             sets = verified[pair], second
             means = [_total(votes, pair, rows).mean() for rows in sets]
@@ -184,8 +183,7 @@ def clusters(weight: Float[Tensor, "view view"]) -> Int[Tensor, " view"]:
     group = torch.arange(len(weight))
     while True:
         weight.fill_diagonal_(0)
-        best = int(weight.argmax())
-        kept, gone = sorted(divmod(best, len(weight)))
+        kept, gone = sorted(divmod(int(weight.argmax()), len(weight)))
         if float(weight[kept, gone]) <= 0:
             return torch.unique(group, return_inverse=True)[1]
         group[group == gone] = kept
@@ -318,8 +316,7 @@ def with_series(
             stacklevel=4,
         )
         return model.replace(series=numbers)
-    apart = [name for name in names if name not in model.names]
-    if apart:
+    if apart := [name for name in names if name not in model.names]:
         caution(
             f"The object was moved on what it stands on, and too little of it ties {len(apart)} of "
             f"{len(names)} photographs to the others, which are reconstructed alone; apart stand "

@@ -107,8 +107,7 @@ def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPos
     pixels = scene.observation_pixels.new_zeros(*table.shape, 2)
     pixels[point, seer] = scene.observation_pixels
     point, seer = table.nonzero(as_tuple=True)
-    kept = torch.zeros_like(poses, dtype=torch.bool)
-    kept[lead] = True
+    kept = torch.bincount(lead, minlength=len(lead)) > 0
     one = scene.replace(
         observation_point=point, observation_view=seer, observation_pixels=pixels[point, seer]
     )

@@ -168,8 +168,7 @@ def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
     focals_px = [one if 0 < one < float("inf") else None for one in views.focals_px.tolist()]
     release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
     with workspace(views, config.num_threads) as space:
-        counts = find_features(space, config, focals_px, lenses)
-        _require_features(counts, views.names)
+        _require_features(find_features(space, config, focals_px, lenses), views.names)
         release_memory()
         found = register(space, config)
     release_memory()

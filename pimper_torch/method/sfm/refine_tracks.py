@@ -163,6 +163,5 @@ def _leading(model: SparseModel, aligned: Bool[Tensor, " observation"]) -> Bool[
     """Find the points that tell cameras: those aligned, and all in views that show few of them."""
     counts = torch.bincount(model.observation_view[aligned], minlength=model.num_views)
     leading = aligned | (counts < MIN_POINTS)[model.observation_view]
-    wanted = torch.zeros(len(model.points_world), dtype=torch.bool)
-    wanted[model.observation_point[leading]] = True
-    return wanted
+    points = model.observation_point[leading]
+    return torch.bincount(points, minlength=len(model.points_world)) > 0

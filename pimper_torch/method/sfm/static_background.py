@@ -216,8 +216,7 @@ def _keep_moving(
     for pair, rows in matched.pairs.items():
         ids = matched.ids[pair[0]], matched.ids[pair[1]]
         stored.write_matches(*ids, moving(pair, rows))
-        if pair in geometries:
-            geometry = geometries[pair]
+        if geometry := geometries.get(pair):
             inliers = moving(pair, indices(geometry.inlier_matches))
             if len(inliers) >= MIN_MATCHES:
                 geometry.inlier_matches = inliers

@@ -222,8 +222,7 @@ class _Window:
         self.places = torch.stack([u.flatten(), v.flatten(), torch.ones_like(u).flatten()])
         weight = torch.exp(-(u.square() + v.square()).flatten() * 1.5 / _RADIUS**2)
         self.root, self.total = weight.sqrt(), float(weight.sum())
-        light = (self.places * self.root).mT
-        self.light = torch.linalg.qr(light).Q
+        self.light = torch.linalg.qr((self.places * self.root).mT).Q
 
     def freed(self, patches: Float[Tensor, "*batch sample"]) -> Float[Tensor, "*batch sample"]:
         """Weigh patches, and project constant and slope out."""
@@ -273,9 +272,7 @@ def _sight(
 
         parts = side_by_side(in_view, range(len(pictures.log)))
         point, view_, pixels = (torch.cat(part) for part in zip(*parts, strict=True))
-        found = torch.zeros_like(templates.usable)
-        found[point] = True
-        (own,) = torch.nonzero(found, as_tuple=True)
+        own = torch.unique(point)
         point = torch.cat([point, own])
         view_ = torch.cat([view_, tangents.reference[own]])
         there = cameras.take(tangents.reference[own])
@@ -347,8 +344,7 @@ def _complete(
 ) -> Bool[Tensor, " point"]:
     """Find whose patches a view shows nearly all of."""
     lacking = _look_up(unusable.float(), homographies, window, mode="nearest", outside=1.0)
-    fraction = (lacking * window.root.square()).sum(dim=1) / window.total
-    return fraction <= 0.1
+    return (lacking * window.root.square()).sum(dim=1) / window.total <= 0.1
 
 
 def _look_up(

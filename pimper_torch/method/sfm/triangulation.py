@@ -145,7 +145,6 @@ def _match_along_lines(
 ) -> None:
     """Replace what was verified by matches along the cameras' epipolar lines."""
     pairs, cameras = _pairs(model, verified, settings), epipolar.pinholes_of(model)
-    kinds = loaded().TwoViewGeometryConfiguration
     with quiet(), loaded().Database.open(space.database) as stored:
         image_of = image_ids(stored, space)
         bent = [matching.read_features(stored, image) for image in image_of]
@@ -168,7 +167,7 @@ def _match_along_lines(
         stored.clear_two_view_geometries()
         for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
             geometry = loaded().TwoViewGeometry()
-            geometry.config = kinds.CALIBRATED
+            geometry.config = loaded().TwoViewGeometryConfiguration.CALIBRATED
             geometry.F = epipolar.epipolar_geometry(cameras, pair).numpy()
             geometry.inlier_matches = found.numpy().astype(np.uint32)
             stored.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
@@ -187,8 +186,7 @@ def _pairs(
         if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
     }
     for pair in epipolar.undistorted_pairs(model, verified):
-        count = int(epipolar.explained(cameras, pair, limit).sum())
-        if count:
+        if count := int(epipolar.explained(cameras, pair, limit).sum()):
             weights[pair.views] = weights.get(pair.views, 0.0) + count
     return matching.strongest(weights, model.num_views, max(settings.guided_pairs, 1))
 

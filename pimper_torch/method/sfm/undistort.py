@@ -58,21 +58,18 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
         height, width = inside.shape
         images[index, :, :height, :width], valid[index, :height, :width] = image, inside
         whole = whole and bool(inside.all())
-    masks = None if whole else valid
-    return views.replace(images=images, masks=masks), pinholes
+    return views.replace(images=images, masks=None if whole else valid), pinholes
 
 
 def undistorted(
     views: Views, lenses: tuple[Lens, ...]
 ) -> Iterator[tuple[Float[Tensor, "channel height width"], Mask]]:
     """Undistort photographs one by one, as :func:`undistort` does, without padding."""
-    alike = len(set(lenses)) == 1
-    shared = source_grid(lenses[0], like=views.images) if alike else None
+    shared = source_grid(lenses[0], like=views.images) if len(set(lenses)) == 1 else None
 
     def one(index: int) -> tuple[Tensor, Tensor]:
-        lens = lenses[index]
-        grid = shared if alike else source_grid(lens, like=views.images)
-        return _undistort_image(views, index, lens, grid)
+        grid = shared or source_grid(lenses[index], like=views.images)
+        return _undistort_image(views, index, lenses[index], grid)
 
     yield from side_by_side(one, range(views.num_views))
     release_memory()  # of the photographs, and of their grids
@@ -147,13 +144,12 @@ def pinhole_for(lens: Lens) -> Matrix3:
     size = K.new_tensor([lens.width, lens.height])
     along = torch.linspace(0, 1, 65, dtype=K.dtype)[:, None] * size  # 64 steps: smooth curves
     zoom = torch.ones(())
-    for axis in range(2):
-        for end in (0.0, float(size[axis])):
-            edge = along.clone()
-            edge[:, axis] = end
-            reach = undistort_pixels(lens, edge)[:, axis].nan_to_num(nan=torch.inf).abs().min()
-            needed = (end - K[axis, 2]).abs() / K[axis, axis]
-            zoom = torch.maximum(zoom, needed / reach.clamp_min(1e-12))
+    for axis, end in ((0, 0), (0, lens.width), (1, 0), (1, lens.height)):
+        edge = along.clone()
+        edge[:, axis] = end
+        reach = undistort_pixels(lens, edge)[:, axis].nan_to_num(nan=torch.inf).abs().min()
+        needed = (end - K[axis, 2]).abs() / K[axis, axis]
+        zoom = torch.maximum(zoom, needed / reach.clamp_min(1e-12))
     zoom = zoom.clamp_max(1.25)
     return torch.stack([K[0] * K.new_tensor([zoom, 1, 1]), K[1] * K.new_tensor([1, zoom, 1]), K[2]])
 

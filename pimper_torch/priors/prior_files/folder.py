@@ -49,8 +49,7 @@ def read_maps(
     sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
     for name, path in _matched(Path(folder), views.names).items():
         values, variance = read_layers(path, kinds, cut_out)
-        beside = [one for one in path.parent.iterdir() if _is_variance_of(one, path)]
-        if beside:
+        if beside := [one for one in path.parent.iterdir() if _is_variance_of(one, path)]:
             variance = read_layers(beside[0], (VARIANCE,))[0][..., 0]
         values = check(path, values)
         _require_shape(path, values, name, *sizes[name])

@@ -115,13 +115,10 @@ def loss_scale(seen: Observed) -> float:
     """Return the scale of Cauchy's loss, by a light of first order without any shadow."""
     basis = torch.cat([torch.ones_like(seen.radiance[:, :1]), seen.pixels.normals_world], dim=1)
     root = seen.weight.sqrt() * ~seen.saturated[:, None]
-    residuals = []
-    for channel in range(seen.radiance.shape[1]):
-        rows = (root * seen.pixels.base_color)[:, channel, None] * basis
-        values = (root * seen.radiance)[:, channel]
-        light = torch.linalg.lstsq(rows, values[:, None], driver="gelsd").solution[:, 0]
-        residuals.append(values - rows @ light)
-    size = torch.stack(residuals).norm(dim=0)
+    rows = (root * seen.pixels.base_color).mT[..., None] * basis
+    values = (root * seen.radiance).mT[..., None]
+    light = torch.linalg.lstsq(rows, values, driver="gelsd").solution
+    size = (values - rows @ light)[..., 0].norm(dim=0)
     deviation = float(median_deviation(size, torch.ones_like(size, dtype=torch.bool)))
     # Half a level of eight bits.
     return CAUCHY_TUNING * max(deviation, 0.002)

@@ -101,8 +101,7 @@ class LitSurface:
     """A mesh prepared to be seen and to cast shadows; a constant to autograd, on the CPU."""
 
     def __init__(self, mesh: Mesh) -> None:
-        mesh = mesh.detach().to("cpu", torch.float32)
-        self.mesh = mesh
+        self.mesh = mesh = mesh.detach().to("cpu", torch.float32)
         self.normals_world = carried_normals(mesh)
         self.base_color = base_color(mesh)
         self._caster = ray_caster(mesh)

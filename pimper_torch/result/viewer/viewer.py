@@ -177,7 +177,6 @@ class Viewer:
                 _put(client.camera, *self._cameras[name])
 
     def _paint(self) -> None:
-        """Show the newest surface in the chosen layer."""
         with self._lock:
             if self._newest is None or self._viewer_from_world is None:
                 return

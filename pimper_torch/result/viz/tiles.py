@@ -74,8 +74,7 @@ def fitted(picture: Picture, room_px: int) -> Picture:
     size = (max(1, round(wide)), max(1, round(wide * height / width)))
     if size == (width, height):
         return picture
-    resized = _image(picture).resize(size, Image.Resampling.LANCZOS)
-    return _picture(resized)
+    return _picture(_image(picture).resize(size, Image.Resampling.LANCZOS))
 
 
 def with_triangles(picture: Picture, corners: Float[Tensor, "face 3 2"], color: str) -> Picture:
@@ -102,8 +101,7 @@ def encoded(radiance: Float[Tensor, "height width channel"]) -> Picture:
 
 def array(values: Scalars) -> Picture:
     """Return values as single precision on the CPU."""
-    found: Picture = values.detach().cpu().float().numpy()
-    return found
+    return values.detach().cpu().float().numpy()
 
 
 def _image(picture: Picture) -> Image.Image:

@@ -125,8 +125,7 @@ def settled(record: AnyRecord) -> AnyRecord:
             return value
         return copies.setdefault(id(value), copied(value))
 
-    found: AnyRecord = pytree.tree_map(one, record)
-    return found
+    return pytree.tree_map(one, record)
 
 
 def kept(
