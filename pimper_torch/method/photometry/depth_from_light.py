@@ -55,9 +55,9 @@ _WINDOW = 5
 _STEPS_AWAY, _UNIQUE = 6, 1 / 0.8
 
 # The coarse mesh is contradicted where its cost falls by this factor so far away (of its size), and
-# wrong if so much of what is swept contradicts it. Spot along an arc, with true silhouettes and with
-# those found: 9.7 and 12.4 %. Jar, balls, mug and potatoes, ogre along an arc, spot and ogre all
-# round: 0.3 to 2.0 %.
+# wrong if so much of what is swept contradicts it. Spot along an arc, with true silhouettes and
+# with those found: 9.7 and 12.4 %. Jar, balls, mug and potatoes, ogre along an arc, spot and ogre
+# all round: 0.3 to 2.0 %.
 _FALL, _FAR, _WRONG = 0.6, 0.02, 0.05
 _JUDGED = 3  # views by whose rays that is judged: a choice
 
@@ -73,16 +73,18 @@ _FACING = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Photographs(Record):
-    """Gray radiance over the colour and exposure of each view's light, reduced.
+class _Lit(Record):
+    """Photographs, reduced, and their light.
 
     Attributes:
+        gray: Radiance over the colour and exposure of each view's light.
         inside: Pixels that show the object.
     """
 
     gray: Maps
     inside: Masks
     cameras: Cameras
+    field: LightField
 
     def shown(self, points: Points, views: Int[Tensor, " view"]) -> tuple[Tensor, Tensor]:
         """Return what some views show at points, and which points they frame: (point, view)."""
@@ -172,22 +174,22 @@ class DepthFromLight(Stage):
         )
         if not contours.confine:
             return nothing
-        photographs = _photographs(scene, contours.silhouettes, field)
-        all_rays = _references(photographs, contours)
+        lit = _reduced(scene, contours.silhouettes, field)
+        all_rays = _references(lit, contours)
         few = all_rays[:_JUDGED]
-        found = _sweep(photographs, field, few)
+        found = _sweep(lit, few)
         caster, size = RayCaster(corners, mesh.faces), (corners.amax(0) - corners.amin(0)).norm()
         wrong = [_contradicted(*each, caster, size) for each in zip(few, found, strict=True)]
         if not wrong or float(torch.cat(wrong).double().mean()) < _WRONG:
             return nothing
-        found += _sweep(photographs, field, all_rays[_JUDGED:])
+        found += _sweep(lit, all_rays[_JUDGED:])
         for _ in range(_ROUNDS):
-            field = _refitted(photographs, field, _oriented(photographs, field, all_rays, found))
-            found = _sweep(photographs, field, all_rays)
-        return _oriented(photographs, field, all_rays, found)
+            lit = _refitted(lit, _oriented(lit, all_rays, found))
+            found = _sweep(lit, all_rays)
+        return _oriented(lit, all_rays, found)
 
 
-def _photographs(scene: SparseScene, silhouettes: Silhouettes, field: LightField) -> _Photographs:
+def _reduced(scene: SparseScene, silhouettes: Silhouettes, field: LightField) -> _Lit:
     images, cameras = scene.views.images, scene.cameras
     by = max(1, round(max(images.shape[-2:]) / _SIZE_PX))
     gain = images.new_ones(len(images), 1) if field.gain is None else field.gain
@@ -199,7 +201,8 @@ def _photographs(scene: SparseScene, silhouettes: Silhouettes, field: LightField
     def shrunk(inside: Float[Tensor, "_ _"]) -> Bool[Tensor, "_ _"]:
         return avg_pool2d(inside[None].float(), by)[0] > 0.5
 
-    return _Photographs(
+    return _Lit(
+        field=field,
         gray=by_view(reduced, images, gain),
         inside=by_view(shrunk, silhouettes.inside),
         cameras=cameras.replace(
@@ -209,10 +212,10 @@ def _photographs(scene: SparseScene, silhouettes: Silhouettes, field: LightField
     )
 
 
-def _references(photographs: _Photographs, contours: Contours) -> list[_Rays]:
+def _references(lit: _Lit, contours: Contours) -> list[_Rays]:
     """Choose views that have others round them, apart from one another, and cast their rays."""
     reliable = contours.silhouettes.reliable
-    axes = photographs.cameras.cam_from_world[:, 2, :3]
+    axes = lit.cameras.cam_from_world[:, 2, :3]
     angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
     central = (angles < _WIDEST_DEG).sum(dim=1) - angles.mean(dim=1) / 360
     chosen: list[_Rays] = []
@@ -221,7 +224,7 @@ def _references(photographs: _Photographs, contours: Contours) -> list[_Rays]:
         views = angles[view].argsort()
         views = views[angles[view, views] < _WIDEST_DEG][:_VIEWS]
         if len(views) >= _FEWEST:
-            chosen.append(_cast(photographs, contours.hull, view, views))
+            chosen.append(_cast(lit, contours.hull, view, views))
         apart = torch.minimum(apart, angles[view]).masked_fill(~reliable, 0)
         view = int(apart.argmax())
         if apart[view] < _APART_DEG:
@@ -229,10 +232,10 @@ def _references(photographs: _Photographs, contours: Contours) -> list[_Rays]:
     return chosen
 
 
-def _cast(photographs: _Photographs, hull: Hull, view: int, views: Int[Tensor, " view"]) -> _Rays:
-    cameras = photographs.cameras
+def _cast(lit: _Lit, hull: Hull, view: int, views: Int[Tensor, " view"]) -> _Rays:
+    cameras = lit.cameras
     frame, eye = cameras.cam_from_world[view], cameras.centers_world[view]
-    inside = photographs.inside[view, _STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE].clone()
+    inside = lit.inside[view, _STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE].clone()
     pixels = _STRIDE * inside.nonzero().flip(1).to(frame) + _STRIDE // 2 + 0.5
     rays = rays_through(pixels, frame, cameras.intrinsics[view])
     low, high = hull.corners_world.to(frame)
@@ -260,12 +263,12 @@ def _cast(photographs: _Photographs, hull: Hull, view: int, views: Int[Tensor, "
     )
 
 
-def _sweep(photographs: _Photographs, field: LightField, all_rays: Sequence[_Rays]) -> list[_Swept]:
+def _sweep(lit: _Lit, all_rays: Sequence[_Rays]) -> list[_Swept]:
     def swept(rays: _Rays) -> _Swept:
         cost = rays.first.new_full(rays.held.shape, torch.nan)
         for place, held in enumerate(rays.held):
             points = rays.at(torch.full_like(rays.first, place))[held]
-            cost[place, held], _ = _explained(photographs, field, points, rays.views)
+            cost[place, held], _ = _explained(lit, points, rays.views)
         return _best(rays, cost)
 
     return list(side_by_side(swept, all_rays, tracked=False))
@@ -285,20 +288,17 @@ def _best(rays: _Rays, cost: Float[Tensor, "place ray"]) -> _Swept:
 
 
 def _explained(
-    photographs: _Photographs,
-    field: LightField,
-    points: Points,
-    views: Int[Tensor, " view"],
+    lit: _Lit, points: Points, views: Int[Tensor, " view"]
 ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 4"]]:
     """Fit albedo times (1, normal) to what views show of points.
 
     Returns:
         The mean of Cauchy's cost, NaN where few views have a point, and the fit.
     """
-    radiance, framed = photographs.shown(points, views)
-    soft = field.soft[views, :4].expand(len(points), -1, -1)
-    light = soft + pad(field.point_light_at(points)[:, views], (1, 0))
-    scale = _NOISE * radiance.mean(dim=1, keepdim=True) + _FLOOR * photographs.gray.mean()
+    radiance, framed = lit.shown(points, views)
+    soft = lit.field.soft[views, :4].expand(len(points), -1, -1)
+    light = soft + pad(lit.field.point_light_at(points)[:, views], (1, 0))
+    scale = _NOISE * radiance.mean(dim=1, keepdim=True) + _FLOOR * lit.gray.mean()
     weight, ridge = framed.to(radiance), 1e-6 * torch.eye(4).to(radiance)
     for _ in range(_ITERATIONS):
         weighted = (light * weight[..., None]).mT
@@ -322,26 +322,21 @@ def _contradicted(
     return depth.isfinite() & far & (swept.cost.amin(dim=0) < _FALL * cost)
 
 
-def _refitted(photographs: _Photographs, field: LightField, cloud: OrientedPoints) -> LightField:
+def _refitted(lit: _Lit, cloud: OrientedPoints) -> _Lit:
     """Fit the light to what was found."""
     some = slice(None, None, max(1, -(-len(cloud.noise) // LIGHT_SAMPLES)))
     points, normals = cloud.points_world[some], cloud.normals_world[some]
-    cameras = photographs.cameras
+    cameras, field = lit.cameras, lit.field
     views = torch.arange(cameras.num_views, device=points.device)
-    radiance, framed = photographs.shown(points, views)
+    radiance, framed = lit.shown(points, views)
     towards = normalize(cameras.centers_world - points[:, None], dim=-1)
     seen = framed & (radiance > 0) & ((towards @ normals[..., None])[..., 0] > _FACING)
     model: LightName = "point_light" if bool(field.point_light.any()) else "soft"
     fitted = fit_light_field(radiance, seen, normals, points, model=model)
-    return fitted.replace(gain=field.gain, exposure=field.exposure)
+    return lit.replace(field=fitted.replace(gain=field.gain, exposure=field.exposure))
 
 
-def _oriented(
-    photographs: _Photographs,
-    field: LightField,
-    all_rays: Sequence[_Rays],
-    found: Sequence[_Swept],
-) -> OrientedPoints:
+def _oriented(lit: _Lit, all_rays: Sequence[_Rays], found: Sequence[_Swept]) -> OrientedPoints:
     """Return the certain places, at smoothed depths, with photometric normals."""
     clouds, fits = [], []
     for rays, swept in zip(all_rays, found, strict=True):
@@ -349,7 +344,7 @@ def _oriented(
         noise = (rays.step / 2).expand(len(points))
         cloud = OrientedPoints(points_world=points, normals_world=normals, noise=noise)
         cloud = cloud.take(swept.certain & normals.isfinite().all(dim=1))
-        fits.append(_explained(photographs, field, cloud.points_world, rays.views)[1][:, 1:])
+        fits.append(_explained(lit, cloud.points_world, rays.views)[1][:, 1:])
         clouds.append(cloud)
     cloud = OrientedPoints.cat(clouds)
     normals = _mapped(normalize(torch.cat(fits), dim=1), cloud.normals_world)
