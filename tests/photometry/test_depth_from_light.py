@@ -23,7 +23,7 @@ def scene_of(num_views=VIEWS, texture=None):
     cameras = arc_cameras(
         num_views, width=120, height=90, focal_px=112.5, distance=3.0, span_deg=50.0
     )
-    lights = wandering_lights(num_views, generator, distance=8.0, spread_deg=50.0)
+    lights = wandering_lights(num_views, generator, distance=8.0, spread_deg=35.0)
     white = texture or (lambda points: torch.full_like(points, 0.6))
     rendered = render_shape(Sphere(), cameras, lights.harmonics_world(), white)
     scene = sparse_scene(rendered, 20, generator, dtype=torch.float64)
@@ -33,10 +33,11 @@ def scene_of(num_views=VIEWS, texture=None):
         source="masks",
     )
     contours = TraceContours()(silhouettes, scene.cameras)
+    ambient, lamp = lights.harmonics_world().split([1, 3], dim=1)
     field = LightField(
         origin=torch.zeros(3).double(),
-        soft=torch.nn.functional.pad(lights.harmonics_world(), (0, 5)),
-        point_light=torch.zeros(num_views, 3).double(),
+        soft=torch.nn.functional.pad(ambient, (0, 8)),
+        point_light=lamp,
         closeness=torch.zeros(num_views).double(),
     )
     return scene, contours, field
@@ -89,8 +90,8 @@ def test_the_ball_is_found_inside_its_hull(arc):
 def test_lights_that_a_wrong_surface_turned_do_not_move_depths(arc):
     scene, contours, field = arc
     turn = torch.matrix_exp(torch.tensor([[0, 0, 0.35], [0, 0, 0], [-0.35, 0, 0]]).double())
-    turned = torch.cat([field.soft[:, :1], field.soft[:, 1:4] @ turn.mT, field.soft[:, 4:]], dim=1)
-    cloud = DepthFromLight()(scene, contours, surface_of(contours), field.replace(soft=turned))
+    turned = field.replace(point_light=field.point_light @ turn.mT)
+    cloud = DepthFromLight()(scene, contours, surface_of(contours), turned)
     distance, angle = off(cloud)
     assert distance.median() < 0.02
     assert angle.median() < 8  # of 20 degrees
@@ -99,6 +100,13 @@ def test_lights_that_a_wrong_surface_turned_do_not_move_depths(arc):
 def test_a_surface_that_is_right_is_not_contradicted(arc):
     scene, contours, field = arc
     assert len(DepthFromLight()(scene, contours, ball(), field).points_world) == 0
+
+
+def test_under_soft_light_nothing_is_found(arc):
+    scene, contours, field = arc
+    soft = torch.cat([field.soft[:, :1], field.point_light, field.soft[:, 4:]], dim=1)
+    soft = field.replace(soft=soft, point_light=torch.zeros_like(field.point_light))
+    assert len(DepthFromLight()(scene, contours, surface_of(contours), soft).points_world) == 0
 
 
 def test_few_views_or_silhouettes_that_leave_nothing_out_find_nothing(arc):

@@ -38,7 +38,7 @@ LINES = {
     "method/fusion": 2600,
     "method/meshing": 817,
     "method/patches": 977,
-    "method/photometry": 4311,
+    "method/photometry": 4313,
     "method/sfm": 4535,
     "method/silhouettes": 1726,
     "method/sweep": 705,

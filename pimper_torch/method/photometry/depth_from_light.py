@@ -27,7 +27,7 @@ from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.geometry.visual_hull import Hull
 from pimper_torch.ground.shapes import Maps, Mask, Masks, Points, Scalar
 from pimper_torch.method.photometry.light_field import LightField
-from pimper_torch.method.photometry.lights import LIGHT_SAMPLES, LightName, fit_light_field
+from pimper_torch.method.photometry.lights import LIGHT_SAMPLES, fit_light_field
 from pimper_torch.records import Cameras, Mesh, OrientedPoints, Record, Silhouettes, SparseScene
 from pimper_torch.runtime.mapped import by_view
 from pimper_torch.runtime.parallel import side_by_side
@@ -166,13 +166,15 @@ class DepthFromLight(Stage):
 
         Returns:
             Points with normals and noise. None where the photographs hardly contradict the mesh,
-            where few views are side by side, or where silhouettes constrain nothing.
+            where few views are side by side, where silhouettes constrain nothing, or where a lamp
+            explains the photographs no better than soft light: of a dark, mirroring bust light
+            shows another surface than the right one.
         """
         corners = mesh.vertices_world
         nothing = OrientedPoints(
             points_world=corners[:0], normals_world=corners[:0], noise=corners[:0, 0]
         )
-        if not contours.confine:
+        if not contours.confine or not bool(field.point_light.any()):
             return nothing
         lit = _reduced(scene, contours.silhouettes, field)
         all_rays = _references(lit, contours)
@@ -326,14 +328,14 @@ def _refitted(lit: _Lit, cloud: OrientedPoints) -> _Lit:
     """Fit the light to what was found."""
     some = slice(None, None, max(1, -(-len(cloud.noise) // LIGHT_SAMPLES)))
     points, normals = cloud.points_world[some], cloud.normals_world[some]
-    cameras, field = lit.cameras, lit.field
+    cameras = lit.cameras
     views = torch.arange(cameras.num_views, device=points.device)
     radiance, framed = lit.shown(points, views)
     towards = normalize(cameras.centers_world - points[:, None], dim=-1)
     seen = framed & (radiance > 0) & ((towards @ normals[..., None])[..., 0] > _FACING)
-    model: LightName = "point_light" if bool(field.point_light.any()) else "soft"
-    fitted = fit_light_field(radiance, seen, normals, points, model=model)
-    return lit.replace(field=fitted.replace(gain=field.gain, exposure=field.exposure))
+    fitted = fit_light_field(radiance, seen, normals, points, model="point_light")
+    fitted = fitted.replace(gain=lit.field.gain, exposure=lit.field.exposure)
+    return lit.replace(field=fitted)
 
 
 def _oriented(lit: _Lit, all_rays: Sequence[_Rays], found: Sequence[_Swept]) -> OrientedPoints:
