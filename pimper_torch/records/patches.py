@@ -439,9 +439,8 @@ class PhotometricPatches(OverPatches):
     def faults(self) -> Faults:
         """List normals of another floating-point type than the templates, too."""
         yield from super(PhotometricPatches, self).faults()
-        for index, (bucket, own) in enumerate(
-            zip(self.buckets, self.patches.buckets, strict=False)
-        ):
+        pairs = zip(self.buckets, self.patches.buckets, strict=False)
+        for index, (bucket, own) in enumerate(pairs):
             found, needed = bucket.normals_patch.dtype, own.depth.dtype
             if found != needed:
                 name = f"buckets[{index}].normals_patch"
@@ -476,7 +475,6 @@ def _given(
         rotated = torch.einsum("pij,vj->pvi", templates.patch_from_world[:, :3, :3], lights[:, 1:])
         lights = torch.cat([lights[:, :1].expand(len(like), -1, 1), rotated], dim=-1)
     determined = valid.flatten(1).any(dim=1)
-    none = torch.zeros_like(templates.facet)
     found = Photometry(
         normals_patch=unit,
         albedo=torch.ones_like(like)[..., None] if albedo is None else albedo.to(like),
@@ -485,7 +483,7 @@ def _given(
         information=torch.as_tensor(information).to(like) * valid,
         status=torch.where(determined, int(PatchStatus.DETERMINED), int(PatchStatus.UNSEEN)),
         convergence=Convergence(
-            iterations=none,
+            iterations=torch.zeros_like(templates.facet),
             residual=torch.zeros_like(templates.spacing),
             cause=torch.where(determined, int(StopCause.CONVERGED), int(StopCause.EMPTY)),
         ),

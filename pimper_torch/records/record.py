@@ -206,13 +206,14 @@ def _arrays(cls: type[Record]) -> dict[str, Any]:
     return {name: hint for name, hint in _hints(cls).items() if _array_of(hint) is not None}
 
 
-def _choices(hint: object) -> tuple[object, ...]:
+def choices(hint: object) -> tuple[Any, ...]:
+    """List the annotations that a union is of; any other is the only one."""
     blend = typing.get_origin(hint) in (typing.Union, types.UnionType)
     return typing.get_args(hint) if blend else (hint,)
 
 
 def _array_of(hint: Any) -> Any:  # noqa: ANN401 - jaxtyping's types have no name of their own
-    arrays = (one for one in _choices(hint) if isinstance(one, type))
+    arrays = (one for one in choices(hint) if isinstance(one, type))
     return next((one for one in arrays if issubclass(one, AbstractArray)), None)
 
 
@@ -297,17 +298,13 @@ def _told(value: object) -> str:
 
 def _wanted(hint: Any) -> str:  # noqa: ANN401
     array = _array_of(hint)
-    optional = " or None" if type(None) in _choices(hint) else ""
+    optional = " or None" if type(None) in choices(hint) else ""
     return f"{array.__name__.partition('[')[0]} of shape ({array.dim_str}){optional}"
 
 
 def _others(record: Record, name: str) -> str:
     """Report the fields before, whose shapes bind the same names."""
-    before = []
-    for other in _arrays(type(record)):
-        if other == name:
-            break
-        value = getattr(record, other)
-        if isinstance(value, Tensor):
-            before.append(f"{other} {_brief(value)}")
+    names = [*_arrays(type(record))]
+    values = ((other, getattr(record, other)) for other in names[: names.index(name)])
+    before = [f"{other} {_brief(value)}" for other, value in values if isinstance(value, Tensor)]
     return f", beside {', '.join(before)}" if before else ""

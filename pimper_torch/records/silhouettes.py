@@ -49,10 +49,9 @@ class Silhouettes(Record):
         Args:
             planes_world: What lies below one of them is not the object.
         """
-        reliable = torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device)
         return cls(
             inside=by_view(Tensor.float, views.inside),
-            reliable=reliable,
+            reliable=torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device),
             source="everything",
             planes_world=(no_planes() if planes_world is None else planes_world).to(views.images),
         )

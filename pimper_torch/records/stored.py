@@ -14,7 +14,7 @@ import typing
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from jaxtyping import AbstractArray
@@ -23,10 +23,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from pimper_torch.records.record import Record
+from pimper_torch.records.record import AnyRecord, Record, choices
 from pimper_torch.runtime.errors import InputError, OutputError
-
-AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 _KEY = "pimper_torch record 2"
 # A choice: the structure of a run's last step is below 1 MB, and a stranger's file can't make
@@ -145,9 +143,7 @@ def as_json(value: object, names: Mapping[int, str] | None = None) -> str:
 
 def of_json(found: Any, hint: Any, where: str, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - JSON
     """Turn parsed JSON of :func:`as_json` into what an annotation asks for, or refuse it."""
-    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    choices = typing.get_args(hint) if union else (hint,)
-    kind = next((choice for choice in choices if _fits(found, choice, tensors)), None)
+    kind = next((choice for choice in choices(hint) if _fits(found, choice, tensors)), None)
     if kind is None:
         needed = getattr(hint, "__name__", hint)
         raise InputError(f"{where} is {json.dumps(found)[:60]}; needed: {needed}.")

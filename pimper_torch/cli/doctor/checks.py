@@ -101,5 +101,4 @@ def exposure(photographs: Sequence[Photograph]) -> Finding:
         advice = "Expose longer: noise takes the place of shading."
         return Finding("exposure", "warning", found, "5% of saturation or more", advice)
     bright = median(one.bright for one in photographs)
-    told = f"brightest parts at {bright:.0%} of saturation in the median"
-    return Finding("exposure", "ok", told)
+    return Finding("exposure", "ok", f"brightest parts at {bright:.0%} of saturation in the median")

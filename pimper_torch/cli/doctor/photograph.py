@@ -94,9 +94,8 @@ def summarize(
     """Make the numbers and the small copy of linear radiance; saturation counts in the mask."""
     height, width = radiance.shape[-2:]
     shrink = min(1.0, SMALL_PX / max(height, width))
-    small = resized_radiance(
-        radiance, max(1, round(width * shrink)), max(1, round(height * shrink))
-    )
+    sides = (max(1, round(side * shrink)) for side in (width, height))
+    small = resized_radiance(radiance, *sides)
     highest = small.amax(dim=0)
     saturated = radiance.amax(dim=0) >= SATURATED
     counted = saturated if mask is None else saturated[mask]

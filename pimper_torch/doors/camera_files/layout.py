@@ -87,10 +87,8 @@ class DataSetPath(NamedTuple):
         Raises:
             InputError: The path is absolute, leads out by ``..``, or is no path.
         """
-        longest = max(
-            len(part.encode("utf-8", "surrogatepass")) for part in (*Path(name).parts, "")
-        )
-        self.expect(longest <= 255, "names of files", f"{name!r}")
+        sizes = [len(part.encode("utf-8", "surrogatepass")) for part in Path(name).parts]
+        self.expect(max(sizes, default=0) <= 255, "names of files", f"{name!r}")
         within = os.path.normpath(name)
         stays = not Path(name).anchor and Path(within).parts[:1] != ("..",) and "\0" not in name
         self.expect(stays, "paths that stay in this folder", f"{name!r}, which leads out of it")

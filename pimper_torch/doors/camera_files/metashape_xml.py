@@ -46,10 +46,9 @@ def read_metashape_cameras(path: Path) -> list[PosedCamera]:
         for number, sensor in enumerate(chunk.iterfind("sensors//sensor"), start=1)
     }
     for camera in chunk.iterfind("cameras//camera"):
-        rig = camera.get("master_id") not in (None, camera.get("id"))
-        file.expect(
-            not rig, f"a transform of its own for {camera.get('label')}", "a camera of a rig"
-        )
+        alone = camera.get("master_id") in (None, camera.get("id"))
+        needed = f"a transform of its own for {camera.get('label')}"
+        file.expect(alone, needed, "a camera of a rig")
     cameras = []
     for camera in _component(_placed(chunk), path):
         label = str(camera.get("label"))

@@ -14,10 +14,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from PIL import ExifTags, Image
 from scipy.ndimage import maximum_filter
-from torch import Tensor
 
 from pimper_torch.doors.io.extras import load_extra
 from pimper_torch.doors.io.header import Header, focal_from_exif
@@ -174,21 +172,19 @@ def _srgb_from_sensor(raw: Any) -> Matrix3 | None:  # noqa: ANN401 - as above
         if float(sensor.det().abs()) < 1e-6:
             return None
         matrix = (sensor / sensor.sum(dim=1, keepdim=True)).inverse()
-    return matrix * _white_balance(raw) if _keeps_white(matrix) else None
+    if not _keeps_white(matrix):
+        return None
+    for told in (raw.camera_whitebalance, raw.daylight_whitebalance):
+        factors = torch.tensor(list(told)[:3], dtype=torch.float64)
+        if bool(factors.isfinite().all() & (factors > 0).all()):
+            return matrix * (factors / factors[1])
+    return matrix
 
 
 def _keeps_white(matrix: Matrix3) -> bool:
     """Return whether rows of a matrix to sRGB sum to about 1."""
     white = (matrix.sum(dim=1) - 1).abs().max()
     return bool(matrix.isfinite().all()) and float(white) < 0.1
-
-
-def _white_balance(raw: Any) -> Float[Tensor, " 3"]:  # noqa: ANN401 - as above
-    for told in (raw.camera_whitebalance, raw.daylight_whitebalance):
-        factors = torch.tensor(list(told)[:3], dtype=torch.float64)
-        if bool(factors.isfinite().all() & (factors > 0).all()):
-            return factors / factors[1]
-    return torch.ones(3, dtype=torch.float64)
 
 
 def _exif(path: Path, raw: Any) -> Image.Exif:  # noqa: ANN401 - as above

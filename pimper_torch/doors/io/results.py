@@ -23,13 +23,13 @@ from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset, from_loc
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.sfm.sparse_scene import write_model
-from pimper_torch.records import Finished, Reconstruction, Silhouettes, SparseScene
+from pimper_torch.records import Finished, Reconstruction
 from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.asset.write import write_asset, write_asset_obj
 from pimper_torch.result.report.page import asset_within, write_page
 from pimper_torch.result.report.predictions import predictions
 from pimper_torch.result.report.vertex_layers import surface_layers
-from pimper_torch.result.viz.maps import ViewMaps, albedo_scale, normal_colors, view_maps
+from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.result.viz.overview import draw_overview, headline
 from pimper_torch.result.viz.tiles import array
 from pimper_torch.result.viz.turn import draw_turn
@@ -158,7 +158,14 @@ def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Pat
 def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
-        _write_masks(result.silhouettes, result.scene, folder / "masks")
+        (folder / "masks").mkdir()
+        views, sizes = each(result.silhouettes.shown), result.cameras.sizes_px.tolist()
+        names = result.scene.views.names
+        for name, (shown,), (width, height) in zip(names, views, sizes, strict=True):
+            drawn = shown[:height, :width].to(torch.uint8) * 255
+            path = mask_path(folder / "masks", name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(drawn.numpy()).save(path)
     with part(2, _PARTS):
         _write_maps(result, folder)
     write_json(lights_report(result), folder / "lights.json", indent=None)
@@ -169,32 +176,17 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
         draw_turn(result.mesh, result.cameras, result.coarse.reference, folder / "turn.webp")
 
 
-def _write_masks(silhouettes: Silhouettes, scene: SparseScene, folder: Path) -> None:
-    folder.mkdir()
-    names, sizes = scene.views.names, scene.cameras.sizes_px.tolist()
-    for name, (shown,), (width, height) in zip(names, each(silhouettes.shown), sizes, strict=True):
-        drawn = shown[:height, :width].to(torch.uint8) * 255
-        path = mask_path(folder, name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(drawn.numpy()).save(path)
-
-
 def _write_maps(result: Reconstruction, folder: Path) -> None:
     reference, cameras = result.coarse.reference, result.cameras
     maps = view_maps(result.mesh, cameras, reference)
     _write_png((255 * normal_colors(maps.normals_cam)).round(), folder / "normals.png")
     albedo = (maps.albedo * albedo_scale(result.mesh)).nan_to_num(0).clamp(0, 1)
     _write_png(to_bytes(albedo), folder / "albedo.png")
-    _write_depth(result, maps, folder / "depth.npz")
-
-
-def _write_depth(result: Reconstruction, maps: ViewMaps, path: Path) -> None:
-    reference, cameras = result.coarse.reference, result.cameras
     error = maps.expected_error
     pose, offset = cameras.cam_from_world[reference], result.scene.offset_world
     far = offset != NO_OFFSET
     np.savez_compressed(
-        path,
+        folder / "depth.npz",
         depth=array(maps.depth),
         mask=maps.seen.numpy(),
         confidence=array(maps.confidence),

@@ -44,11 +44,19 @@ class SparseCholesky(PreparedMatrix):
         # A unit diagonal makes the condition a property of the problem, not of its units.
         self._scale = self._diagonal.rsqrt()
         self._scaled = scaled = coo_array(self._matrix)
-        scale = self._scale.numpy()
+        scale, size = self._scale.numpy(), len(self._scale)
         scaled.data *= scale[scaled.row] * scale[scaled.col]
-        self._solver = self._factor(scaled) if len(scale) else None
+        self._solver = self._factor(scaled) if size else None
         _ALIVE.add(self)
-        self._check_condition()
+        # The condition is estimated from the solution for a generic right-hand side.
+        probe = torch.cos(torch.arange(size, dtype=torch.float64) ** 2)  # no structure to fit
+        growth = float(self._substitute(probe).norm() / probe.norm()) if size else 0.0
+        if not growth < _WORST_CONDITION:
+            raise SingularSystemError(
+                f"{self._what} ({size} unknowns) has a condition number of about {growth:.0e}; "
+                f"below {_WORST_CONDITION:.0e} is needed. Some unknowns are determined by no "
+                "equation: anchor them, or raise the weight of the prior."
+            )
 
     def _factor(self, matrix: coo_array) -> CholeskySolverD:
         lower = matrix.row >= matrix.col
@@ -61,18 +69,6 @@ class SparseCholesky(PreparedMatrix):
                 "equations contradict least squares or leave unknowns free. Anchor the "
                 "unknowns, or raise the weight of the prior."
             ) from error
-
-    def _check_condition(self) -> None:
-        """Estimate the condition from the solution for a generic right-hand side."""
-        size = len(self._scale)
-        probe = torch.cos(torch.arange(size, dtype=torch.float64) ** 2)  # no structure to fit
-        growth = float(self._substitute(probe).norm() / probe.norm()) if size else 0.0
-        if not growth < _WORST_CONDITION:
-            raise SingularSystemError(
-                f"{self._what} ({size} unknowns) has a condition number of about {growth:.0e}; "
-                f"below {_WORST_CONDITION:.0e} is needed. Some unknowns are determined by no "
-                "equation: anchor them, or raise the weight of the prior."
-            )
 
     def _substitute(self, scaled_rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         answer = np.zeros(scaled_rhs.shape)

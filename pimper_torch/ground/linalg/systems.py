@@ -54,8 +54,11 @@ def prepare(
         SingularSystemError: See :class:`~pimper_torch.ground.linalg.sparse.SparseCholesky` and
             :class:`~pimper_torch.ground.linalg.multigrid.Multigrid`.
     """
-    if size > _CHOLESKY_UNKNOWNS and _like_a_laplacian(rows, cols, values):
-        return Multigrid(rows, cols, values, size, what, tolerance)
+    if size > _CHOLESKY_UNKNOWNS:
+        off = values.detach()[rows != cols]
+        positive = float(total(torch.where(off > 0, off, 0)))
+        if positive <= _POSITIVE_FRACTION * float(total(off.abs())):
+            return Multigrid(rows, cols, values, size, what, tolerance)
     return SparseCholesky(rows, cols, values, size, what)
 
 
@@ -119,11 +122,3 @@ def _by_factor(what: str, error: SingularSystemError) -> None:
     """Note that multigrid did not converge."""
     done = "It is solved by a Cholesky factor instead, which takes more time and memory"
     skipped_solver("linalg", what, error, done)
-
-
-def _like_a_laplacian(
-    rows: Int[Tensor, " entry"], cols: Int[Tensor, " entry"], values: Float[Tensor, " entry"]
-) -> bool:
-    off = values.detach()[rows != cols]
-    positive = float(total(torch.where(off > 0, off, 0)))
-    return positive <= _POSITIVE_FRACTION * float(total(off.abs()))

@@ -53,7 +53,9 @@ def protruding(
     # A skull's base that ends in flaps of four facets changes in 9.
     for _ in range(12):
         bare = ends[(count != 2) & (count > 0)]
-        border = _long_borders(points, corners[~out], bare, length)
+        sides, loop = topology.boundary_loops(corners[~out], bare)
+        around = torch.bincount(loop, (points[sides[:, 0]] - points[sides[:, 1]]).norm(dim=1))
+        border = points[torch.unique(sides[(around >= math.tau * length)[loop]])]
         # In a plane what is further from the border has more than 0.76 of that.
         active = active[_near(points[active], border, 2.0 * length)]
         if len(active) == 0:
@@ -92,13 +94,6 @@ def _near(points: Points, others: Float[Tensor, "other 3"], reach: float) -> Boo
     cell = reach / 8
     centres = cell * (torch.unique((others / cell).floor(), dim=0) + 0.5)
     return _distance(points, centres, reach).isfinite()
-
-
-def _long_borders(vertices: Vertices, faces: Faces, bare: topology.Pairs, length: float) -> Points:
-    edges, loop = topology.boundary_loops(faces, bare)
-    sides = (vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=1)
-    around = torch.bincount(loop, sides)
-    return vertices[torch.unique(edges[(around >= math.tau * length)[loop]])]
 
 
 def _smoothed(

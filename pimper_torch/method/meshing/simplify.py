@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.ground.shapes import Faces, Vertices
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.parallel import side_by_side
 
@@ -79,7 +78,8 @@ def simplify(
     normals = mesh.normals_world
     if normals is None:
         normals = vertex_normals(mesh.vertices_world, mesh.faces)
-    spacing = _median_edge(vertices, mesh.faces.cpu())
+    some = mesh.faces.cpu()[:: max(1, len(mesh.faces) // _EDGES)]
+    spacing = float((vertices[some[:, 0]] - vertices[some[:, 1]]).norm(dim=1).median())
     points = _rows(vertices - vertices.mean(dim=0))
     faces = mesh.faces.to("cpu", torch.int32, copy=True).contiguous().numpy()
     channels = _rows(normals if values is None else torch.cat([normals, values.to(normals)], dim=1))
@@ -89,7 +89,10 @@ def simplify(
     cosine = float(np.cos(np.radians(angle_deg)))
     decimation.link_corners(faces, links)
 
-    part = _slices(points)
+    # Slices lie across the mesh's longest side; all have as many vertices.
+    along = points[:, np.ptp(points, axis=0).argmax()]
+    cuts = np.quantile(along, np.arange(1, _SLICES) / _SLICES)
+    part = np.searchsorted(cuts, along).astype(np.int8)
     corners = part[faces]
     between = np.zeros(len(points), bool)
     between[faces[(corners != corners[:, :1]).any(axis=1)]] = True
@@ -133,15 +136,3 @@ def _listed(lists: np.ndarray, left: np.ndarray) -> np.ndarray:
 def _rows(values: Float[Tensor, "vertex channel"]) -> np.ndarray:
     rows: np.ndarray = values.detach().cpu().float().contiguous().numpy()
     return rows
-
-
-def _median_edge(vertices: Vertices, faces: Faces) -> float:
-    some = faces[:: max(1, len(faces) // _EDGES)]
-    return float((vertices[some[:, 0]] - vertices[some[:, 1]]).norm(dim=1).median())
-
-
-def _slices(points: np.ndarray) -> np.ndarray:
-    """Assign each vertex its slice across the mesh's longest side; all have as many vertices."""
-    along = points[:, np.ptp(points, axis=0).argmax()]
-    cuts = np.quantile(along, np.arange(1, _SLICES) / _SLICES)
-    return np.searchsorted(cuts, along).astype(np.int8)

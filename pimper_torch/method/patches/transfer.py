@@ -1,7 +1,5 @@
 """A surface transferred to templates: views are registered on it, not on the facets' planes."""
 
-from functools import partial
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -29,18 +27,16 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     normals = surface.normals_world
     if normals is None:
         normals = vertex_normals(surface.vertices_world, surface.faces)
-    one = partial(_transferred, surface, normals, ray_caster(surface))
+    caster = ray_caster(surface)
+
+    def one(templates: Templates) -> Templates:
+        with torch.no_grad():
+            # A little further, so that rounding does not decide.
+            hits, met = _nearest(caster, *_lines(templates), surface, 1.01 * _reach(templates))
+        return recomputed(_on_surface, surface, normals, templates, hits, met)
+
     buckets = tuple(side_by_side(one, patches.buckets, tracked=False))
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
-
-
-def _transferred(
-    surface: Mesh, normals: Vertices, caster: RayCaster, templates: Templates
-) -> Templates:
-    with torch.no_grad():
-        # A little further, so that rounding does not decide.
-        hits, met = _nearest(caster, *_lines(templates), surface, 1.01 * _reach(templates))
-    return recomputed(_on_surface, surface, normals, templates, hits, met)
 
 
 def _lines(

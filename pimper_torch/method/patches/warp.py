@@ -13,7 +13,6 @@ from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.pyramids import (
-    PriorMaps,
     Sources,
     centers_in_patches,
     image_from_patch,
@@ -187,42 +186,20 @@ class Warp(Stage):
         """
         sources = sources or prepare(views, self.config.saturation_level)
         caster = ray_caster(patches.surface or patches.coarse.mesh)
-        one = partial(self._registered, views.images.shape[1], cameras, sources, caster)
+        one = partial(self._registered, cameras, sources, caster)
         return PatchViews(patches=patches, buckets=tuple(side_by_side(one, patches.buckets)))
 
     def _registered(
-        self,
-        channels: int,
-        cameras: Cameras,
-        sources: Sources,
-        caster: RayCaster,
-        templates: Templates,
+        self, cameras: Cameras, sources: Sources, caster: RayCaster, templates: Templates
     ) -> Observations:
         rows, cameras = templates.rows(cameras.num_views), templates.own(cameras)
         if sources.lights is not None:
             sources = sources.replace(lights=templates.own(sources.lights))
-
-        found = self._register(cameras, sources, caster, rows, templates)
-        total = int(templates.inside.sum()) * cameras.num_views
-        leave_out("warp", total - int(found.valid.count_nonzero()), total=total)
-        centers = cameras.centers_world.to(templates.patch_from_world)
-        viewers = transform(
-            templates.patch_from_world, centers.expand(len(templates.facet), -1, -1)
-        )
-        return found.replace(viewers=normalize(viewers, dim=-1).to(found.radiance))
-
-    def _register(
-        self,
-        cameras: Cameras,
-        sources: Sources,
-        caster: RayCaster,
-        rows: Int[Tensor, " view"],
-        templates: Templates,
-    ) -> Observations:
         found = self._resampled(cameras, sources, rows, templates, self.config.dark_level)
         guesses = [
             (maps, self._resampled(maps.cameras(cameras), maps.maps, own, templates, -math.inf))
-            for maps, own in _maps_of(sources, rows)
+            for maps, own in (each.of(rows) for each in sources.priors)
+            if len(own)
         ]
         shown = found.valid
         for maps, guess in guesses:
@@ -233,7 +210,15 @@ class Warp(Stage):
         priors: PatchPriors | None = None
         if guesses or sources.lights is not None:
             priors = merged(guesses, hidden, cameras, templates, sources.lights)
-        return found.replace(valid=found.valid & ~hidden, priors=priors)
+        valid = found.valid & ~hidden
+        total = int(templates.inside.sum()) * cameras.num_views
+        leave_out("warp", total - int(valid.count_nonzero()), total=total)
+        centers = cameras.centers_world.to(templates.patch_from_world)
+        viewers = transform(
+            templates.patch_from_world, centers.expand(len(templates.facet), -1, -1)
+        )
+        viewers = normalize(viewers, dim=-1).to(found.radiance)
+        return found.replace(valid=valid, priors=priors, viewers=viewers)
 
     def _resampled(
         self,
@@ -311,9 +296,3 @@ class Warp(Stage):
         radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
         valid = torch.zeros_like(wanted).index_put((wanted,), usable)
         return radiance * valid[:, None], valid
-
-
-def _maps_of(
-    sources: Sources, rows: Int[Tensor, " view"]
-) -> list[tuple[PriorMaps, Int[Tensor, " map"]]]:
-    return [(maps, own) for maps, own in (each.of(rows) for each in sources.priors) if len(own)]

@@ -102,25 +102,23 @@ class _Surface:
 
     def nearest(self, points: Float[Tensor, "texel 3"], along: Float[Tensor, "texel 3"]) -> Hits:
         """Meet the surface outward or inward, in lengths of ``along``; -1 where it is not near."""
-        outward, inward = (self._facing(points, sign * along, along) for sign in (1.0, -1.0))
+
+        def facing(sign: float) -> Hits:
+            met = self._caster.cast(
+                points, sign * along, torch.full_like(points[:, 0], self._reach)
+            )
+            same_side = (self._upright[met.face.clamp_min(0)] * along).sum(dim=1) > 0
+            return met.replace(
+                face=torch.where(same_side, met.face, -1),
+                distance=torch.where(same_side, met.distance, torch.inf),
+            )
+
+        outward, inward = facing(1.0), facing(-1.0)
         first = outward.distance <= inward.distance
         return Hits(
             face=torch.where(first, outward.face, inward.face),
             distance=torch.minimum(outward.distance, inward.distance),
             barycentric=torch.where(first[:, None], outward.barycentric, inward.barycentric),
-        )
-
-    def _facing(
-        self,
-        points: Float[Tensor, "texel 3"],
-        directions: Float[Tensor, "texel 3"],
-        along: Float[Tensor, "texel 3"],
-    ) -> Hits:
-        met = self._caster.cast(points, directions, torch.full_like(points[:, 0], self._reach))
-        same_side = (self._upright[met.face.clamp_min(0)] * along).sum(dim=1) > 0
-        return met.replace(
-            face=torch.where(same_side, met.face, -1),
-            distance=torch.where(same_side, met.distance, torch.inf),
         )
 
 

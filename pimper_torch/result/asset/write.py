@@ -59,10 +59,8 @@ def _reflect(
     extension: dict[str, Any] = {"specularColorFactor": [strongest] * 3}
     material["extensions"] = {_SPECULAR: extension}
     if float((reflectance - reflectance[0, 0]).abs().max()) < 1 / 255:
-        surface["metallicFactor"], surface["roughnessFactor"] = (
-            float(metallic[0, 0]),
-            float(roughness[0, 0]),
-        )
+        surface["metallicFactor"] = float(metallic[0, 0])
+        surface["roughnessFactor"] = float(roughness[0, 0])
         extension["specularFactor"] = min(1.0, float(specular[0, 0]))
         return []
     surface["metallicFactor"] = surface["roughnessFactor"] = 1.0

@@ -15,15 +15,7 @@ from torch.nn.functional import interpolate
 from pimper_torch.ground.geometry.pixels import scale_intrinsics
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.ground.shapes import Map
-from pimper_torch.records import (
-    Cameras,
-    Mesh,
-    Record,
-    Relighting,
-    Silhouettes,
-    SparseScene,
-    ViewLights,
-)
+from pimper_torch.records import Mesh, Record, Relighting, Silhouettes, SparseScene, ViewLights
 from pimper_torch.result.relighting.held_out import predict
 from pimper_torch.result.relighting.lit_surface import LitSurface
 from pimper_torch.runtime.mapped import drop_pages
@@ -105,7 +97,13 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
 
     def one(view: int) -> Prediction:
         light, camera = relighting.lights.take([view]), scene.cameras.take([view])
-        seen = predict(surface, _smaller(camera, longest), light, relighting.materials)
+        width, height = camera.sizes_px[0].tolist()
+        sides = _sides(width, height, longest)
+        camera = camera.replace(
+            intrinsics=scale_intrinsics(camera.intrinsics, sides[0] / width, sides[1] / height),
+            sizes_px=torch.tensor([sides]),
+        )
+        seen = predict(surface, camera, light, relighting.materials)
         decibels = worth.get(scene.views.names[view], torch.nan)
         return Prediction(
             radiance=seen.nan_to_num(0).movedim(-1, 0),
@@ -114,16 +112,6 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
         )
 
     return list(side_by_side(one, range(scene.views.num_views), tracked=False))
-
-
-def _smaller(camera: Cameras, longest: int) -> Cameras:
-    """Return a camera whose picture is at most ``longest`` pixels wide and high."""
-    width, height = camera.sizes_px[0].tolist()
-    sides = _sides(width, height, longest)
-    return camera.replace(
-        intrinsics=scale_intrinsics(camera.intrinsics, sides[0] / width, sides[1] / height),
-        sizes_px=torch.tensor([sides]),
-    )
 
 
 Json = dict[str, object]

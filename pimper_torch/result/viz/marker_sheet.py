@@ -42,7 +42,6 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.figure import Figure
 
-    markers = layout(side_mm, paper)
     width, height = PAPERS_MM[paper]
     figure = Figure(figsize=(width / 25.4, height / 25.4))
     FigureCanvasPdf(figure)
@@ -50,9 +49,16 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
     axes.set_axis_off()
     axes.set_xlim(0, width)
     axes.set_ylim(height, 0)
-    for marker in markers:
+    for marker in layout(side_mm, paper):
         _draw_marker(axes, marker.code, marker.left_mm, marker.top_mm, side_mm)
-    _draw_ruler(axes, (width - _RULER_MM) / 2, height / 2)
+    left, y = (width - _RULER_MM) / 2, height / 2
+    for at in range(0, _RULER_MM + 1):
+        length = 6 if at % 10 == 0 else 4 if at % 5 == 0 else 2.5
+        axes.plot([left + at, left + at], [y, y - length], color="black", linewidth=0.3)
+        if at % 10 == 0:
+            axes.text(left + at, y - 7, str(at), ha="center", fontsize=7)
+    axes.plot([left, left + _RULER_MM], [y, y], color="black", linewidth=0.3)
+    axes.text(left + _RULER_MM / 2, y + 5, "100 mm", ha="center", fontsize=8)
     sentences = (*_HINT, f"pimper markers: sides of {side_mm} mm, AprilTag 36h11.")
     for line, text in enumerate(sentences):
         axes.text(width / 2, height / 2 + 14 + 5 * line, text, ha="center", fontsize=8)
@@ -80,13 +86,3 @@ def _fill(axes: Any, left: float, top: float, width: float, height: float, color
     from matplotlib.patches import Rectangle
 
     axes.add_patch(Rectangle((left, top), width, height, facecolor=color, linewidth=0))
-
-
-def _draw_ruler(axes: Any, left: float, y: float) -> None:  # noqa: ANN401 - matplotlib's
-    for at in range(0, _RULER_MM + 1):
-        length = 6 if at % 10 == 0 else 4 if at % 5 == 0 else 2.5
-        axes.plot([left + at, left + at], [y, y - length], color="black", linewidth=0.3)
-        if at % 10 == 0:
-            axes.text(left + at, y - 7, str(at), ha="center", fontsize=7)
-    axes.plot([left, left + _RULER_MM], [y, y], color="black", linewidth=0.3)
-    axes.text(left + _RULER_MM / 2, y + 5, "100 mm", ha="center", fontsize=8)

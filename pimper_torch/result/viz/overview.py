@@ -195,9 +195,6 @@ def border(mask: Mask) -> Mask:
     return mask & beside
 
 
-_SIDES_DEG = (0.0, -40.0, 40.0)
-
-
 @torch.no_grad()
 def draw_preview(
     scene: SparseScene, coarse: CoarseMesh, path: Path | str, panel_px: int = 360
@@ -217,7 +214,7 @@ def draw_preview(
     photograph = interpolate(image, size=size, mode="area")[0].movedim(0, -1)
     center = mesh.vertices_world.mean(dim=0)
     panels = [Image.fromarray(to_bytes(photograph.expand(*size, 3)).numpy())]
-    for angle in _SIDES_DEG:
+    for angle in (0.0, -40.0, 40.0):
         camera = frame(rotation(own, center, angle), mesh.vertices_world, panel_px, 0.05)
         drawn = (255 * shade(mesh, camera)).round().to(torch.uint8)
         panels.append(Image.fromarray(drawn.numpy()))
