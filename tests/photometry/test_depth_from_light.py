@@ -109,6 +109,17 @@ def test_under_soft_light_nothing_is_found(arc):
     assert len(DepthFromLight()(scene, contours, surface_of(contours), soft).points_world) == 0
 
 
+def test_lights_of_one_direction_and_any_size_leave_points_finite(arc):
+    scene, contours, field = arc
+    same = 1e6 * field.point_light[:1].expand_as(field.point_light)
+    scene, field = scene.to(torch.float32), field.replace(point_light=same).to(torch.float32)
+    hull = surface_of(contours)
+    mesh = hull.replace(vertices_world=hull.vertices_world.float())
+    cloud = DepthFromLight()(scene, contours, mesh, field)
+    assert cloud.points_world.isfinite().all()
+    assert cloud.normals_world.isfinite().all()
+
+
 def test_few_views_or_silhouettes_that_leave_nothing_out_find_nothing(arc):
     scene, contours, field = scene_of(num_views=7)
     hull = surface_of(contours)

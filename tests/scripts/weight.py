@@ -38,7 +38,7 @@ LINES = {
     "method/fusion": 2600,
     "method/meshing": 803,
     "method/patches": 952,
-    "method/photometry": 4313,
+    "method/photometry": 4320,
     "method/sfm": 4535,
     "method/silhouettes": 1726,
     "method/sweep": 705,
@@ -64,7 +64,7 @@ LINES = {
 
 # Numbers of module constants, in tuples and mappings, too; lines of signatures and of imports.
 BARS = {
-    "numbers in module constants": 916,
+    "numbers in module constants": 917,
     "lines of signatures": 5182,
     "lines of imports": 4342,
 }

@@ -47,6 +47,9 @@ _VIEWS, _FEWEST, _WIDEST_DEG = 16, 8, 45.0
 # iterations. Choices: 8 bits are 0.4 % of white, and shadows and highlights are no noise.
 _NOISE, _FLOOR, _ITERATIONS = 0.03, 0.004, 4
 
+# Added to the diagonal of the normal equations, of their trace: a choice; floats have 1e-7.
+_RIDGE = 1e-6
+
 # Pixels of the windows of the raster that costs are averaged over, and depths.
 _WINDOW = 5
 
@@ -301,10 +304,14 @@ def _explained(
     soft = lit.field.soft[views, :4].expand(len(points), -1, -1)
     light = soft + pad(lit.field.point_light_at(points)[:, views], (1, 0))
     scale = _NOISE * radiance.mean(dim=1, keepdim=True) + _FLOOR * lit.gray.mean()
-    weight, ridge = framed.to(radiance), 1e-6 * torch.eye(4).to(radiance)
+    weight, each = framed.to(radiance), torch.eye(4).to(radiance)
     for _ in range(_ITERATIONS):
         weighted = (light * weight[..., None]).mT
-        fit = torch.linalg.solve(weighted @ light + ridge, weighted @ radiance[..., None])
+        matrix = weighted @ light
+        ridge = _RIDGE * matrix.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None] * each
+        # Places that no light tells anything of are explained by none.
+        fit, _ = torch.linalg.solve_ex(matrix + ridge, weighted @ radiance[..., None])
+        fit = fit.nan_to_num(0, 0, 0)
         square = ((radiance - (light @ fit)[..., 0]) / scale).square()
         weight = framed / (1 + square)
     count = framed.sum(dim=1)
