@@ -11,6 +11,7 @@ from torch.testing import assert_close
 
 import pimper_torch as pt
 from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.records import OrientedPoints
 from pimper_torch.runtime.stage import Given
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
@@ -72,6 +73,29 @@ def test_a_module_behind_a_stage_is_handed_its_record_and_changes_no_bit(preset,
     for name in ("vertices_world", "faces", "normals_world", "albedo", "confidence"):
         assert torch.equal(getattr(mesh, name), getattr(other, name))
     assert all(own.handed for own in mine.values())
+
+
+def test_points_that_light_finds_make_the_coarse_surface_anew():
+    plain, views = chain_on_a_sphere("default")
+    corners = plain.coarse_surface.record.mesh.vertices_world
+    points = OrientedPoints(
+        points_world=corners, normals_world=corners, noise=torch.ones_like(corners[:, 0])
+    )
+
+    class Recorded(nn.Module):
+        handed = ()
+
+        def forward(self, *arguments):
+            self.handed += (arguments,)
+            return plain.coarse_surface(*arguments)
+
+    surface = Recorded()
+    chain, _ = chain_on_a_sphere("default", depth_from_light=Given(points), coarse_surface=surface)
+    mesh = chain(views).mesh
+    first, second = surface.handed
+    assert len(first) == 3
+    assert second[3] is points
+    assert torch.equal(mesh.vertices_world, without("default").vertices_world)
 
 
 @pytest.mark.parametrize("preset", SETTINGS)

@@ -136,6 +136,10 @@ def test_pieces_that_neither_points_nor_contours_support_go():
     support = torch.where(first, Support.POINTS, Support.LIGHT)
     kept = seen_surface(*two, support, counts, torch.ones_like(first), 1.0, 0.01)
     assert bool((kept == first).all())
+    support = torch.where(first, Support.POINTS, Support.CONTOUR)
+    shape = *two, support, counts, torch.ones_like(first), 1.0, 0.01
+    assert bool(seen_surface(*shape).all())
+    assert bool((seen_surface(*shape, Support.POINTS) == first).all())
 
 
 @pytest.mark.parametrize(("share", "stays"), [(0.3, False), (0.2, True)])

@@ -291,7 +291,13 @@ def before_a_room(generator, num_views=9):
     )
     light = torch.linspace(0.5, 1.5, num_views)[:, None, None] * torch.linspace(0.6, 1, wide)
     images = torch.where(covered, thing[:, 0], seen) * light
-    return images[:, None].expand(-1, 3, -1, -1).contiguous(), maps, covered
+    views = Views(
+        images=images[:, None].expand(-1, 3, -1, -1).contiguous(),
+        sizes_px=torch.tensor([[480, 360]] * 9),
+        focals_px=torch.full((9,), torch.nan),
+        names=tuple("abcdefghi"),
+    )
+    return views, maps, covered
 
 
 def smooth(noise):
@@ -299,13 +305,7 @@ def smooth(noise):
 
 
 def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator):
-    images, maps, covered = before_a_room(generator)
-    views = Views(
-        images=images,
-        sizes_px=torch.tensor([[480, 360]] * 9),
-        focals_px=torch.full((9,), torch.nan),
-        names=tuple("abcdefghi"),
-    )
+    views, maps, covered = before_a_room(generator)
     cameras = staged.scene.cameras.take(list(range(9)))
     pictures = working_pictures(views, cameras, 240)  # half as large
     half = covered[:, ::2, ::2]
@@ -325,13 +325,7 @@ def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator
 def test_a_room_that_shifts_is_found_without_maps_and_none_where_the_camera_moves(
     staged, generator
 ):
-    images, maps, covered = before_a_room(generator)
-    views = Views(
-        images=images,
-        sizes_px=torch.tensor([[480, 360]] * 9),
-        focals_px=torch.full((9,), torch.nan),
-        names=tuple("abcdefghi"),
-    )
+    views, maps, covered = before_a_room(generator)
     pictures = working_pictures(views, staged.scene.cameras.take(list(range(9))), 240)
     found = room_at_rest(pictures, covered[:, ::2, ::2])
     shifts = (found[:, :2, 2] - maps[:, :2, 2]).float()

@@ -44,6 +44,13 @@ def test_shadows_that_the_hull_denies_are_taken_from_cuts(count):
     assert torch.equal(found[count:], cuts[count:])
 
 
+def test_the_shadow_of_an_object_as_dark_as_shadows_is_taken():
+    cuts = cuts_of([SHADOWED] * 5)
+    found = repaired(cuts, MARGINS, with_dark(SHADOWED))
+    assert not (found[:5] & (disc() < -0.25)).any()
+    assert (found | ~(disc() > 0)).all()
+
+
 def test_the_dark_side_of_the_object_stays():
     """It is inside the hull, and half a pixel outside denies nothing."""
     cuts = cuts_of([disc() > -0.4])

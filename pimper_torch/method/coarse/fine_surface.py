@@ -88,6 +88,7 @@ def fine_surface(
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
         contours: Rays and visual hull of the silhouettes.
         levels: Resolutions of the depth maps.
+        more: See :class:`~pimper_torch.method.coarse.surface.CoarseSurface`.
 
     Raises:
         ReconstructionError: Silhouettes and photographs support no surface.

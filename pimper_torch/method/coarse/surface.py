@@ -61,6 +61,8 @@ class CoarseSurface(Stage):
             contours: Of the silhouettes: all of the object gets facets, and nothing else does.
                 Where they constrain nothing, surface far from all points gets none.
             mesh: A surface in the scene's frame, used in place of the photographs' own.
+            more: Points of the surface beside those that are matched. They are on every piece of
+                it: pieces without points go.
 
         Raises:
             InputError: No registered photograph has the reference's name, or no camera sees the

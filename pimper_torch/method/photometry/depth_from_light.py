@@ -301,8 +301,8 @@ def _explained(
         The mean of Cauchy's cost, NaN where few views have a point, and the fit.
     """
     radiance, framed = lit.shown(points, views)
-    soft = lit.field.soft[views, :4].expand(len(points), -1, -1)
-    light = soft + pad(lit.field.point_light_at(points)[:, views], (1, 0))
+    field = lit.field.take(views)
+    light = field.soft[:, :4] + pad(field.point_light_at(points), (1, 0))
     scale = _NOISE * radiance.mean(dim=1, keepdim=True) + _FLOOR * lit.gray.mean()
     weight, each = framed.to(radiance), torch.eye(4).to(radiance)
     for _ in range(_ITERATIONS):

@@ -167,14 +167,15 @@ def _without_shadow(mask: Mask, margin: Map, grey: Map) -> Mask:
     """Take from a cut what the hull denies and is dark, as shadows on the plane are.
 
     They move with the light, so that other views see the plane there. What is as bright as the rest
-    of the object stays: the hull may have lost it, or the camera be misplaced.
+    of the object stays: the hull may have lost it, or the camera be misplaced. Of an object that is
+    itself darker than half of what is around it, only what is brighter than that stays.
     """
     shown, far = grey[mask & (margin > 0)], 1 / 200 * max(mask.shape)
     if len(shown) == 0:
         return mask
     dark, around = shown.median() - _SHADOW, grey[~mask].median() - _SHADOW
     if shown.median() < around:
-        dark = around  # an object as dark as shadows are
+        dark = around
     shadow = mask & (margin < -far / 2) & (grey < dark)
     return mask & ~components_of(shadow, margin < -far)
 
