@@ -14,8 +14,8 @@ def shift_between(texture: Map, other: Map) -> tuple[Float[Tensor, "2"], Float[T
         texture: Mean zero, 0 where nothing is known; and of ``other``.
 
     Returns:
-        What to add to ``(u, v)``, and the correlation of what both then show and know, 0 for less
-        than a tenth of the raster.
+        The shift to add to ``(u, v)``, pixels, and the correlation of the overlap's known pixels; 0
+        where these are less than a tenth of the raster. A constant to autograd.
 
     Source: of the peak, Kuglin & Hines, The phase correlation image alignment method, 1975.
     """

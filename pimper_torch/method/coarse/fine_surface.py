@@ -118,7 +118,7 @@ def fine_surface(
         near = trim.near_points(faces, centres, cloud, support, counts, pixel)
         leave_out("coarse.far", inside & ~near, at=centres)
         inside &= near
-    # Where light shows what silhouettes do not, it shows all of the surface, and none in the air.
+    # Points from light cover all of the visible surface: a piece without any is in the air.
     least = Support.CONTOUR if more is None else Support.POINTS
     fraction = trim.min_fraction(contours)
     kept = trim.seen_surface(vertices, faces, support, counts, inside, pixel, fraction, least)

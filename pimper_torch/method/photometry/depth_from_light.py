@@ -39,7 +39,7 @@ _SIZE_PX, _STRIDE, _PLACES = 320, 2, 64
 
 # Views whose rays are swept, and the angle between them; views that each is compared with, and the
 # widest angle to these. Choices: four unknowns leave half of eight
-# equations over, and fewer views show what is farther round the object.
+# equations over, and views at wider angles see other sides of the object.
 _REFERENCES, _APART_DEG = 8, 20.0
 _VIEWS, _FEWEST, _WIDEST_DEG = 16, 8, 45.0
 
@@ -58,9 +58,9 @@ _WINDOW = 5
 _STEPS_AWAY, _UNIQUE = 6, 1 / 0.8
 
 # The coarse mesh is contradicted where its cost falls by this factor so far away (of its size), and
-# wrong if so much of what is swept contradicts it. Spot along an arc, with true silhouettes and
-# with those found: 9.7 and 12.4 %. Jar, balls, mug and potatoes, ogre along an arc, spot and ogre
-# all round: 0.3 to 2.0 %.
+# wrong if this fraction of the swept rays contradicts it. Spot along an arc, with true silhouettes
+# and with those found: 9.7 and 12.4 %. Jar, balls, mug and potatoes, ogre along an arc, spot and
+# ogre in an orbit: 0.3 to 2.0 %.
 _FALL, _FAR, _WRONG = 0.6, 0.02, 0.05
 _JUDGED = 3  # views by whose rays that is judged: a choice
 
@@ -90,7 +90,7 @@ class _Lit(Record):
     field: LightField
 
     def shown(self, points: Points, views: Int[Tensor, " view"]) -> tuple[Tensor, Tensor]:
-        """Return what some views show at points, and which points they frame: (point, view)."""
+        """Return radiance of points in some views, and which points these frame: (point, view)."""
         cameras, (height, width) = self.cameras.take(views.tolist()), self.gray.shape[1:]
         pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
         grid = grid_from_pixels(pixels, width, height)[:, :, None]
@@ -130,7 +130,7 @@ class _Rays(Record):
         return maps
 
     def averaged(self, values: Float[Tensor, "layer ray"]) -> Float[Tensor, "layer ray"]:
-        """Average over windows, without what is NaN."""
+        """Average over windows; NaN does not count."""
         maps = self.on_raster(values)
         known = maps.isfinite()
         layers = torch.stack([torch.where(known, maps, 0), known.to(maps)])
@@ -164,7 +164,7 @@ class DepthFromLight(Stage):
         Args:
             contours: Silhouettes of all views of the scene, and their hull.
             mesh: Whose light was fitted. It may be far from the surface where neither texture nor
-                silhouettes tell where that is: behind the hull of an arc's views, for instance.
+                silhouettes constrain it: behind the hull of an arc's views, for instance.
             field: Light of the scene's views.
 
         Returns:
@@ -218,7 +218,7 @@ def _reduced(scene: SparseScene, silhouettes: Silhouettes, field: LightField) ->
 
 
 def _references(lit: _Lit, contours: Contours) -> list[_Rays]:
-    """Choose views that have others round them, apart from one another, and cast their rays."""
+    """Choose views with neighbours, at wide angles to one another, and cast their rays."""
     reliable = contours.silhouettes.reliable
     axes = lit.cameras.cam_from_world[:, 2, :3]
     angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
@@ -253,7 +253,7 @@ def _cast(lit: _Lit, hull: Hull, view: int, views: Int[Tensor, " view"]) -> _Ray
     first = depths[held.to(torch.uint8).argmax(dim=0)]
     thickness = depths[-1 - held.flip(0).to(torch.uint8).argmax(dim=0)] - first
     # As deep as the silhouette is wide: hulls of an arc are longer. From two places before the hull
-    # on, as the mesh lies on it.
+    # on, as the mesh may touch it.
     width = inside.sum().sqrt() * _STRIDE / cameras.intrinsics[view, 0, 0] * first.median()
     step = width / (_PLACES - 4)
     places = torch.arange(_PLACES).to(frame)[:, None]
@@ -295,7 +295,7 @@ def _best(rays: _Rays, cost: Float[Tensor, "place ray"]) -> _Swept:
 def _explained(
     lit: _Lit, points: Points, views: Int[Tensor, " view"]
 ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 4"]]:
-    """Fit albedo times (1, normal) to what views show of points.
+    """Fit albedo times (1, normal) to the radiance of points in some views.
 
     Returns:
         The mean of Cauchy's cost, NaN where few views have a point, and the fit.
@@ -309,7 +309,7 @@ def _explained(
         weighted = (light * weight[..., None]).mT
         matrix = weighted @ light
         ridge = _RIDGE * matrix.diagonal(dim1=1, dim2=2).sum(dim=1)[:, None, None] * each
-        # Places that no light tells anything of are explained by none.
+        # A fit that is not finite explains nothing.
         fit, _ = torch.linalg.solve_ex(matrix + ridge, weighted @ radiance[..., None])
         fit = fit.nan_to_num(0, 0, 0)
         square = ((radiance - (light @ fit)[..., 0]) / scale).square()
@@ -332,7 +332,7 @@ def _contradicted(
 
 
 def _refitted(lit: _Lit, cloud: OrientedPoints) -> _Lit:
-    """Fit the light to what was found."""
+    """Fit the light to the points that were swept."""
     some = slice(None, None, max(1, -(-len(cloud.noise) // LIGHT_SAMPLES)))
     points, normals = cloud.points_world[some], cloud.normals_world[some]
     cameras = lit.cameras

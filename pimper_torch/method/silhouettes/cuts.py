@@ -168,7 +168,7 @@ def _without_shadow(mask: Mask, margin: Map, grey: Map) -> Mask:
 
     They move with the light, so that other views see the plane there. What is as bright as the rest
     of the object stays: the hull may have lost it, or the camera be misplaced. Of an object that is
-    itself darker than half of what is around it, only what is brighter than that stays.
+    itself darker than half of its surroundings, brighter pixels alone stay.
     """
     shown, far = grey[mask & (margin > 0)], 1 / 200 * max(mask.shape)
     if len(shown) == 0:

@@ -93,9 +93,9 @@ def _opponent(radiance: Float[Tensor, "3 height width"]) -> UInt8[Tensor, "heigh
     return torch.stack([luma, *ratios], dim=-1).clamp(0, 255).round().byte()
 
 
-# A room is at rest where the median photograph correlates with one of them, and shows it (agreement
-# above the second) on so much of what the object leaves. A turntable before a room: 0.26 and 0.58;
-# objects along arcs and carried round 0.5 and 0.05 at most.
+# A room is at rest if photographs, shifted, correlate with one of them by more than the first, and
+# agree with it by more than the second on more than the third of the background, in the median. A
+# turntable in a room: 0.26 and a fraction of 0.58; arcs and orbits: 0.5 and 0.05 at most.
 _ALIKE, _SHOWN, _AT_REST = 0.2, 0.75, 0.25
 
 DISPUTED = 0.5  # agreement where views do not agree on what the background looks like
@@ -155,13 +155,13 @@ def room_agreement(
 
 
 def room_at_rest(pictures: WorkingPictures, surrounded: Masks) -> Float[Tensor, "mapped 3 3"]:
-    """Find a room before which the object turned, also where the camera was shifted meanwhile.
+    """Find a static background of an object that turned, also if the camera was shifted meanwhile.
 
     Args:
-        surrounded: Where the object is, as far as is known.
+        surrounded: Pixels that the object's points surround.
 
     Returns:
-        As :func:`room_agreement` takes them; none where photographs do not look alike there.
+        Maps for :func:`room_agreement`; none if the photographs do not agree.
     """
     longer, nowhere = max(pictures.grey.shape[1:]), torch.zeros_like(surrounded[0])
     textures = by_view(
