@@ -1,10 +1,12 @@
 """How the documentation is built: ``sphinx-build -W docs site``; nothing is fetched."""
 
+import shutil
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent / "extensions"))
-sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "docs" / "extensions"))
+sys.path.insert(0, str(ROOT / "bench"))
 
 from sphinx.application import Sphinx
 
@@ -15,7 +17,7 @@ author = "the authors of pimper_torch"
 release = installed_version()
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "mathml",
@@ -24,6 +26,11 @@ extensions = [
     "sources",
 ]
 exclude_patterns = ["extensions", "static"]
+
+# Notebooks are pages, with their stored outputs. Sphinx reads only what is in this folder.
+shutil.copytree(ROOT / "notebooks", ROOT / "docs" / "notebooks", dirs_exist_ok=True)
+nb_execution_mode = "off"
+nb_merge_streams = True
 
 # Of autodoc: docstrings are in Google's form with reStructuredText inside.
 autodoc_member_order = "bysource"
@@ -49,6 +56,12 @@ html_show_copyright = False
 def setup(app: Sphinx) -> None:
     """Escape what shapes have for several axes, such as ``*batch``, behind napoleon's turn."""
     app.connect("autodoc-process-docstring", escape_types, priority=900)
+    app.connect("source-read", link_notebooks)
+
+
+def link_notebooks(app: Sphinx, page: str, source: list[str]) -> None:
+    """Point links between documents and notebooks at their pages on the site."""
+    source[0] = source[0].replace("](../notebooks/", "](notebooks/").replace("](../docs/", "](../")
 
 
 def escape_types(

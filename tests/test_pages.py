@@ -69,7 +69,7 @@ def test_messages_of_the_page_on_failures_are_the_programs():
 
 
 def documented() -> set[str]:
-    pages = (DOCS / "api").glob("*.rst")
+    pages = (DOCS / "api").rglob("*.rst")
     return {name for page in pages for name in MODULE.findall(page.read_text(encoding="utf-8"))}
 
 
