@@ -141,7 +141,8 @@ def _search(
         field = interpolate(field[None, None], blank.shape, mode="bilinear", align_corners=False)
         found, _ = _near(matcher, field[0, 0], step)
     offsets = [_LAST_STEP * step * rank for rank in (-2, -1, 0, 1, 2)]
-    return *sweep(matcher, median3(found), offsets), step
+    median = torch.stack(shifted(found, 1, "replicate")).median(dim=0).values
+    return *sweep(matcher, median, offsets), step
 
 
 def _whole_range(
@@ -312,11 +313,6 @@ def push_pull(values: Map, known: Mask) -> Map:
     below = push_pull(total / fraction.clamp_min(1e-12), fraction > 0)
     up = interpolate(below[None, None], values.shape, mode="bilinear", align_corners=False)
     return torch.where(known, values, up[0, 0])
-
-
-def median3(values: Map) -> Map:
-    """Take the median of every pixel and its eight neighbours."""
-    return torch.stack(shifted(values, 1, "replicate")).median(dim=0).values
 
 
 def nearest_pixels(

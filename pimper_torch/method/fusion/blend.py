@@ -343,6 +343,10 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     colours = _sum_at(vertex, weight[:, None] * estimates.albedo, count)
     observed = colours[:, 0] > _MIN_WEIGHT
     albedo = colours[:, 1:] / torch.where(observed, colours[:, 0], 1)[:, None]
+    # Less is known of mean normals where patches know them for a fraction of the weight.
+    information, known = certain * per_support, seen * per_support
+    unknown = (1 - known).clamp_min(0) / known.clamp_min(_MIN_WEIGHT)
+    unknown = math.radians(_UNKNOWN_NORMAL_DEG) ** 2 * unknown
     return Blend(
         heights=_sum_at(vertex, weight * height, count) * per_support,
         supported=supported,
@@ -350,7 +354,7 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
         albedo=albedo * observed[:, None],
         seen=photometric,
         observed=observed,
-        normal_information=_beside_unknown(certain * per_support, seen * per_support) * photometric,
+        normal_information=information / (1 + information * unknown) * photometric,
         offsets=offsets[:, 0],
         offset_information=swept * per_support,
         prior_normals_world=normalize(prior_normals, dim=-1),
@@ -358,12 +362,6 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
         prior_offsets=prior_offsets[:, 0],
         prior_offset_information=told * per_support,
     )
-
-
-def _beside_unknown(information: PerVertex, known: PerVertex) -> PerVertex:
-    """Lower the information of mean normals where they are known for a fraction of the weight."""
-    unknown = (1 - known).clamp_min(0) / known.clamp_min(_MIN_WEIGHT)
-    return information / (1 + information * math.radians(_UNKNOWN_NORMAL_DEG) ** 2 * unknown)
 
 
 def _split(sums: Float[Tensor, "vertex layer"]) -> tuple[PerVertex, Float[Tensor, "vertex value"]]:

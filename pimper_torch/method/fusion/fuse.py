@@ -21,16 +21,8 @@ from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.continuation import about_mean, enclosed
 from pimper_torch.ground.linalg.sums import average
 from pimper_torch.ground.shapes import PerVertex, Scalar
+from pimper_torch.method.fusion import blocks
 from pimper_torch.method.fusion.blend import Blend, ray_directions
-from pimper_torch.method.fusion.blocks import (
-    Coarse,
-    Key,
-    Typical,
-    block_of,
-    parts_of,
-    pooled,
-    sampled,
-)
 from pimper_torch.method.fusion.detail import spacing_of
 from pimper_torch.method.fusion.equations import Equations
 from pimper_torch.method.fusion.estimate import Fused, fuse_like, fuse_terms
@@ -73,7 +65,7 @@ class _Shared(Record):
     tilt: NormalBias | None
     tilt_variance: Scalar
     terms: tuple[Term, ...]
-    coarse: Coarse
+    coarse: blocks.Coarse
 
 
 class Fuse(Stage):
@@ -177,11 +169,11 @@ class Fuse(Stage):
         """Return all vertices' patches, heights and albedo, block by block where memory asks."""
         mesh, coarse = swept.patches.coarse.mesh, shared.coarse
         parts = [torch.ones_like(mesh.faces[:, 0], dtype=torch.bool)]
-        typical: Typical = {}
+        typical: blocks.Typical = {}
         if coarse.detail is not None:
-            parts = parts_of(whole, mesh, most)
-            some = (self._noise(swept, whole, mine, shared) for mine in sampled(parts))
-            typical = {**coarse.typical, **coarse.noise, **pooled(some)}
+            parts = blocks.parts_of(whole, mesh, most)
+            some = (self._noise(swept, whole, mine, shared) for mine in blocks.sampled(parts))
+            typical = {**coarse.typical, **coarse.noise, **blocks.pooled(some)}
         channels = swept.photometric.buckets[0].albedo.shape[-1]
         values = whole.points.new_zeros(len(whole.points), 1 + channels, dtype=torch.float64)
         blends, owned = [], []
@@ -206,10 +198,10 @@ class Fuse(Stage):
         whole: Subdivision,
         mine: Bool[Tensor, " facet"],
         shared: _Shared,
-        typical: Typical,
+        typical: blocks.Typical,
     ) -> Problem:
         """Pose the problem of some facets, without the tilt that the normals of each share."""
-        block = block_of(whole, swept.patches.coarse.mesh.faces, mine, shared.coarse)
+        block = blocks.block_of(whole, swept.patches.coarse.mesh.faces, mine, shared.coarse)
         problem = pose(swept, block, self._lit)
         problem = _sloped(problem.replace(typical=typical), shared.terms)
         release_memory()
@@ -220,7 +212,7 @@ class Fuse(Stage):
 
     def _noise(
         self, swept: SweptPatches, whole: Subdivision, mine: Bool[Tensor, " facet"], shared: _Shared
-    ) -> dict[Key, tuple[int, Scalar]]:
+    ) -> dict[blocks.Key, tuple[int, Scalar]]:
         """Return the noise factors of a block, each with the number of equations that show it."""
         problem = self._posed(swept, whole, mine, shared, shared.coarse.typical)
         made = _Made.of(shared.terms, problem)
@@ -293,10 +285,10 @@ class Fuse(Stage):
         expected: bool,
         several: bool,
         tilt_variance: Scalar | None = None,
-    ) -> Coarse:
+    ) -> blocks.Coarse:
         """Solve as at full size, if anything of it is needed."""
         subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
-        coarse, expected = Coarse(subdivision=subdivision), expected and draws > 0
+        coarse, expected = blocks.Coarse(subdivision=subdivision), expected and draws > 0
         if not (expected or several):
             return coarse
         made = made.again(problem)

@@ -18,19 +18,8 @@ from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.linalg.continuation import continued, enclosed
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.shapes import PerVertex, Scalar
-from pimper_torch.method.fusion.equations import (
-    Contacts,
-    Equations,
-    cloud_points,
-    contour_tangents,
-    kept_slopes,
-    kept_steps,
-    passing,
-    slopes,
-    swept_heights,
-    upright,
-    upright_heights,
-)
+from pimper_torch.method.fusion import equations
+from pimper_torch.method.fusion.equations import Contacts, Equations
 from pimper_torch.method.fusion.normal_bias import (
     MEDIAN_OF_TILT,
     common,
@@ -126,7 +115,7 @@ class Normals(Term):
         shared = problem.tilt_variance
         together = None if shared is None else common(shared, problem.facet, problem.known)
         return [
-            slopes(
+            equations.slopes(
                 problem.edges[problem.lit],
                 problem.subdivision.points,
                 problem.directions,
@@ -171,10 +160,10 @@ class SweptHeights(Term):
     ) -> Equations:
         facing, together = problem.facing, None
         if self.variance is not None:
-            known = upright_heights(information, facing)
+            known = equations.upright_heights(information, facing)
             together = common(self.variance, problem.facet, known)
         start = problem.blend.heights
-        return swept_heights(start, offsets, information, facing, correlated, together)
+        return equations.swept_heights(start, offsets, information, facing, correlated, together)
 
     def evaluated(
         self, problem: Problem, heights: PerVertex, firm: Int[Tensor, " known"]
@@ -204,7 +193,7 @@ class PriorNormals(Term):
         """Find edges between two guessed normals."""
         known = problem.blend.prior_normal_information > 0
         along, normals = problem.directions, problem.blend.prior_normals_world
-        return known[problem.edges].all(dim=1) & upright(problem.edges, along, normals)
+        return known[problem.edges].all(dim=1) & equations.upright(problem.edges, along, normals)
 
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
         """Find those edges, if guesses are nearer to the truth than slopes that were not measured.
@@ -229,7 +218,7 @@ class PriorNormals(Term):
             together = common(self.variance, problem.facet, information > 0)
         flat = problem.subdivision.points
         variance = slope_variance(information) / problem.density
-        return [slopes(edges, flat, problem.directions, normals, variance, together)]
+        return [equations.slopes(edges, flat, problem.directions, normals, variance, together)]
 
     def evaluated(
         self, problem: Problem, heights: PerVertex, firm: Int[Tensor, " known"]
@@ -260,7 +249,7 @@ class PriorDepths(SweptHeights):
     def equations(self, problem: Problem) -> list[Equations]:
         """State the heights, if anything was guessed."""
         offsets, information = problem.blend.prior_offsets, problem.blend.prior_offset_information
-        if not bool(upright_heights(information, problem.facing).any()):
+        if not bool(equations.upright_heights(information, problem.facing).any()):
             return []
         return [self._stated(problem, offsets, information, torch.ones_like(offsets))]
 
@@ -274,7 +263,7 @@ class CloudPoints(Term):
         """Return the points beside the lines along which they are known."""
         del contours
         cloud = problem.cloud
-        return Passing(None if cloud is None else cloud_points(cloud, problem.surface))
+        return Passing(None if cloud is None else equations.cloud_points(cloud, problem.surface))
 
 
 class TouchedRays(Term):
@@ -286,7 +275,7 @@ class TouchedRays(Term):
         """Return the points where the rays touch the surface that there is."""
         tangent = contours.touching(problem.points, problem.normals)
         touched = len(tangent.ray) > 0
-        return Passing(contour_tangents(tangent, problem.surface) if touched else None)
+        return Passing(equations.contour_tangents(tangent, problem.surface) if touched else None)
 
 
 class Passing(Term):
@@ -305,7 +294,7 @@ class Passing(Term):
         caster = problem.caster or RayCaster(problem.points, problem.subdivision.faces)
         # Lines through points beyond a block meet it, too, where the object is thin.
         contacts = self.contacts.take(problem.block.facets[self.contacts.facet])
-        return [passing(contacts, problem.surface, caster)]
+        return [equations.passing(contacts, problem.surface, caster)]
 
 
 class KeptSlopes(Term):
@@ -341,22 +330,23 @@ class KeptSlopes(Term):
             damping = rotation(problem) / together
             normals = continued(normals, ~inpainted, edges, problem.normals, damping)
             normals = normalize(normals, dim=-1)
-        over = inpainted[edges].any(dim=1) & upright(edges, along, normals) & ~problem.sloped
-        kept = ~problem.sloped & ~over
-        level = kept & upright(edges, along, problem.normals)
+        free = ~problem.sloped
+        over = free & inpainted[edges].any(dim=1) & equations.upright(edges, along, normals)
+        kept = free & ~over
+        level = kept & equations.upright(edges, along, problem.normals)
         swept = (problem.blend.offset_information > 0)[edges].all(dim=1)
         windows = problem.correlated.to(start)
         return [
-            slopes(edges[over], flat, along, normals, together).replace(
+            equations.slopes(edges[over], flat, along, normals, together).replace(
                 correlated=(together / variance)[edges[over]].mean(dim=1), evaluated=False
             ),
             *(
-                kept_slopes(
+                equations.kept_slopes(
                     edges[some], flat, along, problem.normals, start, variance * windows
                 ).replace(correlated=windows[edges[some][:, 0]], evaluated=evaluated)
                 for some, evaluated in ((level & swept, True), (level & ~swept, False))
             ),
-            kept_steps(edges[kept & ~level], flat, start, variance),
+            equations.kept_steps(edges[kept & ~level], flat, start, variance),
         ]
 
 

@@ -22,18 +22,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.linalg.robust import Squares
-from pimper_torch.method.photometry.bilinear import (
-    REWEIGHT_EVERY,
-    RUNNING,
-    Bilinear,
-    Factors,
-    State,
-    equations_of_samples,
-    equations_of_views,
-    iterate,
-    keep_scale,
-    robust_weights,
-)
+from pimper_torch.method.photometry import bilinear
+from pimper_torch.method.photometry.bilinear import Bilinear, Factors, Shading, State
 from pimper_torch.method.photometry.quadratics import diagonal, solve_packed
 from pimper_torch.records import StopCause
 
@@ -48,7 +38,7 @@ PENALTY_CAP = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _State(State):
-    multiplier: Float[Tensor, "patch rank sample"]
+    multiplier: Shading
 
 
 def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Factors:
@@ -67,24 +57,24 @@ def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Fact
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
         state, change = _step(work, state, step)
-        done = (change <= tolerance) & (step >= REWEIGHT_EVERY)
-        return state, torch.where(done, int(StopCause.CONVERGED), RUNNING)
+        done = (change <= tolerance) & (step >= bilinear.REWEIGHT_EVERY)
+        return state, torch.where(done, int(StopCause.CONVERGED), bilinear.RUNNING)
 
     with torch.no_grad():
         start = _State(
             lights=problem.lights,
             shading=problem.shading,
             multiplier=torch.zeros_like(problem.shading),
-            weight=robust_weights(problem, problem.lights, problem.shading),
+            weight=bilinear.robust_weights(problem, problem.lights, problem.shading),
         )
-        return iterate(problem, start, advance, max_iterations)
+        return bilinear.iterate(problem, start, advance, max_iterations)
 
 
 def _step(problem: Bilinear, state: _State, step: int) -> tuple[_State, Float[Tensor, " patch"]]:
     weight = state.weight
-    if step and step % REWEIGHT_EVERY == 0 and not isinstance(problem.loss, Squares):
-        weight = robust_weights(problem, state.lights, state.shading)
-    A, b = equations_of_samples(problem, state.lights, weight)
+    if step and step % bilinear.REWEIGHT_EVERY == 0 and not isinstance(problem.loss, Squares):
+        weight = bilinear.robust_weights(problem, state.lights, state.shading)
+    A, b = bilinear.equations_of_samples(problem, state.lights, weight)
     rank = state.lights.shape[2]
     # The trace of L^T W L, the data term of a sample.
     trace = (weight * state.lights.square().sum(dim=2, keepdim=True)).sum(dim=1)
@@ -96,10 +86,10 @@ def _step(problem: Bilinear, state: _State, step: int) -> tuple[_State, Float[Te
     free = solve_packed(A, b + penalty * (state.shading - state.multiplier))
     shading = problem.manifold.project((free + state.multiplier).mT).mT
     multiplier = state.multiplier + free - shading
-    lights = solve_packed(*equations_of_views(problem, free, weight)).mT
+    lights = solve_packed(*bilinear.equations_of_views(problem, free, weight)).mT
     size = shading.norm(dim=(1, 2)).clamp_min(torch.finfo(A.dtype).tiny ** 0.5)
     change = (shading - state.shading).norm(dim=(1, 2)).maximum((free - shading).norm(dim=(1, 2)))
-    scaled, shading = keep_scale(problem, state.lights, lights, shading)
-    _, multiplier = keep_scale(problem, state.lights, lights, multiplier)
+    scaled, shading = bilinear.keep_scale(problem, state.lights, lights, shading)
+    _, multiplier = bilinear.keep_scale(problem, state.lights, lights, multiplier)
     found = _State(lights=scaled, shading=shading, multiplier=multiplier, weight=weight)
     return found, change / size

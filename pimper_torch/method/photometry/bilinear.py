@@ -26,18 +26,16 @@ from torch import Tensor
 
 from pimper_torch.ground.kernels.twin_constants import MAX_STEP, MIN_DEVIATION
 from pimper_torch.ground.linalg.robust import Loss, Squares, robust_deviation
+from pimper_torch.method.photometry import quadratics
 from pimper_torch.method.photometry.cone import Cone, Manifold
-from pimper_torch.method.photometry.quadratics import (
-    PackedCholesky,
-    apply_packed,
-    combination,
-    congruence,
-    coordinates,
-    diagonal,
-    dot,
-    outer,
-)
 from pimper_torch.records import Convergence, Record, StopCause
+
+Lights = Float[Tensor, "patch view rank"]
+Shading = Float[Tensor, "patch rank sample"]
+Entries = Float[Tensor, "patch view sample"]
+"""A value for each view of each sample, such as its radiance or weight."""
+Packed = Float[Tensor, "patch packed sample"]
+"""A symmetric matrix for each sample, see :mod:`~pimper_torch.method.photometry.quadratics`."""
 
 # Steps between updates of the robust weights: they change slowly, and the scale of the residuals
 # costs as much as a step.
@@ -62,13 +60,13 @@ class Bilinear(Record):
         stride: The deviation is taken over every so many samples.
     """
 
-    radiance: Float[Tensor, "patch view sample"]
-    weight: Float[Tensor, "patch view sample"]
-    lights: Float[Tensor, "patch view rank"]
-    anchor: Float[Tensor, "patch view rank"]
-    shading: Float[Tensor, "patch rank sample"]
+    radiance: Entries
+    weight: Entries
+    lights: Lights
+    anchor: Lights
+    shading: Shading
     regularization: Float[Tensor, "patch view"]
-    prior: Float[Tensor, "patch packed sample"] | None = None
+    prior: Packed | None = None
     manifold: Manifold = Cone()  # noqa: RUF009 - frozen
     loss: Loss = Squares()  # noqa: RUF009 - frozen
     stride: int = 1
@@ -85,7 +83,7 @@ class Bilinear(Record):
         return isinstance(self.manifold, Cone) and self.loss.code is not None
 
     @property
-    def dense_prior(self) -> Float[Tensor, "patch packed sample"]:
+    def dense_prior(self) -> Packed:
         """``P``, zero where there is none, as kernels take it."""
         patches, _, samples = self.radiance.shape
         return self.radiance.new_zeros(patches, 10, samples) if self.prior is None else self.prior
@@ -101,20 +99,16 @@ class Factors(Record):
         weight: ``D`` times the final robust weights.
     """
 
-    lights: Float[Tensor, "patch view rank"]
-    shading: Float[Tensor, "patch rank sample"]
-    weight: Float[Tensor, "patch view sample"]
+    lights: Lights
+    shading: Shading
+    weight: Entries
     convergence: Convergence
 
 
 Solver = Callable[[Bilinear, int, float], Factors]
 
 
-def robust_weights(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-) -> Float[Tensor, "patch view sample"]:
+def robust_weights(problem: Bilinear, lights: Lights, shading: Shading) -> Entries:
     """Return ``D`` times the loss's weights at the current residuals."""
     if isinstance(problem.loss, Squares):
         return problem.weight
@@ -124,34 +118,26 @@ def robust_weights(
 
 
 def equations_of_samples(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    weight: Float[Tensor, "patch view sample"],
-) -> tuple[Float[Tensor, "patch packed sample"], Float[Tensor, "patch rank sample"]]:
+    problem: Bilinear, lights: Lights, weight: Entries
+) -> tuple[Packed, Shading]:
     """Assemble the normal equations for every sample's shading vector, lights given."""
-    packed = outer(lights.mT) @ weight
+    packed = quadratics.outer(lights.mT) @ weight
     if problem.prior is not None:
         packed = packed + problem.prior
     return packed, lights.mT @ (weight * problem.radiance)
 
 
 def equations_of_views(
-    problem: Bilinear,
-    shading: Float[Tensor, "patch rank sample"],
-    weight: Float[Tensor, "patch view sample"],
+    problem: Bilinear, shading: Shading, weight: Entries
 ) -> tuple[Float[Tensor, "patch packed view"], Float[Tensor, "patch rank view"]]:
     """Assemble the normal equations for every view's light, its prior included."""
-    packed = (weight @ outer(shading).mT).mT.clone()
-    packed[:, diagonal(shading.shape[1])] += problem.regularization[:, None, :]
-    rhs = (weight * problem.radiance) @ shading.mT + problem.regularization[
-        ..., None
-    ] * problem.anchor
-    return packed, rhs.mT
+    packed = (weight @ quadratics.outer(shading).mT).mT.clone()
+    packed[:, quadratics.diagonal(shading.shape[1])] += problem.regularization[:, None, :]
+    pull = problem.regularization[..., None] * problem.anchor
+    return packed, ((weight * problem.radiance) @ shading.mT + pull).mT
 
 
-def curvature_of_views(
-    shading: Float[Tensor, "patch rank sample"], weight: Float[Tensor, "patch view sample"]
-) -> Float[Tensor, "patch unknown unknown"]:
+def curvature_of_views(shading: Shading, weight: Entries) -> Float[Tensor, "patch unknown unknown"]:
     """Return the block diagonal of the Gauss-Newton matrix: one block per view, shading fixed."""
     batch, views, rank = len(weight), weight.shape[1], shading.shape[1]
     products = (shading[:, :, None] * shading[:, None]).flatten(1, 2)
@@ -163,11 +149,8 @@ def curvature_of_views(
 
 
 def evaluate(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-    weight: Float[Tensor, "patch view sample"],
-) -> tuple[Float[Tensor, " patch"], Float[Tensor, "patch view rank"]]:
+    problem: Bilinear, lights: Lights, shading: Shading, weight: Entries
+) -> tuple[Float[Tensor, " patch"], Lights]:
     """Return the objective, its robust weights given, and minus half its gradient by the lights."""
     residual = problem.radiance - lights @ shading
     weighted = weight * residual
@@ -175,31 +158,27 @@ def evaluate(
     difference = lights - problem.anchor
     cost = cost + (problem.regularization * difference.square().sum(dim=2)).sum(dim=1)
     if problem.prior is not None:
-        penalty = shading * apply_packed(problem.prior, shading)
+        penalty = shading * quadratics.apply_packed(problem.prior, shading)
         cost = cost + penalty.sum(dim=(1, 2))
     return cost, weighted @ shading.mT - problem.regularization[..., None] * difference
 
 
 def update_shading(
-    problem: Bilinear,
-    packed: Float[Tensor, "patch packed sample"],
-    rhs: Float[Tensor, "patch rank sample"],
-    shading: Float[Tensor, "patch rank sample"],
-    steps: int = 1,
-) -> Float[Tensor, "patch rank sample"]:
+    problem: Bilinear, packed: Packed, rhs: Shading, shading: Shading, steps: int = 1
+) -> Shading:
     r"""Minimize :math:`s^\top A s - 2 b^\top s` over every sample's shading vector on the manifold.
 
     By Gauss-Newton steps along the tangents, of bounded length; a step that does not lower the
     objective is rejected. On a linear manifold the first step is exact.
     """
     if problem.manifold.flat:
-        return PackedCholesky(packed, shading.shape[1]).solve(rhs)
-    image = apply_packed(packed, shading)
-    value = dot(shading, image - 2 * rhs)
+        return quadratics.PackedCholesky(packed, shading.shape[1]).solve(rhs)
+    image = quadratics.apply_packed(packed, shading)
+    value = quadratics.dot(shading, image - 2 * rhs)
     for step in range(steps):
         moved = tangent_step(problem.manifold, packed, rhs - image, shading)
-        reached = apply_packed(packed, moved)
-        after = dot(moved, reached - 2 * rhs)
+        reached = quadratics.apply_packed(packed, moved)
+        after = quadratics.dot(moved, reached - 2 * rhs)
         # The last steps lower the objective by less than its rounding.
         better = (after <= value + 8 * torch.finfo(value.dtype).eps * value.abs())[:, None]
         shading = torch.where(better, moved, shading)
@@ -209,12 +188,7 @@ def update_shading(
     return shading
 
 
-def tangent_step(
-    manifold: Manifold,
-    packed: Float[Tensor, "patch packed sample"],
-    slope: Float[Tensor, "patch rank sample"],
-    shading: Float[Tensor, "patch rank sample"],
-) -> Float[Tensor, "patch rank sample"]:
+def tangent_step(manifold: Manifold, packed: Packed, slope: Shading, shading: Shading) -> Shading:
     r"""Take the step :math:`(B^\top A B)^{-1} B^\top r`, ``B`` the manifold's tangents.
 
     Args:
@@ -224,43 +198,35 @@ def tangent_step(
         shading: ``s``.
     """
     columns = manifold.tangents(shading)
-    descent = coordinates(columns, slope)
-    step = PackedCholesky(curvature_along(columns, packed), len(columns)).solve(descent)
-    length = dot(step, step).detach().sqrt()[:, None]
+    descent = quadratics.coordinates(columns, slope)
+    step = quadratics.PackedCholesky(curvature_along(columns, packed), len(columns)).solve(descent)
+    length = quadratics.dot(step, step).detach().sqrt()[:, None]
     limit = MAX_STEP * manifold.split(shading.mT)[0].detach()[:, None]
     step = step * torch.where(length > limit, limit / length.clamp_min(1e-30), 1)
-    return manifold.retract((shading + combination(columns, step)).mT).mT
+    return manifold.retract((shading + quadratics.combination(columns, step)).mT).mT
 
 
-def curvature_along(
-    columns: list[Tensor], packed: Float[Tensor, "patch packed sample"]
-) -> Float[Tensor, "patch smaller sample"]:
+def curvature_along(columns: list[Tensor], packed: Packed) -> Float[Tensor, "patch smaller sample"]:
     """Return ``B^T A B``, packed, its diagonal raised by 1e-9 of its trace to be invertible."""
-    curvature = congruence(packed, columns)
-    slot = diagonal(len(columns))
+    curvature = quadratics.congruence(packed, columns)
+    slot = quadratics.diagonal(len(columns))
     curvature[:, slot] += 1e-9 * curvature[:, slot].sum(dim=1, keepdim=True)
     return curvature
 
 
 def keep_scale(
-    problem: Bilinear,
-    before: Float[Tensor, "patch view rank"],
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch rank sample"]]:
+    problem: Bilinear, before: Lights, lights: Lights, shading: Shading
+) -> tuple[Lights, Shading]:
     """Normalize lights without regularization to their former size; rescale shading inversely."""
     old, size = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
     unanchored = (problem.regularization.amax(dim=1) == 0) & (size > 0) & (old > 0)
-    factor = torch.where(unanchored, (old / torch.where(size > 0, size, 1)).sqrt(), 1)[
-        :, None, None
-    ]
+    factor = torch.where(unanchored, (old / torch.where(size > 0, size, 1)).sqrt(), 1)
+    factor = factor[:, None, None]
     return lights * factor, shading / factor
 
 
 def root_mean_square(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
+    problem: Bilinear, lights: Lights, shading: Shading
 ) -> Float[Tensor, " patch"]:
     """Return each patch's weighted root mean square residual; 0 without data."""
     residual = problem.radiance - lights @ shading
@@ -269,9 +235,7 @@ def root_mean_square(
     return torch.where(mean > 0, torch.where(mean > 0, mean, 1).sqrt(), 0)
 
 
-def residual_deviation(
-    problem: Bilinear, residual: Float[Tensor, "patch view sample"]
-) -> Float[Tensor, " patch"]:
+def residual_deviation(problem: Bilinear, residual: Entries) -> Float[Tensor, " patch"]:
     """Estimate the standard deviation of each patch's residuals, robustly."""
     subset = residual[:, :, :: problem.stride].flatten(1)
     seen = problem.weight[:, :, :: problem.stride].flatten(1) > 0
@@ -294,9 +258,9 @@ class State(Record):
         weight: Of each entry, robust weights included.
     """
 
-    lights: Float[Tensor, "patch view rank"]
-    shading: Float[Tensor, "patch rank sample"]
-    weight: Float[Tensor, "patch view sample"]
+    lights: Lights
+    shading: Shading
+    weight: Entries
 
 
 AnyState = TypeVar("AnyState", bound=State)

@@ -23,22 +23,12 @@ from torch.autograd.function import once_differentiable
 from pimper_torch.ground.kernels.arrays import as_array
 from pimper_torch.ground.kernels.switch import compiled_for
 from pimper_torch.ground.linalg.robust import Squares, with_slope
-from pimper_torch.method.photometry.bilinear import (
-    Bilinear,
-    Factors,
-    curvature_of_views,
-    residual_deviation,
-    robust_weights,
-    root_mean_square,
-)
-from pimper_torch.method.photometry.quadratics import (
-    apply_packed,
-    combination,
-    coordinates,
-    outer,
-    unpacked,
-)
+from pimper_torch.method.photometry import bilinear, quadratics
+from pimper_torch.method.photometry.bilinear import Bilinear, Entries, Factors, Lights, Shading
 from pimper_torch.records import Record
+
+Tangential = Float[Tensor, "patch tangent sample"]
+"""Coordinates of each sample's step along the tangents of the manifold."""
 
 # The step of the lights, over these, that ends Newton's method: a choice.
 _CLOSE = 1e-11
@@ -74,15 +64,15 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     L, N = factors.lights.detach().double(), factors.shading.detach().double()
     hessian = _hessian(problem, L, N)
     step = _newton_step(problem, hessian)
-    moved = combination(hessian.columns, step.along_tangents)
+    moved = quadratics.combination(hessian.columns, step.along_tangents)
     lights = factors.lights.detach() + (step.lights - step.lights.detach()).to(factors.lights)
     shading = factors.shading.detach() + (moved - moved.detach()).to(factors.shading)
-    convergence = factors.convergence
+    residual = bilinear.root_mean_square(problem, lights, shading)
     return factors.replace(
         lights=lights,
         shading=shading,
-        weight=robust_weights(problem, lights, shading),
-        convergence=convergence.replace(residual=root_mean_square(problem, lights, shading)),
+        weight=bilinear.robust_weights(problem, lights, shading),
+        convergence=factors.convergence.replace(residual=residual),
     )
 
 
@@ -140,8 +130,8 @@ class _Compiled(torch.autograd.Function):
 class FactorStep(Record):
     """A step of all unknowns: of the lights, and of the samples along their tangents."""
 
-    lights: Float[Tensor, "patch view rank"]
-    along_tangents: Float[Tensor, "patch tangent sample"]
+    lights: Lights
+    along_tangents: Tangential
 
     def moved(self, factor: Float[Tensor, " patch"], other: "FactorStep") -> "FactorStep":
         """Add a multiple of another step."""
@@ -163,11 +153,11 @@ class Hessian(Record):
         schur: The Schur complement, of the lights.
     """
 
-    lights: Float[Tensor, "patch view rank"]
-    shading: Float[Tensor, "patch rank sample"]
-    columns: tuple[Float[Tensor, "patch rank sample"], ...]
-    loss_curvature: Float[Tensor, "patch view sample"]
-    weighted_residual: Float[Tensor, "patch view sample"]
+    lights: Lights
+    shading: Shading
+    columns: tuple[Shading, ...]
+    loss_curvature: Entries
+    weighted_residual: Entries
     inverse: Float[Tensor, "patch sample tangent tangent"]
     schur: Float[Tensor, "patch unknown unknown"]
 
@@ -179,7 +169,7 @@ def _newton_refined(problem: Bilinear, factors: Factors) -> Factors:
     size = _gradient_size(problem, L, N)
     fraction, step = torch.ones_like(size), _newton_step(problem, _hessian(problem, L, N))
     for _ in range(30):
-        moved = combination(problem.manifold.tangents(N), step.along_tangents)
+        moved = quadratics.combination(problem.manifold.tangents(N), step.along_tangents)
         part = fraction[:, None, None]
         lights = L + part * step.lights
         shading = problem.manifold.retract((N + part * moved).mT).mT
@@ -197,9 +187,7 @@ def _newton_refined(problem: Bilinear, factors: Factors) -> Factors:
     return factors.replace(lights=L.to(factors.lights), shading=N.to(factors.shading))
 
 
-def _gradient_size(
-    problem: Bilinear, L: Float[Tensor, "patch view rank"], N: Float[Tensor, "patch rank sample"]
-) -> Float[Tensor, " patch"]:
+def _gradient_size(problem: Bilinear, L: Lights, N: Shading) -> Float[Tensor, " patch"]:
     on_lights, on_samples = _gradient(problem, L, N, problem.manifold.tangents(N))
     return on_lights.square().sum(dim=(1, 2)) + on_samples.square().sum(dim=(1, 2))
 
@@ -222,11 +210,7 @@ def _newton_step(problem: Bilinear, hessian: Hessian) -> FactorStep:
     return step.moved(_change_of(deviation_slope, hessian, step) / remainder, deviation_step)
 
 
-def _solved(
-    hessian: Hessian,
-    on_lights: Float[Tensor, "patch view rank"],
-    on_samples: Float[Tensor, "patch tangent sample"],
-) -> FactorStep:
+def _solved(hessian: Hessian, on_lights: Lights, on_samples: Tangential) -> FactorStep:
     """Apply the Hessian's inverse, samples eliminated."""
     inner = _apply(hessian.inverse, on_samples)
     slope = on_lights - _apply_mixed(hessian, inner)
@@ -238,47 +222,40 @@ def _solved(
     )
 
 
-def _by_deviation(
-    problem: Bilinear, hessian: Hessian
-) -> tuple[
-    Float[Tensor, "patch view sample"],
-    tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]],
-]:
+def _by_deviation(problem: Bilinear, hessian: Hessian) -> tuple[Entries, tuple[Lights, Tangential]]:
     """Return the deviation's derivatives by the residuals, and the gradient's by the deviation."""
     residual = problem.radiance.double() - hessian.lights @ hessian.shading
-    deviation, deviation_slope = with_slope(partial(residual_deviation, problem), residual)
+    deviation, deviation_slope = with_slope(partial(bilinear.residual_deviation, problem), residual)
     # w depends on r / d alone, so that d dw/dd = w - d(w r)/dr: no derivative of it is needed.
     deviation = deviation[:, None, None].clamp_min(1e-300)
     weighted_residual = (hessian.weighted_residual - hessian.loss_curvature * residual) / deviation
     return deviation_slope, (
         weighted_residual @ hessian.shading.mT,
-        coordinates(hessian.columns, hessian.lights.mT @ weighted_residual),
+        quadratics.coordinates(hessian.columns, hessian.lights.mT @ weighted_residual),
     )
 
 
 def _change_of(
-    deviation_slope: Float[Tensor, "patch view sample"], hessian: Hessian, step: FactorStep
+    deviation_slope: Entries, hessian: Hessian, step: FactorStep
 ) -> Float[Tensor, " patch"]:
-    samples = step.lights @ hessian.shading
-    samples = samples + hessian.lights @ combination(hessian.columns, step.along_tangents)
+    moved = quadratics.combination(hessian.columns, step.along_tangents)
+    samples = step.lights @ hessian.shading + hessian.lights @ moved
     return -(deviation_slope * samples).sum(dim=(1, 2))
 
 
 @torch.no_grad()
-def _hessian(
-    problem: Bilinear, L: Float[Tensor, "patch view rank"], N: Float[Tensor, "patch rank sample"]
-) -> Hessian:
+def _hessian(problem: Bilinear, L: Lights, N: Shading) -> Hessian:
     weight, radiance = problem.weight.double(), problem.radiance.double()
     residual = radiance - L @ N
-    deviation = residual_deviation(problem, residual)[:, None, None]
+    deviation = bilinear.residual_deviation(problem, residual)[:, None, None]
     weighted_residual = weight * problem.loss.weights(residual, deviation) * residual
     loss_curvature = weight * problem.loss.curvatures(residual, deviation)
     columns = tuple(problem.manifold.tangents(N))
-    packed, slope = outer(L.mT) @ loss_curvature, -(L.mT @ weighted_residual)
+    packed, slope = quadratics.outer(L.mT) @ loss_curvature, -(L.mT @ weighted_residual)
     if problem.prior is not None:
         prior = problem.prior.double()
-        packed, slope = packed + prior, slope + apply_packed(prior, N)
-    A, B = unpacked(packed, N.shape[1]), torch.stack(columns, dim=-1).transpose(1, 2)
+        packed, slope = packed + prior, slope + quadratics.apply_packed(prior, N)
+    A, B = quadratics.unpacked(packed, N.shape[1]), torch.stack(columns, dim=-1).transpose(1, 2)
     own = B.mT @ A @ B + problem.manifold.curvature(N, slope)
     diagonal = own.diagonal(dim1=2, dim2=3).abs().sum(dim=-1)
     eye = torch.eye(own.shape[-1], dtype=own.dtype, device=own.device)
@@ -300,7 +277,7 @@ def _hessian(
 def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown unknown"]:
     L, N = hessian.lights, hessian.shading
     batch, views, rank = L.shape
-    total = curvature_of_views(N, hessian.loss_curvature)
+    total = bilinear.curvature_of_views(N, hessian.loss_curvature)
     regularization = problem.regularization.double()[..., None].expand(-1, -1, rank).flatten(1)
     total = total + torch.diag_embed(regularization)
     mean = total.diagonal(dim1=1, dim2=2).mean(dim=1)
@@ -325,45 +302,34 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
 
 
 def _gradient(
-    problem: Bilinear,
-    L: Float[Tensor, "patch view rank"],
-    N: Float[Tensor, "patch rank sample"],
-    columns: Sequence[Float[Tensor, "patch rank sample"]],
-) -> tuple[Float[Tensor, "patch view rank"], Float[Tensor, "patch tangent sample"]]:
+    problem: Bilinear, L: Lights, N: Shading, columns: Sequence[Shading]
+) -> tuple[Lights, Tangential]:
     """Return minus half the gradient by lights and samples, as a function of the data."""
     residual = problem.radiance.double() - L @ N
-    deviation = residual_deviation(problem, residual)[:, None, None]
-    weighted_residual = (
-        problem.weight.double() * problem.loss.weights(residual, deviation) * residual
-    )
+    deviation = bilinear.residual_deviation(problem, residual)[:, None, None]
+    robust = problem.loss.weights(residual, deviation)
+    weighted_residual = problem.weight.double() * robust * residual
     difference = L - problem.anchor.double()
     on_lights = weighted_residual @ N.mT - problem.regularization.double()[..., None] * difference
     ambient = L.mT @ weighted_residual
     if problem.prior is not None:
-        ambient = ambient - apply_packed(problem.prior.double(), N)
-    return on_lights, coordinates(columns, ambient)
+        ambient = ambient - quadratics.apply_packed(problem.prior.double(), N)
+    return on_lights, quadratics.coordinates(columns, ambient)
 
 
-def _apply_mixed(
-    hessian: Hessian, along_tangents: Float[Tensor, "patch tangent sample"]
-) -> Float[Tensor, "patch view rank"]:
-    moved = combination(hessian.columns, along_tangents)
-    return (
-        hessian.loss_curvature * (hessian.lights @ moved)
-    ) @ hessian.shading.mT - hessian.weighted_residual @ moved.mT
+def _apply_mixed(hessian: Hessian, along_tangents: Tangential) -> Lights:
+    moved = quadratics.combination(hessian.columns, along_tangents)
+    weighted = hessian.loss_curvature * (hessian.lights @ moved)
+    return weighted @ hessian.shading.mT - hessian.weighted_residual @ moved.mT
 
 
-def _apply_mixed_transpose(
-    hessian: Hessian, step: Float[Tensor, "patch view rank"]
-) -> Float[Tensor, "patch tangent sample"]:
-    ambient = hessian.lights.mT @ (hessian.loss_curvature * (step @ hessian.shading)) - (
-        step.mT @ hessian.weighted_residual
-    )
-    return coordinates(hessian.columns, ambient)
+def _apply_mixed_transpose(hessian: Hessian, step: Lights) -> Tangential:
+    weighted = hessian.loss_curvature * (step @ hessian.shading)
+    ambient = hessian.lights.mT @ weighted - step.mT @ hessian.weighted_residual
+    return quadratics.coordinates(hessian.columns, ambient)
 
 
 def _apply(
-    inverse: Float[Tensor, "patch sample tangent tangent"],
-    vectors: Float[Tensor, "patch tangent sample"],
-) -> Float[Tensor, "patch tangent sample"]:
+    inverse: Float[Tensor, "patch sample tangent tangent"], vectors: Tangential
+) -> Tangential:
     return (inverse @ vectors.mT[..., None])[..., 0].mT

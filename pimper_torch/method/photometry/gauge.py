@@ -38,23 +38,18 @@ class FixGauge(Stage):
         at = mesh.vertices_world, mesh.faces[torch.cat(facet)]
         leave_out("photometry.undetermined", undetermined, at=at)
         warn_of_undetermined(solved.buckets, config.min_views, config.min_light_variation)
-        return _in_gauge(solved)
-
-
-def _in_gauge(solved: PhotometricPatches) -> PhotometricPatches:
-    determined = any(bool(bucket.valid.any()) for bucket in solved.buckets)
-    gray = torch.cat(
-        [
+        determined = any(bool(bucket.valid.any()) for bucket in solved.buckets)
+        gray = [
             bucket.albedo.mean(dim=-1)[bucket.valid if determined else bucket.observed]
             for bucket in solved.buckets
         ]
-    )
-    if len(gray) == 0:
-        return solved
-    bright = gray.kthvalue(max(1, math.ceil(0.99 * len(gray)))).values
-    factor = torch.where(bright > 0, bright, 1)
-    buckets = tuple(
-        bucket.replace(albedo=bucket.albedo / factor, lights_patch=bucket.lights_patch * factor)
-        for bucket in solved.buckets
-    )
-    return solved.replace(buckets=buckets)
+        count = sum(map(len, gray))
+        if count == 0:
+            return solved
+        bright = torch.cat(gray).kthvalue(max(1, math.ceil(0.99 * count))).values
+        factor = torch.where(bright > 0, bright, 1)
+        buckets = tuple(
+            bucket.replace(albedo=bucket.albedo / factor, lights_patch=bucket.lights_patch * factor)
+            for bucket in solved.buckets
+        )
+        return solved.replace(buckets=buckets)

@@ -15,7 +15,8 @@ from torch.nn.functional import pad
 
 from pimper_torch.ground.kernels.twin_constants import MIN_DEVIATION
 from pimper_torch.ground.linalg.robust import with_slope
-from pimper_torch.method.photometry.light_models import MIN_DISTANCE, ImageSamples, LightModel
+from pimper_torch.method.photometry import light_models
+from pimper_torch.method.photometry.light_models import ImageSamples, LightModel, Unknowns
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
 # is the limit of iterations and the fraction where gradients are required, from which Newton's
@@ -32,12 +33,10 @@ class LightFit:
     """Fitted lights and albedo."""
 
     model: LightModel
-    lights: Float[Tensor, "view parameter"]
-    albedo: Float[Tensor, " sample"]
+    lights: light_models.Parameters
+    albedo: light_models.Albedo
 
-    def misfit(
-        self, samples: ImageSamples, some: Bool[Tensor, "sample view"]
-    ) -> Float[Tensor, " view"]:
+    def misfit(self, samples: ImageSamples, some: light_models.Seen) -> Float[Tensor, " view"]:
         """Return the median residual of some samples, in brightnesses of their views.
 
         NaN in views that have none of them.
@@ -49,10 +48,7 @@ class LightFit:
 
 
 def fit_lights(
-    model: LightModel,
-    samples: ImageSamples,
-    iterations: int,
-    start: tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]] | None = None,
+    model: LightModel, samples: ImageSamples, iterations: int, start: Unknowns | None = None
 ) -> LightFit:
     """Fit a model's lights and the samples' albedo; a constant to autograd.
 
@@ -77,11 +73,11 @@ def _requires_grad(model: LightModel, samples: ImageSamples) -> bool:
 def _minimize(
     model: LightModel,
     samples: ImageSamples,
-    lights: Float[Tensor, "view parameter"],
-    albedo: Float[Tensor, " sample"],
+    lights: light_models.Parameters,
+    albedo: light_models.Albedo,
     limit: int,
     min_gain: float,
-) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+) -> Unknowns:
     """Minimize over lights and albedo jointly; alternation converges slowly along their valley."""
     from pimper_torch.ground.kernels.lights_and_albedo import TILE, fit
 
@@ -98,7 +94,7 @@ def _minimize(
         radiance,
         seen,
         level.numpy(),
-        1 / MIN_DISTANCE,
+        1 / light_models.MIN_DISTANCE,
         limit,
         min_gain,
         lights.numpy(),
@@ -146,9 +142,6 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
     )
 
 
-Unknowns = tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]
-
-
 def _length(step: Unknowns) -> float:
     return math.hypot(*(float(part.norm()) for part in step))
 
@@ -156,8 +149,8 @@ def _length(step: Unknowns) -> float:
 def _descent(
     model: LightModel,
     samples: ImageSamples,
-    lights: Float[Tensor, "view parameter"],
-    albedo: Float[Tensor, " sample"],
+    lights: light_models.Parameters,
+    albedo: light_models.Albedo,
 ) -> Unknowns:
     """Return minus half the gradient of the objective."""
     shading = model.shade(lights)
@@ -170,8 +163,8 @@ def _descent(
 def _newton_matrix(
     model: LightModel,
     samples: ImageSamples,
-    lights: Float[Tensor, "view parameter"],
-    albedo: Float[Tensor, " sample"],
+    lights: light_models.Parameters,
+    albedo: light_models.Albedo,
     fixed: Bool[Tensor, "view parameter"],
 ) -> Callable[[Tensor, Tensor], Unknowns]:
     """Factor the exact derivative of :func:`_descent`, negative; albedos are eliminated (Schur).
@@ -235,7 +228,7 @@ def _newton_matrix(
 
 
 def _second_derivatives(
-    model: LightModel, lights: Float[Tensor, "view parameter"], weight: Float[Tensor, "sample view"]
+    model: LightModel, lights: light_models.Parameters, weight: light_models.Entries
 ) -> Float[Tensor, "view parameter parameter"]:
     if model.normals is None:
         return lights.new_zeros(*lights.shape, lights.shape[1])

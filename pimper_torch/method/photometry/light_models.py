@@ -20,12 +20,21 @@ from pimper_torch.ground.geometry.directions import even_directions
 from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIATION
 from pimper_torch.ground.linalg.robust import cauchy_weights, robust_deviation
 
+Parameters = Float[Tensor, "view parameter"]
+"""Of a model of each view's light, see :class:`LightModel`."""
+Entries = Float[Tensor, "sample view"]
+"""A value for each sample in each view."""
+Seen = Bool[Tensor, "sample view"]
+Albedo = Float[Tensor, " sample"]
+SampleVectors = Float[Tensor, "sample 3"]
+Unknowns = tuple[Parameters, Albedo]
+
 # Residuals have to fall by so many standard errors over the views, 99.7 % confidence, and by this
 # fraction at least, a choice: what won less on glossy scenes was no light.
 _CONFIDENCE, _LEAST = 3.0, 0.05
 
 
-def left_out(seen: Bool[Tensor, "sample view"]) -> Bool[Tensor, "sample view"]:
+def left_out(seen: Seen) -> Seen:
     """Choose what to leave out: of each sample and each view a fifth."""
     sample, view = (torch.arange(size, device=seen.device) for size in seen.shape)
     return seen & ((sample[:, None] + view) % 5 == 0)
@@ -55,8 +64,8 @@ class ImageSamples:
         seen: False where missing.
     """
 
-    radiance: Float[Tensor, "sample view"]
-    seen: Bool[Tensor, "sample view"]
+    radiance: Entries
+    seen: Seen
 
     def at(self, index: slice | tuple[slice, slice]) -> "ImageSamples":
         """Take some samples, or some samples in some views."""
@@ -67,24 +76,20 @@ class ImageSamples:
         """Mean brightness of each view."""
         return (self.radiance.sum(dim=0) / self.seen.sum(dim=0).clamp_min(1)).abs()
 
-    def residual(
-        self, albedo: Float[Tensor, " sample"], shading: Float[Tensor, "sample view"]
-    ) -> Float[Tensor, "sample view"]:
+    def residual(self, albedo: Albedo, shading: Entries) -> Entries:
         """Return the residuals of a model of albedo and shading; zero where not seen."""
         return torch.where(self.seen, self.radiance - albedo[:, None] * shading, 0)
 
-    def scale(self, residual: Float[Tensor, "sample view"]) -> Float[Tensor, " view"]:
+    def scale(self, residual: Entries) -> Float[Tensor, " view"]:
         """Return the scale of Cauchy's loss for each view."""
         least = MIN_DEVIATION * self.level
         return CAUCHY_TUNING * robust_deviation(residual.mT, self.seen.mT).maximum(least)
 
-    def weights(
-        self, residual: Float[Tensor, "sample view"], scale: Float[Tensor, " view"]
-    ) -> Float[Tensor, "sample view"]:
+    def weights(self, residual: Entries, scale: Float[Tensor, " view"]) -> Entries:
         """Return Cauchy's weights; zero where not seen."""
         return self.seen * cauchy_weights(residual, scale)
 
-    def brightness(self) -> tuple[Float[Tensor, " view"], Float[Tensor, " sample"]]:
+    def brightness(self) -> tuple[Float[Tensor, " view"], Albedo]:
         """Return median radiance of each view, and of each sample relative to its views."""
         missing = torch.where(self.seen, self.radiance, torch.nan)
         gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
@@ -93,9 +98,7 @@ class ImageSamples:
         albedo = ratio.nanmedian(dim=1).values.nan_to_num(nan=0.0)
         return gain, torch.where(known.any(dim=1), albedo, 0)
 
-    def albedo_under(
-        self, shading: Float[Tensor, "sample view"], weight: Float[Tensor, "sample view"]
-    ) -> Float[Tensor, " sample"]:
+    def albedo_under(self, shading: Entries, weight: Entries) -> Albedo:
         """Return the weighted least-squares albedo under a shading; NaN without weight."""
         square = (weight * shading**2).sum(dim=1)
         product = (weight * shading * self.radiance).sum(dim=1)
@@ -114,8 +117,8 @@ _TIE = 1e-3
 
 
 def search_point_lights(
-    samples: ImageSamples, normals: Float[Tensor, "sample 3"]
-) -> tuple[Float[Tensor, "view 4"], Float[Tensor, " sample"]]:
+    samples: ImageSamples, normals: SampleVectors
+) -> tuple[Float[Tensor, "view 4"], Albedo]:
     r"""Search the direction of each view's point light, taken to be distant.
 
     For albedo initialized by the samples' brightest views, ambient light :math:`a` and the point
@@ -160,16 +163,15 @@ def search_point_lights(
     return lights, all_albedo.nan_to_num(nan=0.0)
 
 
+Directions = Float[Tensor, "view direction"]
+
+
 def _fit_directions(
     samples: ImageSamples,
-    albedo: Float[Tensor, " sample"],
+    albedo: Albedo,
     facing: Float[Tensor, "sample direction"],
-    weight: Float[Tensor, "sample view"],
-) -> tuple[
-    Float[Tensor, "view direction"],
-    Float[Tensor, "view direction"],
-    Float[Tensor, "view direction"],
-]:
+    weight: Entries,
+) -> tuple[Directions, Directions, Directions]:
     """Return ambient light, strength and sum of squared residuals for every direction."""
     J = samples.radiance
     lit = albedo[:, None] * facing
@@ -212,17 +214,15 @@ class LightModel:
     """
 
     basis: Float[Tensor, "sample term"]
-    normals: Float[Tensor, "sample 3"] | None = None
-    points: Float[Tensor, "sample 3"] | None = None
+    normals: SampleVectors | None = None
+    points: SampleVectors | None = None
 
     def geometry(self) -> tuple[Tensor, ...]:
         """List the tensors that the model is a function of."""
         parts = self.basis, self.normals, self.points
         return tuple(part for part in parts if part is not None)
 
-    def inside_bounds(
-        self, lights: Float[Tensor, "view parameter"]
-    ) -> Bool[Tensor, "view parameter"]:
+    def inside_bounds(self, lights: Parameters) -> Bool[Tensor, "view parameter"]:
         """Find parameters that are not at a bound."""
         inside = torch.ones_like(lights) > 0
         inside[:, 0] = lights[:, 0] > 0
@@ -230,9 +230,7 @@ class LightModel:
             inside[:, -1] = (lights[:, -1] > 0) & (lights[:, -1] < 1 / MIN_DISTANCE)
         return inside
 
-    def initialize(
-        self, samples: ImageSamples
-    ) -> tuple[Float[Tensor, "view parameter"], Float[Tensor, " sample"]]:
+    def initialize(self, samples: ImageSamples) -> Unknowns:
         """Return initial lights and albedo.
 
         Soft light is along the mean normal with the views' median brightness. Of ambient and a
@@ -246,7 +244,7 @@ class LightModel:
         near = torch.full_like(lights[:, :1], 1 / _FIRST_DISTANCE)
         return torch.cat([lights, near], dim=1), albedo
 
-    def shade(self, lights: Float[Tensor, "view parameter"]) -> Float[Tensor, "sample view"]:
+    def shade(self, lights: Parameters) -> Entries:
         """Return the radiance of albedo 1."""
         soft = self.basis @ lights[:, : self.basis.shape[1]].mT
         if self.normals is None:
@@ -255,9 +253,7 @@ class LightModel:
         facing = (self.normals[:, None] * away).sum(dim=-1)
         return soft + strength * facing.clamp_min(0) / distance**3
 
-    def jacobian(
-        self, lights: Float[Tensor, "view parameter"]
-    ) -> Float[Tensor, "sample view parameter"]:
+    def jacobian(self, lights: Parameters) -> Float[Tensor, "sample view parameter"]:
         """Return the derivatives of :meth:`shade` by the view's parameters."""
         by_soft = self.basis[:, None].expand(-1, len(lights), -1)
         if self.normals is None or self.points is None:
@@ -277,7 +273,7 @@ class LightModel:
             [by_soft, lit[..., None] * by_point_light, (lit * by_closeness)[..., None]], dim=-1
         )
 
-    def clamp(self, lights: Float[Tensor, "view parameter"]) -> Float[Tensor, "view parameter"]:
+    def clamp(self, lights: Parameters) -> Parameters:
         """Project on the bounds: no negative ambient light, no point light inside the scene."""
         ambient = lights[:, :1].clamp_min(0)
         if self.points is None:
@@ -286,12 +282,12 @@ class LightModel:
         return torch.cat([ambient, lights[:, 1:-1], closeness], dim=1)
 
     def _geometry(
-        self, lights: Float[Tensor, "view parameter"]
+        self, lights: Parameters
     ) -> tuple[
         Float[Tensor, " view"],
         Float[Tensor, "view 3"],
         Float[Tensor, "sample view 3"],
-        Float[Tensor, "sample view"],
+        Entries,
     ]:
         assert self.points is not None
         strength = lights[:, -4:-1].norm(dim=1)

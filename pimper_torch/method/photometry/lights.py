@@ -14,21 +14,17 @@ import math
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.ground.shapes import Scalar
+from pimper_torch.method.photometry import light_models
 from pimper_torch.method.photometry.light_colour import exposures, light_colours
 from pimper_torch.method.photometry.light_field import LightField, harmonics, second_harmonics
 from pimper_torch.method.photometry.light_fit import LightFit, fit_lights, with_gradients
-from pimper_torch.method.photometry.light_models import (
-    ImageSamples,
-    LightModel,
-    left_out,
-    predicts_better,
-)
+from pimper_torch.method.photometry.light_models import ImageSamples, LightModel, SampleVectors
 from pimper_torch.records import PatchSet, PatchViews, Templates
 
 # Models by their number of parameters.
@@ -108,10 +104,10 @@ def light_of_mesh(
 
 
 def fit_light_field(
-    radiance: Float[Tensor, "sample view"],
-    seen: Bool[Tensor, "sample view"],
-    normals: Float[Tensor, "sample 3"],
-    points: Float[Tensor, "sample 3"] | None = None,
+    radiance: light_models.Entries,
+    seen: light_models.Seen,
+    normals: SampleVectors,
+    points: SampleVectors | None = None,
     model: LightName = "auto",
     iterations: int = 60,
 ) -> LightField:
@@ -173,7 +169,8 @@ def fit_light_field(
     )
     closeness = torch.cat([each[3] for each in fits])[order]
     closeness = torch.zeros_like(closeness) if points is None else closeness / size
-    factor = _median_length(lights.square().sum(dim=1) + point_lights.square().sum(dim=1))
+    square = lights.square().sum(dim=1) + point_lights.square().sum(dim=1)
+    factor = square[square > 0].sqrt().median().nan_to_num(nan=1.0)
     return LightField(
         origin=origin.to(radiance),
         soft=(lights / factor).to(radiance),
@@ -182,22 +179,18 @@ def fit_light_field(
     )
 
 
-def _ratio(albedo: Float[Tensor, " sample"], other: Float[Tensor, " sample"]) -> Scalar | float:
+def _ratio(albedo: light_models.Albedo, other: light_models.Albedo) -> Scalar | float:
     """Return the median ratio of two albedos where both are known; 1 where none is."""
     both = (albedo > 0) & (other > 0)
     return (albedo[both] / other[both]).median() if bool(both.any()) else 1.0
 
 
 def _lights(
-    name: str,
-    samples: ImageSamples,
-    normals: Float[Tensor, "sample 3"],
-    points: Float[Tensor, "sample 3"],
-    iterations: int,
+    name: str, samples: ImageSamples, normals: SampleVectors, points: SampleVectors, iterations: int
 ) -> tuple[
     Float[Tensor, "view 9"],
     Float[Tensor, "view 3"],
-    Float[Tensor, " sample"],
+    light_models.Albedo,
     Float[Tensor, " view"],
 ]:
     """Return fitted harmonics, point lights, albedo, and closeness, in units of the points."""
@@ -212,11 +205,7 @@ def _lights(
 
 
 def _fit(
-    name: str,
-    samples: ImageSamples,
-    normals: Float[Tensor, "sample 3"],
-    points: Float[Tensor, "sample 3"],
-    iterations: int,
+    name: str, samples: ImageSamples, normals: SampleVectors, points: SampleVectors, iterations: int
 ) -> tuple[LightFit, Float[Tensor, "term 9"]]:
     """Fit a model.
 
@@ -267,35 +256,27 @@ def _fit_room(
 
 @torch.no_grad()
 def _selected(
-    samples: ImageSamples,
-    normals: Float[Tensor, "sample 3"],
-    points: Float[Tensor, "sample 3"],
-    iterations: int,
+    samples: ImageSamples, normals: SampleVectors, points: SampleVectors, iterations: int
 ) -> str:
     """Select the model by its residuals where radiance is left out of the fit."""
     few = slice(None, None, -(-len(normals) // 2500))
     normals, points = normals[few], points[few]
     every = samples.at(few)
-    test = left_out(every.seen)
+    test = light_models.left_out(every.seen)
     seen = every.seen & ~test
     rest = ImageSamples(radiance=torch.where(seen, every.radiance, 0), seen=seen)
     best, least = "", torch.empty(0)
     for name in _MODELS:
         misfit = _fit(name, rest, normals, points, iterations)[0].misfit(every, test)
-        if not best or predicts_better(misfit, least):
+        if not best or light_models.predicts_better(misfit, least):
             best, least = name, misfit
     return best
 
 
-def _mean_distance(positions: Float[Tensor, "sample 3"]) -> Scalar:
+def _mean_distance(positions: SampleVectors) -> Scalar:
     """Return the mean distance of points from the origin; 1 if all are there."""
     offsets = positions[(positions != 0).any(dim=1)]
     return offsets.norm(dim=1).sum() / len(positions) if len(offsets) else positions.new_ones(())
-
-
-def _median_length(square: Float[Tensor, " view"]) -> Scalar:
-    shining = square[square > 0]
-    return shining.sqrt().median() if len(shining) else square.new_ones(())
 
 
 def _subsampled(templates: Templates, step: int) -> Templates:

@@ -6,13 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from pimper_torch.method.photometry.bilinear import (
-    Bilinear,
-    Factors,
-    curvature_along,
-    equations_of_samples,
-    tangent_step,
-)
+from pimper_torch.method.photometry import bilinear
+from pimper_torch.method.photometry.bilinear import Bilinear, Entries, Factors, Lights, Shading
 from pimper_torch.method.photometry.quadratics import apply_packed, solve_packed
 from pimper_torch.records import Observations, Record, Templates
 
@@ -113,20 +108,20 @@ def refine_on_manifold(problem: Bilinear, factors: Factors) -> SampleEstimates:
     :math:`B^\top A B` for the tangents that rotate the normal and :math:`s^2` the variance of the
     residuals, the sample's and the patch's pooled. Differentiable in factors and radiance.
     """
-    A, b = equations_of_samples(problem, factors.lights, factors.weight)
+    A, b = bilinear.equations_of_samples(problem, factors.lights, factors.weight)
     slope = b - apply_packed(A, factors.shading)
-    moved = tangent_step(problem.manifold, A, slope, factors.shading)
+    moved = bilinear.tangent_step(problem.manifold, A, slope, factors.shading)
     albedo, normals = problem.manifold.split(moved.mT)
-    curvature = curvature_along(problem.manifold.tangents(factors.shading), A)
+    curvature = bilinear.curvature_along(problem.manifold.tangents(factors.shading), A)
     information = _information(problem, factors, curvature)
     return SampleEstimates(albedo=albedo, normals=normals, information=information)
 
 
 def fit_albedo(
     radiance: Float[Tensor, "patch view channel sample"],
-    weight: Float[Tensor, "patch view sample"],
-    lights: Float[Tensor, "patch view rank"],
-    basis: Float[Tensor, "patch rank sample"],
+    weight: Entries,
+    lights: Lights,
+    basis: Shading,
 ) -> Float[Tensor, "patch channel sample"]:
     """Return every channel's least-squares albedo, lights and normals given.
 
@@ -147,11 +142,8 @@ def fit_albedo(
 
 
 def initial_shading(
-    radiance: Float[Tensor, "patch view sample"],
-    seen: Bool[Tensor, "patch view sample"],
-    lights: Float[Tensor, "patch view rank"],
-    basis: Float[Tensor, "patch rank sample"],
-) -> Float[Tensor, "patch rank sample"]:
+    radiance: Entries, seen: Bool[Tensor, "patch view sample"], lights: Lights, basis: Shading
+) -> Shading:
     """Return shading vectors in the directions of ``basis``, with the least-squares albedo."""
     weight = seen.to(radiance.dtype)
     return fit_albedo(radiance[:, :, None], weight, lights, basis) * basis
@@ -165,10 +157,9 @@ def _information(
     square = (factors.weight * residual**2).sum(dim=1)
     count = factors.weight.sum(dim=1)
     # A sample with m views has spent 3 of them on its own albedo and normal.
-    pooled = square.sum(dim=1) / (count - 3).clamp_min(0).sum(dim=1).clamp_min(1)
-    variance = (square + BORROWED_VIEWS * pooled[:, None]) / (
-        (count - 3).clamp_min(0) + BORROWED_VIEWS
-    )
+    left = (count - 3).clamp_min(0)
+    pooled = square.sum(dim=1) / left.sum(dim=1).clamp_min(1)
+    variance = (square + BORROWED_VIEWS * pooled[:, None]) / (left + BORROWED_VIEWS)
     robust_deviation = torch.zeros_like(square)
     for angle in (1, 2):
         unit = torch.zeros_like(factors.shading[:, :3])
@@ -180,8 +171,7 @@ def _information(
     kind = torch.finfo(square.dtype)
     error = variance * robust_deviation / square
     determined = (robust_deviation > 0) & (square > kind.tiny**0.5) & (error < kind.max**0.5)
-    error = torch.where(determined, variance * robust_deviation, 1) / torch.where(
-        determined, square, 1
-    )
+    error = torch.where(determined, variance * robust_deviation, 1)
+    error = error / torch.where(determined, square, 1)
     # Without residuals a normal is known to single precision.
     return torch.where(determined, 1 / error.clamp_min(1e-7**2), 0)

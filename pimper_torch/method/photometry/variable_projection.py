@@ -31,28 +31,17 @@ from pimper_torch.ground.kernels.twin_constants import (
     ZERO_ROUNDINGS,
 )
 from pimper_torch.ground.linalg.robust import Squares
-from pimper_torch.method.photometry.bilinear import (
-    RUNNING,
-    Bilinear,
-    Factors,
-    State,
-    curvature_of_views,
-    equations_of_samples,
-    evaluate,
-    iterate,
-    keep_scale,
-    robust_weights,
-    update_shading,
-)
+from pimper_torch.method.photometry import bilinear
+from pimper_torch.method.photometry.bilinear import Bilinear, Entries, Factors, Lights, Shading
 from pimper_torch.method.photometry.quadratics import PackedCholesky, congruence, outer, unpacked
 from pimper_torch.records import Convergence, StopCause
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _State(State):
+class _State(bilinear.State):
     energy: Float[Tensor, " patch"]
     cost: Float[Tensor, " patch"]
-    slope: Float[Tensor, "patch view rank"]
+    slope: Lights
     curvature: Float[Tensor, "patch unknown unknown"]
     damping: Float[Tensor, " patch"]
     small: Int[Tensor, " patch"]
@@ -95,15 +84,11 @@ def solve_variable_projection(
 
     with torch.no_grad():
         state = _start(problem, curvature_samples)
-        return iterate(problem, state, advance, max_iterations)
+        return bilinear.iterate(problem, state, advance, max_iterations)
 
 
 def curvature_of_lights(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-    weight: Float[Tensor, "patch view sample"],
-    samples: int | None = None,
+    problem: Bilinear, lights: Lights, shading: Shading, weight: Entries, samples: int | None = None
 ) -> Float[Tensor, "patch unknown unknown"]:
     """Return the Gauss-Newton matrices ``H``, unknowns view by view, regularization included.
 
@@ -120,7 +105,7 @@ def curvature_of_lights(
         shading=shading,
         prior=None if problem.prior is None else problem.prior[:, :, ::stride],
     )
-    per_view = curvature_of_views(shading, weight)
+    per_view = bilinear.curvature_of_views(shading, weight)
     normal = per_view - _eliminated(_whitened(subset, lights, shading, weight), shading)
     regularization = problem.regularization[..., None].expand(-1, -1, rank).flatten(1)
     return stride * normal + torch.diag_embed(regularization)
@@ -138,10 +123,10 @@ def _step(
     if _is_free(problem):
         moved = torch.linalg.qr(moved).Q
     else:
-        moved, shading = keep_scale(problem, state.lights, moved, shading)
-    equations = equations_of_samples(problem, moved, state.weight)
-    shading = update_shading(problem, *equations, shading, SHADING_STEPS)
-    after, slope = evaluate(problem, moved, shading, state.weight)
+        moved, shading = bilinear.keep_scale(problem, state.lights, moved, shading)
+    equations = bilinear.equations_of_samples(problem, moved, state.weight)
+    shading = bilinear.update_shading(problem, *equations, shading, SHADING_STEPS)
+    after, slope = bilinear.evaluate(problem, moved, shading, state.weight)
     better = after < state.cost
     gain = (state.cost - after) / state.cost.clamp_min(torch.finfo(after.dtype).tiny)
     small = torch.where(gain < tolerance, state.small + 1, 0)
@@ -161,16 +146,16 @@ def _step(
         )
         state = _with_robust_weights(problem, state)
         state = state.replace(curvature=_curvature(problem, state, curvature_samples))
-    cause = torch.where(stalled, int(StopCause.STALLED), RUNNING)
+    cause = torch.where(stalled, int(StopCause.STALLED), bilinear.RUNNING)
     return state, torch.where(exact | (small >= small_steps), int(StopCause.CONVERGED), cause)
 
 
 def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
     lights = torch.linalg.qr(problem.lights).Q if _is_free(problem) else problem.lights
-    weight = robust_weights(problem, lights, problem.shading)
-    equations = equations_of_samples(problem, lights, weight)
-    shading = update_shading(problem, *equations, problem.shading, SHADING_STEPS)
-    cost, slope = evaluate(problem, lights, shading, weight)
+    weight = bilinear.robust_weights(problem, lights, problem.shading)
+    equations = bilinear.equations_of_samples(problem, lights, weight)
+    shading = bilinear.update_shading(problem, *equations, problem.shading, SHADING_STEPS)
+    cost, slope = bilinear.evaluate(problem, lights, shading, weight)
     seen = (weight * problem.radiance).flatten(1)
     state = _State(
         lights=lights,
@@ -195,19 +180,16 @@ def _curvature(
 def _with_robust_weights(problem: Bilinear, state: _State) -> _State:
     if isinstance(problem.loss, Squares):
         return state
-    weight = robust_weights(problem, state.lights, state.shading)
-    cost, slope = evaluate(problem, state.lights, state.shading, weight)
+    weight = bilinear.robust_weights(problem, state.lights, state.shading)
+    cost, slope = bilinear.evaluate(problem, state.lights, state.shading, weight)
     return state.replace(weight=weight, cost=cost, slope=slope)
 
 
 def _whitened(
-    problem: Bilinear,
-    lights: Float[Tensor, "patch view rank"],
-    shading: Float[Tensor, "patch rank sample"],
-    weight: Float[Tensor, "patch view sample"],
-) -> list[Float[Tensor, "patch view sample"]]:
+    problem: Bilinear, lights: Lights, shading: Shading, weight: Entries
+) -> list[Entries]:
     """Return ``C_k^-1 B_k^T l_f w_fk`` by tangents, ``C C^T`` the sample's normal equations."""
-    packed, _ = equations_of_samples(problem, lights, weight)
+    packed, _ = bilinear.equations_of_samples(problem, lights, weight)
     if problem.manifold.flat:
         slopes = [light[..., None] * weight for light in lights.unbind(dim=2)]
     else:
@@ -218,9 +200,7 @@ def _whitened(
     return [rows.to(lights) for rows in white]
 
 
-def _eliminated(
-    white: list[Float[Tensor, "patch view sample"]], shading: Float[Tensor, "patch rank sample"]
-) -> Float[Tensor, "patch unknown unknown"]:
+def _eliminated(white: list[Entries], shading: Shading) -> Float[Tensor, "patch unknown unknown"]:
     """Sum the samples' Schur terms ``(n n^T) (x) (white^T white)``.
 
     Products of views come first, then the matrix product with ``n n^T``: several times less
@@ -245,7 +225,7 @@ def _eliminated(
     return torch.where(view_of[:, None] <= view_of, upper, upper.mT)
 
 
-def _damped_step(state: _State) -> Float[Tensor, "patch view rank"]:
+def _damped_step(state: _State) -> Lights:
     normal = state.curvature.double()
     diagonals = normal.diagonal(dim1=1, dim2=2)
     ridge = state.damping[:, None] * diagonals.mean(dim=1, keepdim=True).clamp_min(1e-300)

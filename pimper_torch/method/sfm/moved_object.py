@@ -16,24 +16,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
+from pimper_torch.method.sfm import matching
 from pimper_torch.method.sfm.doubt import FEWEST_VIEWS, JOINING, agreement
 from pimper_torch.method.sfm.epipolar import sampson_errors, shared_geometry
-from pimper_torch.method.sfm.matching import (
-    Keypoints,
-    Matches,
-    PhotographPair,
-    Rows,
-    VerifiedPair,
-    Verifier,
-    Verify,
-    add_votes,
-    among,
-    indices,
-    pairs_of,
-    pixels_of,
-    read_geometries,
-    read_matched,
-)
+from pimper_torch.method.sfm.matching import Keypoints, Matches, PhotographPair, Rows
 from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.records import Record
@@ -77,7 +63,7 @@ def find_moved_object(
     sizes_px: Float[Tensor, "view 2"],
     verified: Matches,
     outside: Matches,
-    verify: Verify,
+    verify: matching.Verify,
     *,
     max_error_px: float,
     fewest: int,
@@ -142,13 +128,13 @@ def object_votes(
             means = [_total(votes, pair, rows).mean() for rows in sets]
             first = 1.0 if means[0] > means[1] else -1.0
             for rows, sign in zip(sets, (first, -first), strict=True):
-                add_votes(cast, pair, rows, torch.full((len(rows), 2), sign))
+                matching.add_votes(cast, pair, rows, torch.full((len(rows), 2), sign))
         votes = [one.sign() for one in cast]
     for _ in range(4):
         handed = [one.clone() for one in votes]
         for pair, rows in (*verified.items(), *seconds.items()):
             ends = [votes[view][rows[:, side]] for side, view in enumerate(pair)]
-            add_votes(handed, pair, rows, torch.stack(ends[::-1], dim=1))
+            matching.add_votes(handed, pair, rows, torch.stack(ends[::-1], dim=1))
         votes = [one.sign() for one in handed]
     return votes
 
@@ -196,7 +182,7 @@ def _contradict(
     keypoints: Keypoints, pair: PhotographPair, first: Rows, second: Rows, max_error_px: float
 ) -> bool:
     """Return whether no geometry explains both sets of matches."""
-    ends = [pixels_of(keypoints, pair, rows) for rows in (first, second)]
+    ends = [matching.pixels_of(keypoints, pair, rows) for rows in (first, second)]
     shared = shared_geometry(ends[0], ends[1], max_error_px)
     far = [(sampson_errors(shared, *each) > max_error_px).double().mean() for each in ends]
     return float(torch.stack(far).amax()) > 0.2
@@ -212,7 +198,7 @@ def _counts(votes: Sequence[Tensor], pair: PhotographPair, rows: Rows) -> tuple[
     return int((total > 0).sum()), int((total < 0).sum())
 
 
-def tie_series(database: Path, settings: ReconstructConfig) -> tuple[VerifiedPair, ...]:
+def tie_series(database: Path, settings: ReconstructConfig) -> tuple[matching.VerifiedPair, ...]:
     """Find series between which the object was moved, and keep between them what is the object's.
 
     Args:
@@ -223,19 +209,19 @@ def tie_series(database: Path, settings: ReconstructConfig) -> tuple[VerifiedPai
         Matches of the surroundings, within series and between; none where nothing was moved.
     """
     with quiet(), loaded().Database.open(database) as stored:
-        matched = read_matched(stored)
+        matched = matching.read_matched(stored)
         geometries = {
             pair: geometry
-            for pair, geometry in read_geometries(stored, matched.ids).items()
+            for pair, geometry in matching.read_geometries(stored, matched.ids).items()
             if len(geometry.inlier_matches) >= MIN_MATCHES
         }
-        verified = {pair: indices(one.inlier_matches) for pair, one in geometries.items()}
+        verified = {pair: matching.indices(one.inlier_matches) for pair, one in geometries.items()}
         outside = {
-            pair: rows[~among(rows, verified[pair])]
+            pair: rows[~matching.among(rows, verified[pair])]
             for pair, rows in matched.pairs.items()
             if pair in verified
         }
-        verifier = Verifier(matched=matched, settings=settings)
+        verifier = matching.Verifier(matched=matched, settings=settings)
         found = find_moved_object(
             matched.keypoints,
             torch.tensor([(one.width, one.height) for one in matched.cameras]).float(),
@@ -251,11 +237,11 @@ def tie_series(database: Path, settings: ReconstructConfig) -> tuple[VerifiedPai
                 stored.update_two_view_geometry(*ids, verifier.geometries[pair])
         for pair in found.dropped:
             stored.delete_two_view_geometry(matched.ids[pair[0]], matched.ids[pair[1]])
-    return tuple(pairs_of(matched.keypoints, found.around))
+    return tuple(matching.pairs_of(matched.keypoints, found.around))
 
 
 def series_in(
-    model: SparseModel, names: Sequence[str], around: Sequence[VerifiedPair]
+    model: SparseModel, names: Sequence[str], around: Sequence[matching.VerifiedPair]
 ) -> Int[Tensor, " view"]:
     """Number the series of a model's views, by what they show round the object.
 

@@ -22,21 +22,9 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
 from pimper_torch.ground.shapes import Matrix3
+from pimper_torch.method.sfm import matching
 from pimper_torch.method.sfm.epipolar import sampson_errors, shared_geometry
-from pimper_torch.method.sfm.matching import (
-    Keypoints,
-    Matched,
-    Matches,
-    PhotographPair,
-    Rows,
-    Verifier,
-    Verify,
-    add_votes,
-    indices,
-    pixels_of,
-    read_geometries,
-    read_matched,
-)
+from pimper_torch.method.sfm.matching import Keypoints, PhotographPair, Rows
 from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.records import Record
 from pimper_torch.runtime.ledger import leave_out
@@ -98,8 +86,8 @@ def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackgro
             as it is.
     """
     with quiet(), loaded().Database.open(database) as stored:
-        matched = read_matched(stored)
-        verifier = Verifier(matched=matched, settings=settings)
+        matched = matching.read_matched(stored)
+        verifier = matching.Verifier(matched=matched, settings=settings)
         rest = find_static_background(
             matched.keypoints,
             matched.pairs,
@@ -109,7 +97,7 @@ def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackgro
             fewest=MIN_MATCHES,
         )
         if rest.room:
-            geometries = read_geometries(stored, matched.ids) | verifier.geometries
+            geometries = matching.read_geometries(stored, matched.ids) | verifier.geometries
             _keep_moving(stored, matched, rest, geometries)
     return rest
 
@@ -124,8 +112,8 @@ def enter_room(rest: StaticBackground) -> tuple[int, int]:
 
 def find_static_background(
     keypoints: Keypoints,
-    pairs: Matches,
-    verify: Verify,
+    pairs: matching.Matches,
+    verify: matching.Verify,
     *,
     still_px: float,
     max_error_px: float,
@@ -153,13 +141,13 @@ def find_static_background(
             if len(moving) < fewest:
                 continue
             resting = split[pair][0]
-            ends = pixels_of(keypoints, pair, moving)
-            geometry = shared_geometry(pixels_of(keypoints, pair, resting), ends, max_error_px)
+            still, ends = (matching.pixels_of(keypoints, pair, some) for some in (resting, moving))
+            geometry = shared_geometry(still, ends, max_error_px)
             moving_pairs += 1
             num_moving += len(moving)
             num_violating += int((sampson_errors(geometry, *ends) > max_error_px).sum())
-            add_votes(votes, pair, resting, torch.ones_like(resting))
-            add_votes(votes, pair, moving, -torch.ones_like(moving))
+            matching.add_votes(votes, pair, resting, torch.ones_like(resting))
+            matching.add_votes(votes, pair, moving, -torch.ones_like(moving))
         if num_moving and num_violating <= _CONTRADICTION * num_moving:
             break
     num_still = sum(len(still) for still, _ in split.values())
@@ -177,7 +165,7 @@ def moving_matches(
 ) -> Bool[Tensor, " match"]:
     """Find matches that are neither still nor of a feature at rest."""
     touched = rest.features[pair[0]][rows[:, 0]] | rest.features[pair[1]][rows[:, 1]]
-    first, second = pixels_of(keypoints, pair, rows)
+    first, second = matching.pixels_of(keypoints, pair, rows)
     return ~touched & ((first - second).norm(dim=-1) >= still_px)
 
 
@@ -185,7 +173,7 @@ def _split(
     keypoints: Keypoints, pair: PhotographPair, rows: Rows, still_px: float
 ) -> tuple[Rows, Rows]:
     """Return a pair's still matches, and those that clearly move."""
-    first, second = pixels_of(keypoints, pair, rows)
+    first, second = matching.pixels_of(keypoints, pair, rows)
     length = (first - second).norm(dim=-1)
     # Features at rest that were found less exactly are no evidence of motion.
     return rows[length < still_px], rows[length >= 4 * still_px]
@@ -193,7 +181,7 @@ def _split(
 
 def _keep_moving(
     stored: Any,  # noqa: ANN401 - pycolmap is untyped
-    matched: Matched,
+    matched: matching.Matched,
     rest: StaticBackground,
     geometries: Mapping[PhotographPair, Any],
 ) -> None:
@@ -217,7 +205,7 @@ def _keep_moving(
         ids = matched.ids[pair[0]], matched.ids[pair[1]]
         stored.write_matches(*ids, moving(pair, rows))
         if geometry := geometries.get(pair):
-            inliers = moving(pair, indices(geometry.inlier_matches))
+            inliers = moving(pair, matching.indices(geometry.inlier_matches))
             if len(inliers) >= MIN_MATCHES:
                 geometry.inlier_matches = inliers
                 stored.write_two_view_geometry(*ids, geometry)

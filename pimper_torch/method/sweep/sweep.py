@@ -1,7 +1,5 @@
 """The stage that finds heights by a sweep along normals, under the fitted light."""
 
-from functools import partial
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -35,8 +33,6 @@ CORRELATED_SAMPLES = 4.0
 
 # Standard deviation of the window that costs are averaged over, in samples: a choice.
 _WINDOW = 1.5
-
-_NO_HEIGHTS = "These patches keep their template's heights there"
 
 # Of the robust cost, in standard deviations of the patch's residuals: a choice (2.385 is 95 %
 # efficient on Gaussian noise).
@@ -79,25 +75,21 @@ class Sweep(Stage):
             sources: The photographs as ``Warp`` prepares them; made here where not given.
         """
         buckets = zip(photometric.patches.buckets, seen.buckets, photometric.buckets, strict=True)
-        coarse = photometric.patches.coarse
-        one = partial(self._swept, cameras, sources or prepare(views), coarse, views.poses)
+        pictures, coarse = sources or prepare(views), photometric.patches.coarse
+
+        def one(bucket: tuple[Templates, Observations, Photometry]) -> Heights:
+            found = self._sweep(cameras, pictures, coarse, views.poses, *bucket)
+            return self._finite(found, *bucket[:2])
+
         return SweptPatches(
             photometric=photometric,
             buckets=tuple(side_by_side(one, list(buckets))),
             averaged=window_size(_WINDOW),
         )
 
-    def _swept(
-        self,
-        cameras: Cameras,
-        sources: Sources,
-        coarse: CoarseMesh,
-        poses: Int[Tensor, " view"] | None,
-        bucket: tuple[Templates, Observations, Photometry],
-    ) -> Heights:
-        """Sweep a bucket; heights that are not finite are none."""
-        found = self._sweep(cameras, sources, coarse, poses, bucket)
-        usable = bucket[1].valid.sum(dim=1)
+    def _finite(self, found: Heights, templates: Templates, registered: Observations) -> Heights:
+        """Drop heights that are not finite, and record how many samples have none."""
+        usable = registered.valid.sum(dim=1)
         most = (usable - self.config.num_views).clamp_min(0)
         leave_out("sweep.selection", int(most.sum()), total=int(usable.sum()))
         asked = usable >= self.config.min_views
@@ -106,8 +98,9 @@ class Sweep(Stage):
         finite = found.offset.isfinite() & found.information.isfinite()
         if bool(finite.all()):
             return found
-        lost = bucket[0].facet[~finite.flatten(1).all(dim=1)]
-        skipped_patches("sweep", lost, "heights are not finite", _NO_HEIGHTS)
+        lost = templates.facet[~finite.flatten(1).all(dim=1)]
+        done = "These patches keep their template's heights there"
+        skipped_patches("sweep", lost, "heights are not finite", done)
         return found.replace(
             offset=torch.where(finite, found.offset, 0),
             information=torch.where(finite, found.information, 0),
@@ -119,10 +112,11 @@ class Sweep(Stage):
         sources: Sources,
         coarse: CoarseMesh,
         poses: Int[Tensor, " view"] | None,
-        bucket: tuple[Templates, Observations, Photometry],
+        templates: Templates,
+        registered: Observations,
+        photometry: Photometry,
     ) -> Heights:
         config = self.config
-        templates, registered, photometry = bucket
         images = templates.rows(cameras.num_views)
         shown = registered.valid.flatten(2).any(dim=2).sum(dim=1)
         priors = registered.priors

@@ -38,12 +38,10 @@ class Free:
     flat: ClassVar[bool] = True
 
     def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Return the nearest vector of the manifold: the vector itself."""
+        """Return the vector itself: it is on the manifold, and so is the end of every step."""
         return shading
 
-    def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Return the end of the step: the manifold is linear."""
-        return shading
+    retract = project
 
     def curvature(
         self,
