@@ -12,6 +12,8 @@ from torch import Tensor
 from pimper_torch.ground.geometry.surfaces import barycentric_2d
 from pimper_torch.ground.shapes import Faces, Pixels, Points
 
+PerPoint = Float[Tensor, " point"]
+
 
 def behind_others(
     pixels: Pixels, points_cam: Points, observed: Bool[Tensor, " point"]
@@ -95,9 +97,7 @@ def well_accompanied(pixels: Pixels) -> Bool[Tensor, " point"]:
     return keep
 
 
-def spread(
-    pixels: Pixels, quality: Float[Tensor, " point"], distance_px: float
-) -> Int[Tensor, " chosen"]:
+def spread(pixels: Pixels, quality: PerPoint, distance_px: float) -> Int[Tensor, " chosen"]:
     """Choose points at least ``distance_px`` apart, the best first."""
     coordinates = pixels.detach().cpu().numpy()
     close = cKDTree(coordinates).query_ball_point(coordinates, distance_px)
@@ -110,9 +110,7 @@ def spread(
     return torch.tensor(chosen, dtype=torch.long, device=pixels.device)
 
 
-def spread_to_count(
-    pixels: Pixels, quality: Float[Tensor, " point"], target: int
-) -> Int[Tensor, " chosen"]:
+def spread_to_count(pixels: Pixels, quality: PerPoint, target: int) -> Int[Tensor, " chosen"]:
     """Choose about ``target`` well-spread points by bisecting their distance."""
     if target >= len(pixels):
         return torch.arange(len(pixels), device=pixels.device)
@@ -137,9 +135,7 @@ def _steepness(
     return steps[..., 2].abs() / steps[..., :2].norm(dim=-1).clamp_min(1e-12)
 
 
-def _deviation(
-    points_cam: Points, nearest: Int[Tensor, "point neighbour"]
-) -> Float[Tensor, " point"]:
+def _deviation(points_cam: Points, nearest: Int[Tensor, "point neighbour"]) -> PerPoint:
     """Measure the distance from the neighbours' robust plane, in radii of the neighbourhood."""
     steps = (points_cam[nearest] - points_cam[:, None]).double()
     radius = steps[..., :2].norm(dim=-1).median(dim=1).values.clamp_min(1e-12)

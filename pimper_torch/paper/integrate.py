@@ -8,20 +8,21 @@ with the basis are 3 to 10 times as fast as FFTs on rasters of 30 to 120 samples
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, normalize, pad
 
 from pimper_torch.ground.geometry.height_fields import sample_raster
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.geometry.surfaces import slopes_from_normals
+from pimper_torch.ground.shapes import PatchMask, PatchRaster, PatchVectors
 from pimper_torch.records import DepthPatches, Depths, PhotometricPatches
 from pimper_torch.runtime.progress import track
 from pimper_torch.runtime.stage import Stage
 
 
 def fill_smoothly(
-    values: Float[Tensor, "patch channel height width"], weight: Float[Tensor, "patch height width"]
+    values: Float[Tensor, "patch channel height width"], weight: PatchRaster
 ) -> Float[Tensor, "patch channel height width"]:
     """Inpaint samples without weight from those around, through a pyramid of halved rasters.
 
@@ -134,11 +135,8 @@ class Integrate(Stage):
 
 
 def integrate_normals(
-    normals: Float[Tensor, "patch height width 3"],
-    valid: Bool[Tensor, "patch height width"],
-    spacing: Float[Tensor, " patch"],
-    steepest: float,
-) -> Float[Tensor, "patch height width"]:
+    normals: PatchVectors, valid: PatchMask, spacing: Float[Tensor, " patch"], steepest: float
+) -> PatchRaster:
     """Find the height field, of mean zero over its raster, whose slopes are the normals'.
 
     Args:

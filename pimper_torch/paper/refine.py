@@ -8,8 +8,6 @@ three right-hand sides of one system.
 """
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
@@ -19,7 +17,7 @@ from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.ground.linalg.continuation import about_mean
 from pimper_torch.ground.linalg.sums import average
 from pimper_torch.ground.linalg.systems import solutions
-from pimper_torch.ground.shapes import Scalars, Vectors, VertexMask, Vertices
+from pimper_torch.ground.shapes import PerFacet, Scalars, Vectors, VertexMask, Vertices
 from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
 from pimper_torch.paper.paper_config import RefineConfig
 from pimper_torch.records import Convergence, DepthPatches, StopCause, Surface
@@ -96,7 +94,7 @@ def smooth_seams(
     subdivision: Subdivision,
     points: Vertices,
     supported: VertexMask,
-    spacing: Float[Tensor, " facet"],
+    spacing: PerFacet,
     radius: float,
 ) -> Vertices:
     """Minimise the energy over the subdivided mesh; float64, differentiable in ``points``.

@@ -86,9 +86,8 @@ def _nothing(cameras: Cameras) -> ContourRays:
 @torch.no_grad()
 def _of_view(inside: Map, cameras: Cameras, view: int, per_view: int) -> ContourRays:
     like, (width, height) = cameras.intrinsics, cameras.sizes_px[view].tolist()
-    smooth = gaussian_filter(
-        inside[:height, :width].detach().cpu().double().numpy(), _BLUR_PX, mode="nearest"
-    )
+    probability = inside[:height, :width].detach().cpu().double().numpy()
+    smooth = gaussian_filter(probability, _BLUR_PX, mode="nearest")
     lines = [_resampled(line) for line in find_contours(smooth, 0.5)]
     lines = [line for line in lines if len(line.points) >= _MIN_LENGTH_PX]
     stride = max(1.0, sum(len(line.points) for line in lines) / per_view)
@@ -141,7 +140,8 @@ def _samples(line: _Line, smooth: Array, stride: float) -> Array:
     """Return rows of place, tangent and outward direction, two numbers each, and slope."""
     points = line.points
     how: Literal["wrap", "nearest"] = "wrap" if line.closed else "nearest"
-    tangent = _unit(gaussian_filter1d(points, _TANGENT_PX, axis=0, order=1, mode=how))
+    tangent = gaussian_filter1d(points, _TANGENT_PX, axis=0, order=1, mode=how)
+    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     # The probability falls outward; half a pixel to either side tells how fast.
     across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     rise = _read(smooth, points + 0.5 * across) - _read(smooth, points - 0.5 * across)
@@ -158,10 +158,6 @@ def _samples(line: _Line, smooth: Array, stride: float) -> Array:
     chosen = chosen[good[chosen]]
     rows = np.concatenate([points, tangent, outward, np.abs(rise)[:, None]], axis=1)
     return np.asarray(rows[chosen])
-
-
-def _unit(vectors: Array) -> Array:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
 def _read(values: Array, points: Array) -> Array:
@@ -228,7 +224,7 @@ def contour_points(
 
 
 class _SignedDistance:
-    """Distance to the surface round some of its points, negative below it.
+    """Distance to the surface around some of its points, negative below it.
 
     A point stands for a disc of its tangent plane that reaches to its neighbours.
     """
@@ -238,9 +234,8 @@ class _SignedDistance:
         self._points, self._normals, self._tree = points, normals, cKDTree(positions)
 
     def __call__(self, positions: Float[Tensor, "place 3"]) -> Float[Tensor, " place"]:
-        _, nearest = self._tree.query(
-            positions.detach().cpu().double().numpy(), workers=num_workers()
-        )
+        asked = positions.detach().cpu().double().numpy()
+        _, nearest = self._tree.query(asked, workers=num_workers())
         index = torch.from_numpy(nearest).to(self._points.device)
         offset, normals = positions - self._points[index], self._normals[index]
         height = (offset * normals).sum(dim=1)
@@ -259,7 +254,7 @@ class _SignedDistance:
 def _depths_in_box(
     hull: Hull, centers: Float[Tensor, "ray 3"], rays: Float[Tensor, "ray 3"]
 ) -> tuple[Float[Tensor, "ray 1"], Float[Tensor, "ray 1"]]:
-    """Return the depths at which rays enter and leave the ball round the hull's grid."""
+    """Return the depths at which rays enter and leave the ball around the hull's grid."""
     corners = hull.corners_world.to(rays)
     centre, radius = corners.mean(dim=0), (corners[1] - corners[0]).norm() / 2
     square = rays.square().sum(dim=1, keepdim=True)
@@ -315,7 +310,7 @@ def ambiguous(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Contours(Record):
-    """Rays that the surface is tangent to, and the hull that it lies in.
+    """Rays that the surface is tangent to, and the hull that it is inside of.
 
     Attributes:
         rays: Through the silhouettes of all reliable views.

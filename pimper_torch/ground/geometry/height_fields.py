@@ -6,14 +6,16 @@ from the first sample's centre is :func:`~pimper_torch.ground.geometry.pixels.in
 already undone. Rasters have at least two samples a side.
 """
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.ground.shapes import Scalars
+from pimper_torch.ground.shapes import PatchMask, PatchRaster, Scalars
+
+PerPatch = Float[Tensor, " patch"]
+Origins = Float[Tensor, "patch 2"]
+PerRay = Float[Tensor, "patch ray"]
 
 # A neighbour that carries less of the blend than this may be invalid: a point that lies on
 # a row of samples must not miss because rounding put it a hair beside the row.
@@ -23,9 +25,9 @@ _NEGLIGIBLE_WEIGHT = 1e-4
 def sample_raster(
     values: Float[Tensor, "patch channel height width"],
     xy: Float[Tensor, "patch ray 2"],
-    origin: Float[Tensor, "patch 2"],
-    spacing: Float[Tensor, " patch"],
-    valid: Bool[Tensor, "patch height width"] | None = None,
+    origin: Origins,
+    spacing: PerPatch,
+    valid: PatchMask | None = None,
 ) -> Float[Tensor, "patch channel ray"]:
     """Look values up between the samples of a template, bilinearly.
 
@@ -57,10 +59,10 @@ def sample_raster(
 
 
 def intersect_height_field(
-    depth: Float[Tensor, "patch height width"],
-    valid: Bool[Tensor, "patch height width"],
-    origin: Float[Tensor, "patch 2"],
-    spacing: Float[Tensor, " patch"],
+    depth: PatchRaster,
+    valid: PatchMask,
+    origin: Origins,
+    spacing: PerPatch,
     ray_origins: Float[Tensor, "patch ray 3"],
     ray_directions: Float[Tensor, "patch ray 3"],
     steps: int = 3,
@@ -90,35 +92,36 @@ def intersect_height_field(
     """
     normal_enough = 1e-3 * ray_directions.norm(dim=-1)
     toward_plane = _away_from_zero(ray_directions[..., 2], normal_enough)
-    grid = _Grid(continued_level(depth, valid).to(ray_origins), origin, spacing)
+    field = continued_level(depth, valid).to(ray_origins), origin, spacing
     rays = (*ray_origins.unbind(dim=-1), *ray_directions.unbind(dim=-1))
     distance = -ray_origins[..., 2] / toward_plane
     with torch.no_grad():
         for _ in range(steps - 1):
-            gap, rate = _gap(grid, rays, distance)
+            gap, rate = _gap(*field, rays, distance)
             distance = distance - gap / _away_from_zero(rate, normal_enough)
     distance = distance.detach()
-    gap, rate = _gap(grid, rays, distance)
+    gap, rate = _gap(*field, rays, distance)
     distance = distance - gap / _away_from_zero(rate.detach(), normal_enough)
     points = ray_origins + distance[..., None] * ray_directions
 
     with torch.no_grad():
-        gap, rate = _gap(grid, rays, distance)
+        gap, rate = _gap(*field, rays, distance)
         neighbours, across, down = _cell(points[..., :2], origin, spacing, depth.shape[-2:])
         known = _gather(valid[:, None], neighbours)[:, 0]
         supported = (_bilinear_weights(across, down) * known).sum(dim=-1)
+        index = (points[..., :2] - origin[:, None]) / spacing[:, None, None]
+        last = index.new_tensor([depth.shape[2] - 1, depth.shape[1] - 1])
+        slack = _NEGLIGIBLE_WEIGHT
         hit = (
-            (supported >= 1 - _NEGLIGIBLE_WEIGHT)
-            & _within(points[..., :2], origin, spacing, depth.shape[-2:])
+            (supported >= 1 - slack)
+            & ((index >= -slack) & (index <= last + slack)).all(dim=-1)
             & (gap.abs() <= 0.02 * spacing[:, None])
             & (rate.abs() > normal_enough)
         )
     return points, hit
 
 
-def continued_level(
-    depth: Float[Tensor, "patch height width"], valid: Bool[Tensor, "patch height width"]
-) -> Float[Tensor, "patch height width"]:
+def continued_level(depth: PatchRaster, valid: PatchMask) -> PatchRaster:
     """Assign invalid samples the mean of the valid ones among their eight neighbours.
 
     Rays that pass over the rim of the height field on their way are then not thrown off by what
@@ -129,42 +132,36 @@ def continued_level(
     return torch.where(valid, depth, _sum_of_nine(known) / count)
 
 
-def _sum_of_nine(
-    raster: Float[Tensor, "patch height width"],
-) -> Float[Tensor, "patch height width"]:
+def _sum_of_nine(raster: PatchRaster) -> PatchRaster:
     """Add up every sample and its eight neighbours; avg_pool2d takes ten times as long."""
     wide = pad(raster, (1, 1, 1, 1))
     columns = wide[:, :, :-2] + wide[:, :, 1:-1] + wide[:, :, 2:]
     return columns[:, :-2] + columns[:, 1:-1] + columns[:, 2:]
 
 
-class _Grid(NamedTuple):
-    """Depth on the samples of a bucket, and where the samples are."""
-
-    depth: Float[Tensor, "patch height width"]
-    origin: Float[Tensor, "patch 2"]
-    spacing: Float[Tensor, " patch"]
-
-
 def _gap(
-    grid: _Grid, rays: tuple[Float[Tensor, "patch ray"], ...], distance: Float[Tensor, "patch ray"]
-) -> tuple[Float[Tensor, "patch ray"], Float[Tensor, "patch ray"]]:
+    depth: PatchRaster,
+    origin: Origins,
+    spacing: PerPatch,
+    rays: tuple[PerRay, ...],
+    distance: PerRay,
+) -> tuple[PerRay, PerRay]:
     """Return the ray's height over the height field along z, and its derivative along the ray.
 
     Args:
-        grid: The height field; every sample has a value.
+        depth: The height field; every sample has a value.
         rays: x, y and z of the rays' origins, and of their directions.
     """
     x, y, z, dx, dy, dz = rays
-    count, height, width = grid.depth.shape
-    per_sample = (1 / grid.spacing)[:, None]
-    column = ((x + distance * dx - grid.origin[:, :1]) * per_sample).clamp(0, width - 1)
-    row = ((y + distance * dy - grid.origin[:, 1:]) * per_sample).clamp(0, height - 1)
+    count, height, width = depth.shape
+    per_sample = (1 / spacing)[:, None]
+    column = ((x + distance * dx - origin[:, :1]) * per_sample).clamp(0, width - 1)
+    row = ((y + distance * dy - origin[:, 1:]) * per_sample).clamp(0, height - 1)
     left = column.detach().floor().clamp_max(width - 2)
     top = row.detach().floor().clamp_max(height - 2)
     across, down = column - left, row - top
     first = (top * width + left).long()
-    raster = grid.depth.reshape(count, -1)
+    raster = depth.reshape(count, -1)
     top_left, top_right = raster.gather(1, first), raster.gather(1, first + 1)
     low_left, low_right = raster.gather(1, first + width), raster.gather(1, first + width + 1)
     slope_x = torch.lerp(top_right - top_left, low_right - low_left, down)
@@ -176,12 +173,9 @@ def _gap(
 
 
 def _cell(
-    xy: Float[Tensor, "patch ray 2"],
-    origin: Float[Tensor, "patch 2"],
-    spacing: Float[Tensor, " patch"],
-    size: torch.Size,
-) -> tuple[Int[Tensor, "patch ray 4"], Float[Tensor, "patch ray"], Float[Tensor, "patch ray"]]:
-    """Return the four samples round each point, and its place between them in [0, 1]."""
+    xy: Float[Tensor, "patch ray 2"], origin: Origins, spacing: PerPatch, size: torch.Size
+) -> tuple[Int[Tensor, "patch ray 4"], PerRay, PerRay]:
+    """Return the four samples around each point, and its place between them in [0, 1]."""
     height, width = size
     index = (xy - origin[:, None]) / spacing[:, None, None]
     column = index[..., 0].clamp(0, width - 1)
@@ -208,22 +202,7 @@ def _gather(
     return raster.flatten(2).gather(2, where).reshape(*raster.shape[:2], *neighbours.shape[1:])
 
 
-def _within(
-    xy: Float[Tensor, "patch ray 2"],
-    origin: Float[Tensor, "patch 2"],
-    spacing: Float[Tensor, " patch"],
-    size: torch.Size,
-) -> Bool[Tensor, "patch ray"]:
-    height, width = size
-    index = (xy - origin[:, None]) / spacing[:, None, None]
-    last = index.new_tensor([width - 1, height - 1])
-    slack = _NEGLIGIBLE_WEIGHT
-    return ((index >= -slack) & (index <= last + slack)).all(dim=-1)
-
-
-def _away_from_zero(
-    value: Float[Tensor, "patch ray"], least: Float[Tensor, "patch ray"]
-) -> Float[Tensor, "patch ray"]:
+def _away_from_zero(value: PerRay, least: PerRay) -> PerRay:
     """Keep a divisor's sign but not a size below ``least``; 1 for a ray without direction."""
     sign = torch.where(value < 0, -1.0, 1.0).to(value)
     pushed = torch.where(value.abs() < least, sign * least, value)

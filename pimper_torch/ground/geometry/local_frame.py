@@ -7,18 +7,16 @@ hundredths. A scene's own frame has its origin among what is photographed.
 import math
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.ground.shapes import Points
+from pimper_torch.ground.shapes import Points, Poses
 
 Offset = tuple[float, float, float]
 
 NO_OFFSET: Offset = (0.0, 0.0, 0.0)
 
 
-def local_origin(cam_from_world: Float[Tensor, "view 4 4"], points_world: Points) -> Offset:
+def local_origin(cam_from_world: Poses, points_world: Points) -> Offset:
     """Choose the origin of a scene's own frame, a round number; zero where its own will do.
 
     It is the median of the cloud, or of the cameras where there is none, so that points far out
@@ -51,17 +49,13 @@ def local_origin(cam_from_world: Float[Tensor, "view 4 4"], points_world: Points
     return x, y, z
 
 
-def to_local(
-    cam_from_world: Float[Tensor, "view 4 4"], offset: Offset
-) -> Float[Tensor, "view 4 4"]:
+def to_local(cam_from_world: Poses, offset: Offset) -> Poses:
     """Return the poses that see points of which ``offset`` was subtracted; differentiable."""
     rotation, translation = cam_from_world[:, :3, :3], cam_from_world[:, :3, 3]
     return rigid(rotation, translation + rotation @ rotation.new_tensor(offset))
 
 
-def from_local(
-    cam_from_local: Float[Tensor, "view 4 4"], offset: Offset
-) -> Float[Tensor, "view 4 4"]:
+def from_local(cam_from_local: Poses, offset: Offset) -> Poses:
     """Undo :func:`to_local`, in float64.
 
     Rotations are made exact first: those of single precision would carry their rounding times the

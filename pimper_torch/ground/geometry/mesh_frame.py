@@ -41,8 +41,8 @@ def compare_with_scene(
 ) -> dict[str, int | float]:
     """Compare a mesh with the points and masks of a scene; warn of one that is far off.
 
-    A point that a camera saw lies neither behind the mesh nor before it: rays to observed points
-    meet the mesh at the point, or nowhere, as those to the background do.
+    A point that a camera saw lies neither behind the mesh nor in front of it: rays to observed
+    points meet the mesh at the point, or nowhere, as those to the background do.
 
     Args:
         silhouettes: Compared too where they are masks that came with the photographs.
@@ -53,7 +53,7 @@ def compare_with_scene(
     """
     fit = _fit(mesh, _rays(scene, silhouettes))
     frame = "in the frame of the cameras, with their axes and their unit"
-    # The box round an object is off by less than a tenth of its diagonal.
+    # The box around an object is off by less than a tenth of its diagonal.
     if fit.score < 0.1 and not fit.distance < 0.1:
         raise InputError(
             f"The given mesh is not where the photographs show the object: {fit.told()}. It has to "
@@ -148,11 +148,8 @@ def _fit(mesh: Mesh, rays: _Rays) -> _Fit:
     met, length = cast.face >= 0, rays.directions.norm(dim=1)
     # Nothing is near in a mesh that the cameras are inside of.
     near = (cast.distance.double() - 1).abs() * length <= _NEAR * length.clamp_max(diagonal)
-    reached, shown, inside = (
-        met[: rays.num_points],
-        met[rays.num_points :],
-        rays.inside[rays.num_points :],
-    )
+    reached, shown = met[: rays.num_points], met[rays.num_points :]
+    inside = rays.inside[rays.num_points :]
     hits = int(reached.sum())
     distance = on_mesh = overlap = math.nan
     if hits:
@@ -187,9 +184,8 @@ def _rays(scene: SparseScene, silhouettes: Silhouettes) -> _Rays:
         step = -(-max(width, height) // _SIDE)
         raster = slice(step // 2, None, step)
         mask = masks[number, :height, :width][raster, raster].flatten()
-        if (
-            bool(silhouettes.reliable[number]) and float(mask.float().mean()) <= 0.95
-        ):  # else no silhouette
+        # A mask of nearly everything shows no silhouette.
+        if bool(silhouettes.reliable[number]) and float(mask.float().mean()) <= 0.95:
             pose, K = poses[number].double(), cameras.intrinsics[number].detach().double()
             pixels = pixel_centers(width, height, like=pose)[raster, raster].reshape(-1, 2)
             rays = rays_through(pixels, pose, K)

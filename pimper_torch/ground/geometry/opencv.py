@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from pimper_torch.ground.shapes import Map, Mask, Matrix3, Pixels
@@ -97,9 +97,9 @@ def grab_cut(
     if not seeded.any() or seeded.all():
         return seeded
     cv2.setRNGSeed(0)
-    top, left = (int(side.nonzero()[0, 0]) for side in _open_sides(labels))
-    bottom, right = (int(side.nonzero()[-1, 0]) + 1 for side in _open_sides(labels))
-    window = slice(max(0, top - 8), bottom + 8), slice(max(0, left - 8), right + 8)
+    other = labels != BACKGROUND
+    sides = (other.any(dim=1).nonzero(), other.any(dim=0).nonzero())
+    window = tuple(slice(max(0, int(side[0]) - 8), int(side[-1]) + 9) for side in sides)
     drawn = labels[window].contiguous().numpy().copy()
     models = np.zeros((1, 65)), np.zeros((1, 65))
     pixels = colours[window].contiguous().numpy()
@@ -107,14 +107,6 @@ def grab_cut(
     found = torch.zeros_like(seeded)
     found[window] = torch.from_numpy((drawn & 1) > 0)
     return found
-
-
-def _open_sides(
-    labels: UInt8[Tensor, "height width"],
-) -> tuple[Bool[Tensor, " height"], Bool[Tensor, " width"]]:
-    """Find rows and columns with anything but certain background."""
-    other = labels != BACKGROUND
-    return other.any(dim=1), other.any(dim=0)
 
 
 def opened(mask: Mask, radius_px: int) -> Mask:
@@ -128,7 +120,7 @@ def closed(mask: Mask, radius_px: int) -> Mask:
 
 
 def dilated(layer: Map, reach_px: int) -> Map:
-    """Return the largest value of the square round each pixel that reaches so far."""
+    """Return the largest value of the square around each pixel that reaches so far."""
     return torch.from_numpy(cv2.dilate(layer.numpy(), np.ones((2 * reach_px + 1,) * 2)))
 
 

@@ -6,14 +6,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.ground.shapes import Poses, ViewVectors
 from pimper_torch.records import Cameras
 
 
 def look_at(
-    eyes_world: Float[Tensor, "view 3"],
-    target_world: Float[Tensor, " 3"],
-    up_world: Float[Tensor, " 3"],
-) -> Float[Tensor, "view 4 4"]:
+    eyes_world: ViewVectors, target_world: Float[Tensor, " 3"], up_world: Float[Tensor, " 3"]
+) -> Poses:
     """Return ``cam_from_world`` of cameras that look at one point and are held upright."""
     forward = normalize(target_world - eyes_world, dim=-1)
     right = normalize(torch.linalg.cross(forward, up_world.expand_as(forward)), dim=-1)
@@ -22,9 +21,7 @@ def look_at(
     return rigid(rotation, -(rotation @ eyes_world[..., None])[..., 0])
 
 
-def pinholes(
-    cam_from_world: Float[Tensor, "view 4 4"], focal_px: float, width: int, height: int
-) -> Cameras:
+def pinholes(cam_from_world: Poses, focal_px: float, width: int, height: int) -> Cameras:
     """Return cameras of one focal length whose axis meets the centre of the image."""
     K = cam_from_world.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
     num_views = len(cam_from_world)

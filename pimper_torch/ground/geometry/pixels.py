@@ -18,10 +18,11 @@ from torch import Tensor
 
 from pimper_torch.ground.shapes import Vectors
 
+Matrices3 = Float[Tensor, "*batch 3 3"]
+Pairs = Float[Tensor, "*batch 2"]
 
-def grid_from_pixels(
-    pixels: Float[Tensor, "*batch 2"], width: int, height: int
-) -> Float[Tensor, "*batch 2"]:
+
+def grid_from_pixels(pixels: Pairs, width: int, height: int) -> Pairs:
     """Turn pixels into the coordinates ``grid_sample(..., align_corners=False)`` expects.
 
     >>> grid_from_pixels(torch.tensor([0.5, 0.5]), width=4, height=2)
@@ -30,17 +31,17 @@ def grid_from_pixels(
     return 2 * pixels / pixels.new_tensor([width, height]) - 1
 
 
-def indices_from_pixels(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+def indices_from_pixels(pixels: Pairs) -> Pairs:
     """Count from the centre of the top-left pixel instead of its corner."""
     return pixels - 0.5
 
 
-def pixels_from_indices(indices: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
+def pixels_from_indices(indices: Pairs) -> Pairs:
     """Count from the corner of the top-left pixel instead of its centre."""
     return indices + 0.5
 
 
-def homogeneous(pixels: Float[Tensor, "*batch 2"]) -> Vectors:
+def homogeneous(pixels: Pairs) -> Vectors:
     """Append 1 to pixels, as homographies and epipolar geometries take them; differentiable."""
     return torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
 
@@ -54,18 +55,14 @@ def pixel_centers(
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
 
 
-def crop_intrinsics(
-    intrinsics: Float[Tensor, "*batch 3 3"], left: float, top: float
-) -> Float[Tensor, "*batch 3 3"]:
+def crop_intrinsics(intrinsics: Matrices3, left: float, top: float) -> Matrices3:
     """Follow a cut of the image: pixels count from its corner, ``(left, top)`` of before."""
     moved = torch.zeros_like(intrinsics)
     moved[..., 0, 2], moved[..., 1, 2] = left, top
     return intrinsics - moved
 
 
-def scale_intrinsics(
-    intrinsics: Float[Tensor, "*batch 3 3"], factor_u: float, factor_v: float
-) -> Float[Tensor, "*batch 3 3"]:
+def scale_intrinsics(intrinsics: Matrices3, factor_u: float, factor_v: float) -> Matrices3:
     """Follow a resize of the image; corners stay corners, so no half-pixel shift arises."""
     scale = intrinsics.new_tensor([factor_u, factor_v, 1.0])
     return scale[:, None] * intrinsics

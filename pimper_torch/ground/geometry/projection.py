@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.pixels import homogeneous
 from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.ground.shapes import Points
+from pimper_torch.ground.shapes import Points, ViewVectors
 from pimper_torch.records import Cameras
 
 _POINTS = 2048  # at once: 72 MB of angles between the rays of 66 views
@@ -63,9 +63,7 @@ def triangulate_rays(
 
 
 def triangulation_angles(
-    points_world: Points,
-    observed: Bool[Tensor, "point view"],
-    centers_world: Float[Tensor, "view 3"],
+    points_world: Points, observed: Bool[Tensor, "point view"], centers_world: ViewVectors
 ) -> Float[Tensor, " point"]:
     """Return each point's widest angle between two rays that saw it, in radians; 0 without two."""
     count = observed.sum(dim=1)

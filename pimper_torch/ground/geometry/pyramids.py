@@ -17,6 +17,7 @@ from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.ground.kernels.arrays import as_array
 from pimper_torch.ground.kernels.signatures import FractionRows, PictureRows, Projection, Samples
 from pimper_torch.ground.radiometry import SATURATED
+from pimper_torch.ground.shapes import PatchRaster, PatchVectors
 from pimper_torch.records import (
     AlbedoPrior,
     Cameras,
@@ -49,9 +50,7 @@ def halve(images: Float[Tensor, "view channels _ _"]) -> Float[Tensor, "view cha
     return planes.reshape(*images.shape[:-2], height // 2, width // 2)
 
 
-def pyramid_level(
-    pixels: Float[Tensor, "patch height width 2"],
-) -> Float[Tensor, "patch height width"]:
+def pyramid_level(pixels: Float[Tensor, "patch height width 2"]) -> PatchRaster:
     """Choose the pyramid level at which neighbouring samples are a pixel apart.
 
     The footprint is the square root of the area of a sample's parallelogram in the image:
@@ -224,7 +223,7 @@ def centers_in_patches(
 def kernel_geometry(
     rows: Int[Tensor, " view"],
     templates: Templates,
-    outward: Float[Tensor, "patch height width 3"],
+    outward: PatchVectors,
     projections: Float[Tensor, "patch view 3 4"],
     centers: Float[Tensor, "patch view 3"],
 ) -> tuple[Projection, Samples]:

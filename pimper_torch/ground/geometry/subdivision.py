@@ -19,8 +19,10 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.ground.shapes import Faces, PerVertex, Points, Vertices
+from pimper_torch.ground.shapes import Faces, Facets, PerFacet, PerVertex, Points, Vertices
 from pimper_torch.records import Record
+
+Corners = Float[Tensor, "corner 3"]  # vertices of the coarse mesh
 
 # Vertices that a value is blended from, as many as a face has; and a distance, scene units, at
 # which one counts alone.
@@ -44,10 +46,10 @@ class Subdivision(Record):
     barycentric: Vertices
     faces: Faces
     face_facet: Int[Tensor, " face"]
-    spacing: Float[Tensor, " facet"]
+    spacing: PerFacet
 
     def interpolate(
-        self, per_corner: Float[Tensor, "corner channel"], facets: Int[Tensor, "facet 3"]
+        self, per_corner: Float[Tensor, "corner channel"], facets: Facets
     ) -> Float[Tensor, "vertex channel"]:
         """Blend what is known at the coarse mesh's vertices; continuous across its edges.
 
@@ -58,11 +60,7 @@ class Subdivision(Record):
         return (self.barycentric[..., None] * corners).sum(dim=1)
 
 
-def subdivide(
-    vertices: Float[Tensor, "corner 3"],
-    facets: Int[Tensor, "facet 3"],
-    spacing: Float[Tensor, " facet"],
-) -> Subdivision:
+def subdivide(vertices: Corners, facets: Facets, spacing: PerFacet) -> Subdivision:
     """Subdivide a triangle mesh into pieces of about ``spacing``.
 
     Args:
@@ -150,12 +148,7 @@ class _Cuts:
         return torch.where(name == low, 0, torch.where(name == high, pieces, cut))
 
 
-def _assemble(
-    vertices: Float[Tensor, "corner 3"],
-    facets: Int[Tensor, "facet 3"],
-    cuts: _Cuts,
-    spacing: Float[Tensor, " facet"],
-) -> Subdivision:
+def _assemble(vertices: Corners, facets: Facets, cuts: _Cuts, spacing: PerFacet) -> Subdivision:
     """Lay the subdivided meshes of all facets, like sizes together, and number their points."""
     sizes = cuts.size
     inner_start = cuts.first_inner + _starts((sizes - 1) * (sizes - 2) // 2)
@@ -218,11 +211,11 @@ def _fanned(
 
 
 def _pieces(
-    vertices: Float[Tensor, "corner 3"],
-    facets: Int[Tensor, "facet 3"],
+    vertices: Corners,
+    facets: Facets,
     edges: Int[Tensor, "edge 2"],
     facet_edges: Int[Tensor, "facet 3"],
-    spacing: Float[Tensor, " facet"],
+    spacing: PerFacet,
 ) -> Int[Tensor, "facet 3"]:
     ends = vertices[edges]
     length = (ends[:, 1] - ends[:, 0]).norm(dim=-1)

@@ -28,7 +28,8 @@ def unit_face_normals(vertices: Vertices, faces: Faces) -> Float[Tensor, "face 3
     """Return outward unit normals, whatever the unit of length; zero for a face without area."""
     a, b, c = vertices[faces].unbind(dim=1)
     ab, ac = b - a, c - a
-    longest = torch.stack([ab, ac]).detach().abs().amax(dim=(0, 2)).clamp_min(_least(vertices))
+    longest = torch.stack([ab, ac]).detach().abs().amax(dim=(0, 2))
+    longest = longest.clamp_min(torch.finfo(vertices.dtype).tiny)
     ab, ac = ab / longest[:, None], ac / longest[:, None]
     return normalize(torch.linalg.cross(ab, ac), dim=1)
 
@@ -39,10 +40,11 @@ def side_lengths(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"
 
 
 def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
-    """Average the face normals round each vertex by area; unit."""
+    """Average the face normals around each vertex by area; unit."""
     per_face = face_normals(vertices, faces)
     if len(per_face):  # areas in a large unit are too small for a length to be divided by
-        per_face = per_face / per_face.detach().abs().amax().clamp_min(_least(per_face))
+        largest = per_face.detach().abs().amax()
+        per_face = per_face / largest.clamp_min(torch.finfo(per_face.dtype).tiny)
     total = torch.zeros_like(vertices)
     for corner in range(3):
         total = total.index_add(0, faces[:, corner], per_face)
@@ -87,7 +89,3 @@ def barycentric(
     gamma = (torch.linalg.cross(b - a, points - a) * normal).sum(dim=1) / square
     found = torch.stack([1 - beta - gamma, beta, gamma], dim=1)
     return torch.where(flat[:, None], found.new_tensor([1.0, 0.0, 0.0]), found)
-
-
-def _least(values: Tensor) -> float:
-    return torch.finfo(values.dtype).tiny

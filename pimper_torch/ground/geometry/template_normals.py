@@ -1,31 +1,25 @@
 """Normals of templates: of the surface that they carry, or of the mesh."""
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.ground.shapes import Vectors
+from pimper_torch.ground.shapes import PatchVectors, Vectors
 from pimper_torch.records import CoarseMesh, Templates
 
 # Cosine to the viewer that every normal keeps at least. A choice: 87 degrees.
 MIN_FACING = 0.05
 
 
-def transferred_normals(
-    coarse: CoarseMesh, templates: Templates
-) -> Float[Tensor, "patch height width 3"]:
+def transferred_normals(coarse: CoarseMesh, templates: Templates) -> PatchVectors:
     """Return the normals of a template, patch frame: of its surface, or else of the mesh."""
     if templates.normals_patch is None:
         return coarse_normals(coarse, templates)
     return facing_viewer(templates.normals_patch)
 
 
-def coarse_normals(
-    coarse: CoarseMesh, templates: Templates
-) -> Float[Tensor, "patch height width 3"]:
+def coarse_normals(coarse: CoarseMesh, templates: Templates) -> PatchVectors:
     """Blend the mesh's smoothed vertex normals over every template, patch frame.
 
     Outside the facet barycentric coordinates are clamped to it, as the blend would

@@ -22,6 +22,8 @@ from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.shapes import Faces, Scalars, Vectors, Vertices
 from pimper_torch.records import Cameras, Mesh, Record
 
+Places = Float[Tensor, "*#batch 3"]
+Lengths = Float[Tensor, "*#batch"]
 Rows = NDArray[np.float32]
 
 
@@ -47,11 +49,7 @@ class Hits(Record):
         return torch.where((self.face >= 0)[..., None], blended, 0)
 
     def refined(
-        self,
-        vertices: Vertices,
-        faces: Faces,
-        origins: Float[Tensor, "*#batch 3"],
-        directions: Vectors,
+        self, vertices: Vertices, faces: Faces, origins: Places, directions: Vectors
     ) -> "Hits":
         """Meet the planes of the same faces again, in the dtype of the rays and with gradients.
 
@@ -69,11 +67,10 @@ class Hits(Record):
         area = torch.where(sound, normal.square().sum(dim=-1), 1)
         v = (torch.linalg.cross(along, other) * normal).sum(dim=-1) / area
         w = (torch.linalg.cross(one, along) * normal).sum(dim=-1) / area
+        barycentric = torch.stack([1 - v - w, v, w], dim=-1)
         return self.replace(
             distance=torch.where(sound, distance, self.distance),
-            barycentric=torch.where(
-                sound[..., None], torch.stack([1 - v - w, v, w], dim=-1), self.barycentric
-            ),
+            barycentric=torch.where(sound[..., None], barycentric, self.barycentric),
         )
 
 
@@ -94,12 +91,7 @@ class RayCaster:
         # The first ray builds the tree, and threads must not do so together.
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
-    def cast(
-        self,
-        origins: Float[Tensor, "*#batch 3"],
-        directions: Vectors,
-        reach: Float[Tensor, "*#batch"] | None = None,
-    ) -> Hits:
+    def cast(self, origins: Places, directions: Vectors, reach: Lengths | None = None) -> Hits:
         """Find the first face each ray meets.
 
         Args:
@@ -122,14 +114,11 @@ class RayCaster:
     def _near(self, points: Vectors) -> Vectors:
         return points if self._origin is None else points - self._origin.to(points)
 
-    def _rays(self, origins: Float[Tensor, "*#batch 3"], directions: Vectors) -> tuple[Rows, Rows]:
+    def _rays(self, origins: Places, directions: Vectors) -> tuple[Rows, Rows]:
         return _as_rows(self._near(origins).expand_as(directions)), _as_rows(directions)
 
     def occluded(
-        self,
-        points: Vectors,
-        center: Float[Tensor, " 3"],
-        tolerance: float | Float[Tensor, "*#batch"],
+        self, points: Vectors, center: Float[Tensor, " 3"], tolerance: float | Lengths
     ) -> Bool[Tensor, "*batch"]:
         """Return whether the mesh hides points from a camera.
 
@@ -143,10 +132,7 @@ class RayCaster:
         return hits.distance < length - tolerance
 
     def blocked(
-        self,
-        origins: Float[Tensor, "*#batch 3"],
-        directions: Vectors,
-        reach: Float[Tensor, "*#batch"],
+        self, origins: Places, directions: Vectors, reach: Lengths
     ) -> Bool[Tensor, "*batch"]:
         """Return whether a ray meets any face at all; several times as fast as its first one.
 
@@ -191,9 +177,8 @@ def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
     """
     width, height = (int(side) for side in cameras.sizes_px[view])
     pixels = pixel_centers(width, height, like=cameras.intrinsics)
-    rays = rays_through(
-        pixels.reshape(-1, 2), cameras.cam_from_world[view], cameras.intrinsics[view]
-    ).reshape(height, width, 3)
+    pose, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
+    rays = rays_through(pixels.reshape(-1, 2), pose, intrinsics).reshape(height, width, 3)
     caster = ray_caster(mesh) if isinstance(mesh, Mesh) else mesh
     return caster.cast(cameras.centers_world[view], rays)
 
@@ -208,7 +193,7 @@ def _origin(vertices: Vertices) -> Float[Tensor, "3"] | None:
     return middle if bool(middle.norm() > 16.0 * (high - low).norm()) else None
 
 
-def _reaches(reach: Float[Tensor, "*#batch"], shape: torch.Size) -> Rows:
+def _reaches(reach: Lengths, shape: torch.Size) -> Rows:
     far = reach.detach().expand(shape).reshape(-1).to("cpu", torch.float32)
     # embree's own word for infinity
     return far.clamp(0, 1e37).contiguous().numpy()

@@ -92,9 +92,8 @@ class Hull(Record):
             padding_mode="border",
             align_corners=True,
         )
-        return value.reshape(points_world.shape[:-1]).to(within) - (points_world - within).norm(
-            dim=-1
-        )
+        off_grid = (points_world - within).norm(dim=-1)
+        return value.reshape(points_world.shape[:-1]).to(within) - off_grid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -192,8 +191,13 @@ def visual_hull(
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
     inside, hard = silhouettes.inside, silhouettes.source == "masks"
 
-    def framed(view: int) -> Float[Tensor, "layer high wide"]:
-        return _framed(inside[view], hard, cameras.sizes_px[view].tolist())
+    def framed(view: int) -> Float[Tensor, "layer high_and_2 wide_and_2"]:
+        """Measure distances to the silhouette; unless it is a mask, with what pixels count."""
+        width, height = cameras.sizes_px[view].tolist()
+        shown = inside[view, :height, :width]
+        known = signed_distance(shown > 0.5).masked_fill(shown == 0.5, _UNSEEN)
+        found = [known] if hard else [known, torch.where(shown > 0.5, 1, 1 - 2 * shown)]
+        return torch.stack([pad(one, (1, 1, 1, 1), value=_UNSEEN) for one in found])
 
     layers = 1 if hard else 2
     sizes = [(layers, high + 2, wide + 2) for wide, high in cameras.sizes_px[views].tolist()]
@@ -264,17 +268,6 @@ def _deepest(
         depth[some], best = depths[0, 0, 0].max(dim=1)
         place[some] = along.gather(1, best[:, None])[:, 0].clamp_min(float(hull.spacing))
     return depth, place
-
-
-def _framed(
-    inside: Map, hard: bool, size_px: list[int]
-) -> Float[Tensor, "layer high_and_2 wide_and_2"]:
-    """Measure distances to the silhouette; unless it is a mask, with what pixels count."""
-    width, height = size_px
-    inside = inside[:height, :width]
-    known = signed_distance(inside > 0.5).masked_fill(inside == 0.5, _UNSEEN)
-    layers = [known] if hard else [known, torch.where(inside > 0.5, 1, 1 - 2 * inside)]
-    return torch.stack([pad(one, (1, 1, 1, 1), value=_UNSEEN) for one in layers])
 
 
 def _voted(

@@ -10,22 +10,20 @@ what is known from elsewhere.
 """
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from pimper_torch.ground.geometry.topology import boundary_vertices, vertex_components
 from pimper_torch.ground.linalg.sums import average, total
 from pimper_torch.ground.linalg.systems import solutions
-from pimper_torch.ground.shapes import Faces, PerVertex, VertexMask
+from pimper_torch.ground.shapes import Edges, Faces, PerVertex, VertexMask, VertexValues
 
 
 def continued(
-    values: Float[Tensor, "vertex channel"],
+    values: VertexValues,
     known: VertexMask,
-    edges: Int[Tensor, "edge 2"],
-    otherwise: Float[Tensor, "vertex channel"],
+    edges: Edges,
+    otherwise: VertexValues,
     damping: PerVertex,
-) -> Float[Tensor, "vertex channel"]:
+) -> VertexValues:
     """Continue values smoothly from where they are known.
 
     Args:
@@ -65,9 +63,7 @@ def continued(
     return values.index_copy(0, unknown, found.to(values))
 
 
-def about_mean(
-    values: Float[Tensor, "vertex channel"], known: VertexMask, edges: Int[Tensor, "edge 2"]
-) -> Float[Tensor, "vertex channel"]:
+def about_mean(values: VertexValues, known: VertexMask, edges: Edges) -> VertexValues:
     """Continue values from where they are known; far from there, they are the mean of these.
 
     Both variances are those of the known values. If none is known, ``values`` are returned.

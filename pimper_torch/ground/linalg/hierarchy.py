@@ -13,12 +13,8 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from pimper_torch.ground.kernels.arrays import as_array
-from pimper_torch.ground.linalg.aggregation import (
-    coarser,
-    dominant_diagonal,
-    parts_of,
-    prolongation,
-)
+from pimper_torch.ground.linalg import aggregation
+from pimper_torch.ground.shapes import Sides
 from pimper_torch.runtime.parallel import on_one_thread, over_rows
 
 # Up to so many unknowns, the coarsest level is solved by a dense inverse: a choice.
@@ -52,17 +48,13 @@ class Level:
         restrict: csr_array | None,
         dtype: torch.dtype,
     ) -> None:
-        inverse = torch.from_numpy(1 / dominant_diagonal(matrix)).to(dtype).numpy()
+        inverse = torch.from_numpy(1 / aggregation.dominant_diagonal(matrix)).to(dtype).numpy()
         self._matrix, self._inverse_diagonal = _rounded(matrix, inverse.dtype), inverse
         self._prolong = None if prolong is None else _rounded(prolong, inverse.dtype)
         self._restrict = None if restrict is None else _rounded(restrict, inverse.dtype)
         self._vectors: dict[str, Tensor] = {}
 
-    def smoothed(
-        self,
-        residual: Float[Tensor, "unknown side"],
-        start: Float[Tensor, "unknown side"] | None = None,
-    ) -> Float[Tensor, "unknown side"]:
+    def smoothed(self, residual: Sides, start: Sides | None = None) -> Sides:
         """Take two Chebyshev steps of Jacobi's iteration towards A x = residual."""
         from pimper_torch.ground.kernels import sparse_products
 
@@ -75,21 +67,11 @@ class Level:
         over_rows(sparse_products.scaled, size, diagonal, left, as_array(step), 1 / _CENTER)
         vectors = [as_array(each) for each in (step, step if start is None else start, found)]
         of_step = _OF_STEP - 1 if start is None else _OF_STEP
-        over_rows(
-            sparse_products.corrected,
-            size,
-            *parts_of(self._matrix),
-            diagonal,
-            left,
-            *vectors,
-            of_step,
-            _OF_CORRECTION,
-        )
+        arrays = *aggregation.parts_of(self._matrix), diagonal, left, *vectors
+        over_rows(sparse_products.corrected, size, *arrays, of_step, _OF_CORRECTION)
         return found
 
-    def coarse_residual(
-        self, residual: Float[Tensor, "unknown side"], found: Float[Tensor, "unknown side"]
-    ) -> Float[Tensor, "coarse side"]:
+    def coarse_residual(self, residual: Sides, found: Sides) -> Float[Tensor, "coarse side"]:
         """Return the restricted residual of a solution."""
         assert self._restrict is not None
         remaining = self._buffer("left", residual)
@@ -97,9 +79,7 @@ class Level:
         coarse = self._buffer("coarse", residual, self._restrict.shape[0])
         return with_product(self._restrict, remaining, found=coarse)
 
-    def add_coarse(
-        self, found: Float[Tensor, "unknown side"], coarse: Float[Tensor, "coarse side"]
-    ) -> None:
+    def add_coarse(self, found: Sides, coarse: Float[Tensor, "coarse side"]) -> None:
         """Add the prolonged correction of the next level."""
         assert self._prolong is not None
         with_product(self._prolong, coarse, found, keep=1.0, found=found)
@@ -126,24 +106,22 @@ class Hierarchy:
         self.dtype = dtype
         self._levels: list[Level] = []
         while True:
-            prolong = prolongation(matrix) if matrix.shape[0] > _DENSE else None
+            prolong = aggregation.prolongation(matrix) if matrix.shape[0] > _DENSE else None
             if prolong is not None and not 0 < prolong.shape[1] < 0.8 * matrix.shape[0]:
                 prolong = None
             restrict = None if prolong is None else prolong.T.tocsr()
             self._levels.append(Level(matrix, prolong, restrict, dtype))
             if prolong is None or restrict is None:
                 break
-            matrix = coarser(matrix, prolong, restrict)
+            matrix = aggregation.coarser(matrix, prolong, restrict)
         small = matrix.shape[0] <= _DENSE
         self._coarsest = _dense_inverse(matrix).to(dtype) if small else None
 
-    def cycle(self, residual: Float[Tensor, "unknown side"]) -> Float[Tensor, "unknown side"]:
+    def cycle(self, residual: Sides) -> Sides:
         """Apply the approximate inverse; the next cycle may overwrite the result."""
         return self._cycle(0, residual)
 
-    def _cycle(
-        self, depth: int, residual: Float[Tensor, "unknown side"]
-    ) -> Float[Tensor, "unknown side"]:
+    def _cycle(self, depth: int, residual: Sides) -> Sides:
         level = self._levels[depth]
         if depth + 1 == len(self._levels):
             if self._coarsest is not None:
@@ -170,7 +148,8 @@ def with_product(
     if found is None:
         found = vectors.new_empty(matrix.shape[0], *vectors.shape[1:])
     columns = [as_array(each) for each in (vectors, found if start is None else start, found)]
-    over_rows(sparse_products.product, len(found), *parts_of(matrix), *columns, keep, gain)
+    arrays = *aggregation.parts_of(matrix), *columns
+    over_rows(sparse_products.product, len(found), *arrays, keep, gain)
     return found
 
 

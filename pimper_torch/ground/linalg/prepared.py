@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
 
+from pimper_torch.ground.shapes import PerEntry, Unknowns
 from pimper_torch.runtime.errors import NumericalError
 
 # Maximum residual of a solution, with the diagonal scaled to 1, relative to the right-hand side: a
@@ -20,9 +21,7 @@ class SingularSystemError(NumericalError):
     """Linear equations that do not determine their unknowns."""
 
 
-def refuse_hopeless(
-    entries: Float[Tensor, " entry"], diagonal: Float[Tensor, " unknown"], what: str
-) -> None:
+def refuse_hopeless(entries: PerEntry, diagonal: Float[Tensor, " unknown"], what: str) -> None:
     """Refuse entries that are not finite and unknowns without a positive diagonal."""
     if not bool(entries.isfinite().all()):
         raise SingularSystemError(
@@ -62,7 +61,7 @@ class PreparedMatrix(ABC):
         self,
         rows: Int[Tensor, " entry"],
         cols: Int[Tensor, " entry"],
-        values: Float[Tensor, " entry"],
+        values: PerEntry,
         size: int,
         what: str = "the linear system",
         tolerance: float = DEFAULT_TOLERANCE,
@@ -81,7 +80,7 @@ class PreparedMatrix(ABC):
     def _prepare(self, tolerance: float) -> None:
         """Do once what all solves need."""
 
-    def solve(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+    def solve(self, rhs: Unknowns) -> Unknowns:
         """Solve for one right-hand side or several at once.
 
         Differentiable in ``rhs`` and in the matrix's ``values``, any number of times, by adjoint
@@ -96,27 +95,20 @@ class PreparedMatrix(ABC):
         return solution
 
     @abstractmethod
-    def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+    def solve_values(self, rhs: Unknowns) -> Unknowns:
         """Solve, constant to autograd, in device and dtype of rhs; see :meth:`solve` for errors."""
 
 
 class _Solve(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        prepared: PreparedMatrix,
-        values: Float[Tensor, " entry"],
-        rhs: Float[Tensor, "unknown ..."],
-    ) -> Float[Tensor, "unknown ..."]:
+    def forward(ctx: Any, prepared: PreparedMatrix, values: PerEntry, rhs: Unknowns) -> Unknowns:
         solution = prepared.solve_values(rhs.detach())
         ctx.prepared = prepared
         ctx.save_for_backward(values, solution)
         return solution
 
     @staticmethod
-    def backward(
-        ctx: Any, upstream: Float[Tensor, "unknown ..."]
-    ) -> tuple[None, Float[Tensor, " entry"] | None, Float[Tensor, "unknown ..."]]:
+    def backward(ctx: Any, upstream: Unknowns) -> tuple[None, PerEntry | None, Unknowns]:
         values, solution = ctx.saved_tensors
         prepared: PreparedMatrix = ctx.prepared
         adjoint: Tensor = _Solve.apply(prepared, values, upstream)  # type: ignore[no-untyped-call]

@@ -9,22 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.ground.kernels.twin_constants import (
-    CAUCHY,
-    GAUSSIAN_SCALE,
-    GEMAN_MCCLURE,
-    GEMAN_MCCLURE_TUNING,
-    HUBER,
-    HUBER_TUNING,
-    LONGEST_NEWTON_STEP,
-    NEWTON_STEPS,
-    SQUARES,
-)
+from pimper_torch.ground.kernels import twin_constants
 from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING as CAUCHY_TUNING
 from pimper_torch.ground.linalg.sums import along_last
 from pimper_torch.ground.shapes import Scalars
 from pimper_torch.runtime.config import Range, require_ranges
 
+Items = Float[Tensor, "*batch item"]
+Seen = Bool[Tensor, "*batch item"]
 Scale = Annotated[float, Range(above=0, most=1e12)]
 
 
@@ -70,7 +62,7 @@ class Loss(ABC):
 class Squares(Loss):
     r"""Plain least squares, :math:`\rho = u`."""
 
-    code: ClassVar[int | None] = SQUARES
+    code: ClassVar[int | None] = twin_constants.SQUARES
     scale: Scale = 1.0
 
     def rho(self, square: Scalars) -> Scalars:
@@ -86,7 +78,7 @@ class Squares(Loss):
 class Cauchy(Loss):
     r"""Cauchy's loss, :math:`\rho = \log(1 + u)`: outliers keep a small influence."""
 
-    code: ClassVar[int | None] = CAUCHY
+    code: ClassVar[int | None] = twin_constants.CAUCHY
     scale: Scale = CAUCHY_TUNING
 
     def rho(self, square: Scalars) -> Scalars:
@@ -105,8 +97,8 @@ class GemanMcClure(Loss):
     Source: Geman & McClure, Bulletin of the International Statistical Institute 52(4), 1987.
     """
 
-    code: ClassVar[int | None] = GEMAN_MCCLURE
-    scale: Scale = GEMAN_MCCLURE_TUNING
+    code: ClassVar[int | None] = twin_constants.GEMAN_MCCLURE
+    scale: Scale = twin_constants.GEMAN_MCCLURE_TUNING
 
     def rho(self, square: Scalars) -> Scalars:
         r"""Return :math:`u / (1 + u)`."""
@@ -124,8 +116,8 @@ class Huber(Loss):
     Source: Huber, Annals of Mathematical Statistics 35(1), 1964.
     """
 
-    code: ClassVar[int | None] = HUBER
-    scale: Scale = HUBER_TUNING
+    code: ClassVar[int | None] = twin_constants.HUBER
+    scale: Scale = twin_constants.HUBER_TUNING
 
     def rho(self, square: Scalars) -> Scalars:
         """Return squares of small residuals, and sizes of large ones."""
@@ -149,9 +141,7 @@ def with_slope(
     return found.detach(), slope
 
 
-def median_deviation(
-    residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
-) -> Scalars:
+def median_deviation(residual: Items, seen: Seen) -> Scalars:
     """Estimate residuals' standard deviation by their median absolute value; 0 if none is seen.
 
     The factor 1.4826 makes it consistent for Gaussian noise. Where most residuals are close to
@@ -161,9 +151,7 @@ def median_deviation(
     return 1.4826 * size.nanmedian(dim=-1).values.nan_to_num(nan=0.0)
 
 
-def robust_deviation(
-    residual: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
-) -> Scalars:
+def robust_deviation(residual: Items, seen: Seen) -> Scalars:
     r"""Estimate the standard deviation of residuals, robustly and differentiably.
 
     An M-estimate of scale, of which the median absolute value is the limit of high powers: the
@@ -192,9 +180,7 @@ def robust_deviation(
     return torch.where(positive, torch.where(positive, variance, 1).sqrt(), 0)
 
 
-def robust_variance(
-    square: Float[Tensor, "*batch item"], seen: Bool[Tensor, "*batch item"]
-) -> Scalars:
+def robust_variance(square: Items, seen: Seen) -> Scalars:
     """Estimate the variance from squared residuals; see :func:`robust_deviation`.
 
     Args:
@@ -209,28 +195,27 @@ def robust_variance(
     correction = (along_last(fraction) - half) / torch.where(slope > 0, slope, 1)
     # One more Newton step, of length about zero: its derivative is the implicit function's.
     variance = (scale[..., 0] * (1 + correction)).clamp_min(0)
-    return torch.where(determined, variance / GAUSSIAN_SCALE**2, 0)
+    return torch.where(determined, variance / twin_constants.GAUSSIAN_SCALE**2, 0)
 
 
 @torch.no_grad()
-def _scale_of_squares(square: Float[Tensor, "*batch item"], half: Scalars) -> Scalars:
+def _scale_of_squares(square: Items, half: Scalars) -> Scalars:
     """Find the squared scale by Newton's method for its logarithm, from the mean square down."""
     scale = along_last(square) / square.shape[-1]
     scale = torch.where(scale > 0, scale, 1)
     close = torch.finfo(square.dtype).eps ** 0.75
-    for _ in range(NEWTON_STEPS):
+    for _ in range(twin_constants.NEWTON_STEPS):
         fraction = _fractions(square, scale[..., None])
         slope = 2 * (along_last(fraction) - along_last(fraction.square()))
         step = (along_last(fraction) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
-        scale = scale * step.clamp(-LONGEST_NEWTON_STEP, LONGEST_NEWTON_STEP).exp()
+        longest = twin_constants.LONGEST_NEWTON_STEP
+        scale = scale * step.clamp(-longest, longest).exp()
         if bool((step.abs() < close).all()):
             break
     return scale
 
 
-def _fractions(
-    square: Float[Tensor, "*batch item"], scale: Float[Tensor, "*batch one"]
-) -> Float[Tensor, "*batch item"]:
+def _fractions(square: Items, scale: Float[Tensor, "*batch one"]) -> Items:
     ratio = (square / scale).clamp_max(1e9).square()
     return ratio / (1 + ratio)
 

@@ -10,11 +10,10 @@ from weakref import WeakSet
 import numpy as np
 import torch
 from cholespy import CholeskySolverD, MatrixType
-from jaxtyping import Float
 from scipy.sparse import coo_array
-from torch import Tensor
 
 from pimper_torch.ground.linalg.prepared import WORST_RESIDUAL, PreparedMatrix, SingularSystemError
+from pimper_torch.ground.shapes import Unknowns
 
 # Above this the solution has fewer than three digits in float64; an exactly singular
 # matrix that survives elimination by rounding lands at 1e15 and more.
@@ -70,13 +69,13 @@ class SparseCholesky(PreparedMatrix):
                 "unknowns, or raise the weight of the prior."
             ) from error
 
-    def _substitute(self, scaled_rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+    def _substitute(self, scaled_rhs: Unknowns) -> Unknowns:
         answer = np.zeros(scaled_rhs.shape)
         if answer.size and self._solver is not None:
             self._solver.solve(np.ascontiguousarray(scaled_rhs.numpy()), answer)
         return torch.from_numpy(answer)
 
-    def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
+    def solve_values(self, rhs: Unknowns) -> Unknowns:
         """Solve; constant to autograd."""
         columns = rhs.detach().double().cpu().reshape(rhs.shape[0], -1)
         scaled = columns * self._scale[:, None]

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Scalars
+from pimper_torch.ground.shapes import PerEntry, Scalars
 from pimper_torch.runtime.errors import InputError
 
 
@@ -107,7 +107,7 @@ class Curve:
         bits: Of the files that the curve was measured on; ``None`` for any.
     """
 
-    encoded: Float[Tensor, " entry"]
+    encoded: PerEntry
     radiance: Float[Tensor, "channel entry"]
     bits: int | None = None
 
@@ -142,9 +142,7 @@ class Curve:
 Response = Linear | Srgb | Gamma | Curve
 
 
-def curve_from_table(
-    levels: Float[Tensor, " entry"], radiance: Float[Tensor, "channel entry"]
-) -> Curve:
+def curve_from_table(levels: PerEntry, radiance: Float[Tensor, "channel entry"]) -> Curve:
     """Make a curve of a measured inverse response.
 
     Args:
@@ -185,9 +183,7 @@ def curve_from_table(
     return Curve(encoded=levels / full, radiance=radiance / radiance[:, -1:], bits=bits)
 
 
-def _require_rising(
-    values: Float[Tensor, " entry"], levels: Float[Tensor, " entry"], what: str
-) -> None:
+def _require_rising(values: PerEntry, levels: PerEntry, what: str) -> None:
     falls = (values.diff() <= 0).nonzero().flatten()
     if len(falls):
         at = int(falls[0])
@@ -198,9 +194,7 @@ def _require_rising(
         )
 
 
-def _interpolate(
-    values: Scalars, given: Float[Tensor, " entry"], wanted: Float[Tensor, " entry"]
-) -> Scalars:
+def _interpolate(values: Scalars, given: PerEntry, wanted: PerEntry) -> Scalars:
     inside = values.clamp(given[0], given[-1])
     upper = torch.searchsorted(given, inside.detach().contiguous()).clamp(1, len(given) - 1)
     slope = wanted.diff() / given.diff()

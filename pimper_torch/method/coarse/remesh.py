@@ -1,14 +1,14 @@
 """Remeshing: facets that the surface departs from are split, unseen ones dropped."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.ground.geometry.topology import face_edges, vertex_fans
 from pimper_torch.ground.linalg.sums import total
-from pimper_torch.ground.shapes import FaceMask, Faces, Vertices
+from pimper_torch.ground.shapes import Edges, FaceMask, Faces, PerFacet, Vertices
 from pimper_torch.method.coarse import splitting
 from pimper_torch.method.coarse.coarse_config import RemeshConfig
 from pimper_torch.method.coarse.trim import enclosed_holes
@@ -65,7 +65,7 @@ def remesh(
     spacing: float,
     config: RemeshConfig | None = None,
     *,
-    residual: Float[Tensor, " facet"] | None = None,
+    residual: PerFacet | None = None,
     seen: Bool[Tensor, " facet"] | None = None,
 ) -> CoarseMesh:
     """Fit the coarse mesh to the surface that was reconstructed on it.
@@ -129,11 +129,7 @@ def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
 
 
 def _on_surface(
-    vertices: Vertices,
-    faces: Faces,
-    edges: Int[Tensor, "edge 2"],
-    face_edge: Faces,
-    surface: Surface,
+    vertices: Vertices, faces: Faces, edges: Edges, face_edge: Faces, surface: Surface
 ) -> tuple[Vertices, Float[Tensor, "edge 3"]]:
     """Find vertices and midpoints of edges on the surface; these interpolate along the edge."""
     zeros = surface.barycentric < _ON_EDGE

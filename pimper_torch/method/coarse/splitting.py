@@ -23,6 +23,9 @@ from pimper_torch.ground.linalg.sums import average
 from pimper_torch.ground.shapes import FaceMask, Faces, PerVertex, Points, Vertices
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Record, Surface
 
+Children = Int[Tensor, " child"]
+
+
 # Barycentric coordinates of a face's corners, and of the midpoints of the opposite edges.
 _NODES = ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0))
 
@@ -41,7 +44,7 @@ class Split(Record):
 
     faces: Int[Tensor, "child 3"]
     halved: Int[Tensor, " new"]
-    parent: Int[Tensor, " child"]
+    parent: Children
     corners: Float[Tensor, "child 3 3"]
 
     def relocate(
@@ -160,9 +163,7 @@ def normal_weights(information: PerVertex) -> PerVertex:
     return known / (1 + known) + _MIN_WEIGHT
 
 
-def fitted_normals(
-    mesh: Mesh, surface: Surface, split: Split, index: Int[Tensor, " child"]
-) -> Vertices:
+def fitted_normals(mesh: Mesh, surface: Surface, split: Split, index: Children) -> Vertices:
     """Fit vertex normals whose blend over the facets is nearest to the surface's normals.
 
     Least squares over the subdivided mesh, weighted by inverse variances; where that has no
@@ -202,11 +203,7 @@ def fitted_normals(
 
 
 def with_points(
-    coarse: CoarseMesh,
-    mesh: Mesh,
-    split: Split,
-    index: Int[Tensor, " child"],
-    source: Int[Tensor, " vertex"],
+    coarse: CoarseMesh, mesh: Mesh, split: Split, index: Children, source: Int[Tensor, " vertex"]
 ) -> CoarseMesh:
     """Return the new mesh the points of the cloud on its facets, and the support of its facets.
 
@@ -251,7 +248,7 @@ def with_points(
 
 
 def _relocated(
-    coarse: CoarseMesh, points: FacetPoints, split: Split, index: Int[Tensor, " child"]
+    coarse: CoarseMesh, points: FacetPoints, split: Split, index: Children
 ) -> FacetPoints:
     """Assign the points on facets to the children that they project into, along the old normal."""
     corners = coarse.mesh.vertices_world[coarse.mesh.faces[points.facet]]

@@ -8,9 +8,10 @@ does without them. Spacings are powers of two.
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.ground.shapes import PatchMask, PatchRaster, PerFacet
 from pimper_torch.records import Heights, Photometry, SweptPatches, Templates
 
 # Root mean square of albedo that a coarser grid may lose, relative: 4 of 255 sRGB levels of a
@@ -23,9 +24,7 @@ _MAX_HEIGHT = 0.1
 
 
 @torch.no_grad()
-def spacing_of(
-    swept: SweptPatches, samples_per_vertex: float, max_lost: float
-) -> Float[Tensor, " facet"]:
+def spacing_of(swept: SweptPatches, samples_per_vertex: float, max_lost: float) -> PerFacet:
     """Return each facet's distance between neighbouring vertices, scene units; a constant.
 
     Args:
@@ -70,18 +69,13 @@ def _apart(
     return apart
 
 
-def _mean(
-    values: Float[Tensor, "patch height width"], where: Bool[Tensor, "patch height width"]
-) -> Float[Tensor, " patch"]:
+def _mean(values: PatchRaster, where: PatchMask) -> Float[Tensor, " patch"]:
     """Average over samples; 0 where there are none."""
     return torch.where(where, values, 0).sum(dim=(1, 2)) / where.sum(dim=(1, 2)).clamp_min(1)
 
 
 def _lost(
-    values: Float[Tensor, "patch height width channel"],
-    known: Bool[Tensor, "patch height width"],
-    own: Bool[Tensor, "patch height width"],
-    step: int,
+    values: Float[Tensor, "patch height width channel"], known: PatchMask, own: PatchMask, step: int
 ) -> Float[Tensor, " patch"]:
     """Return the mean square that samples differ by from the mean of those a step before and after.
 

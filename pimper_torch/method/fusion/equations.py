@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster
-from pimper_torch.ground.shapes import Faces, PerVertex, Points, Scalar, VertexMask, Vertices
+from pimper_torch.ground.shapes import Edges, Faces, PerVertex, Points, Scalar, VertexMask, Vertices
 from pimper_torch.records import ContourPoints, FacetPoints, Record
 
 # A direction that leaves the surface at a flatter angle than this (cosine) tells no height.
@@ -63,7 +63,7 @@ class Equations(Record):
 
 
 def slopes(
-    edges: Int[Tensor, "edge 2"],
+    edges: Edges,
     flat: Vertices,
     directions: Vertices,
     normals: Vertices,
@@ -103,9 +103,7 @@ def slopes(
     )
 
 
-def upright(
-    edges: Int[Tensor, "edge 2"], directions: Vertices, normals: Vertices
-) -> Bool[Tensor, " edge"]:
+def upright(edges: Edges, directions: Vertices, normals: Vertices) -> Bool[Tensor, " edge"]:
     """Find edges whose slope heights can follow.
 
     Others lie across a contour or a fold as seen along the directions: raising both ends by the
@@ -116,7 +114,7 @@ def upright(
 
 
 def kept_slopes(
-    edges: Int[Tensor, "edge 2"],
+    edges: Edges,
     flat: Vertices,
     directions: Vertices,
     shape: Vertices,
@@ -136,7 +134,7 @@ def kept_slopes(
 
 
 def kept_steps(
-    edges: Int[Tensor, "edge 2"], flat: Vertices, transferred: PerVertex, variance: float | Scalar
+    edges: Edges, flat: Vertices, transferred: PerVertex, variance: float | Scalar
 ) -> Equations:
     """State that heights go on differing as they do, where edges are not upright.
 

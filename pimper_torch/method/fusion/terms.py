@@ -28,6 +28,9 @@ from pimper_torch.method.fusion.normal_bias import (
 )
 from pimper_torch.method.fusion.problem import Problem
 
+Known = Int[Tensor, " known"]
+
+
 # Least squared angle from vertex to vertex, radians, and least variance of the slopes that a
 # surface has already: they keep weights finite on flat facets and exact surfaces.
 _MIN_ROTATION, _MIN_SLOPE_VARIANCE = 1e-8, 1e-6
@@ -86,9 +89,7 @@ class Term(nn.Module):
         """List equations of one kind each, with the variances that their source claims."""
         raise NotImplementedError
 
-    def evaluated(
-        self, problem: Problem, heights: PerVertex, firm: Int[Tensor, " known"]
-    ) -> "Term":
+    def evaluated(self, problem: Problem, heights: PerVertex, firm: Known) -> "Term":
         """Return the term with the variance of its common errors, as other terms' heights show it.
 
         Args:
@@ -165,9 +166,7 @@ class SweptHeights(Term):
         start = problem.blend.heights
         return equations.swept_heights(start, offsets, information, facing, correlated, together)
 
-    def evaluated(
-        self, problem: Problem, heights: PerVertex, firm: Int[Tensor, " known"]
-    ) -> "SweptHeights":
+    def evaluated(self, problem: Problem, heights: PerVertex, firm: Known) -> "SweptHeights":
         """Return the term with the variance of the error that a facet's heights share."""
         plain, facet = type(self)().equations(problem), problem.facet
         return type(self)(common_variance(plain[0], heights, facet, facet[firm]) if plain else None)
@@ -220,9 +219,7 @@ class PriorNormals(Term):
         variance = slope_variance(information) / problem.density
         return [equations.slopes(edges, flat, problem.directions, normals, variance, together)]
 
-    def evaluated(
-        self, problem: Problem, heights: PerVertex, firm: Int[Tensor, " known"]
-    ) -> "PriorNormals":
+    def evaluated(self, problem: Problem, heights: PerVertex, firm: Known) -> "PriorNormals":
         """Return the term with the variance of its tilt against the photometric normals.
 
         What these are off the surface by themselves does not count.

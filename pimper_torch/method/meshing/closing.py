@@ -3,13 +3,12 @@
 import math
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.topology import face_counts, face_edges, half_edges, vertex_fans
 from pimper_torch.ground.linalg.continuation import continued
-from pimper_torch.ground.shapes import Faces
+from pimper_torch.ground.shapes import Faces, VertexValues
 from pimper_torch.method.meshing.faults import diagonal
 from pimper_torch.records import Closed, Mesh
 from pimper_torch.runtime.errors import InputError
@@ -72,7 +71,7 @@ def closed(mesh: Mesh) -> Closed:
     return Closed(mesh=whole, measured=measured, borders=len(cycles))
 
 
-def _known(albedo: Float[Tensor, "vertex channel"]) -> Float[Tensor, "vertex channel"]:
+def _known(albedo: VertexValues) -> VertexValues:
     """Assign vertices whose albedo no photograph tells the mean of the others'."""
     known = albedo.isfinite()
     mean = torch.where(known, albedo, 0).sum(dim=0) / known.sum(dim=0).clamp_min(1)

@@ -13,6 +13,8 @@ from pimper_torch.records import Mesh, PatchSet, Templates
 from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.parallel import side_by_side
 
+SampleMask = Bool[Tensor, "patch sample"]
+
 
 def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     """Transfer the depth and the normals of a surface to every template.
@@ -54,11 +56,7 @@ def _reach(templates: Templates) -> Float[Tensor, "patch 1"]:
 
 
 def _on_surface(
-    surface: Mesh,
-    normals: Vertices,
-    templates: Templates,
-    hits: Hits,
-    met: Bool[Tensor, "patch sample"],
+    surface: Mesh, normals: Vertices, templates: Templates, hits: Hits, met: SampleMask
 ) -> Templates:
     """Put samples where their lines meet given faces of a surface."""
     positions, inward = _lines(templates)
@@ -83,11 +81,11 @@ def _nearest(
     inward: Float[Tensor, "patch sample 3"],
     surface: Mesh,
     reach: Float[Tensor, "patch 1"],
-) -> tuple[Hits, Bool[Tensor, "patch sample"]]:
+) -> tuple[Hits, SampleMask]:
     """Cast to both sides, and take the nearer hit of a face that looks outward."""
     below, above = caster.cast(positions, inward, reach), caster.cast(positions, -inward, reach)
 
-    def looking_out(hits: Hits) -> Bool[Tensor, "patch sample"]:
+    def looking_out(hits: Hits) -> SampleMask:
         met = surface.faces[hits.face.clamp_min(0).flatten()]
         outward = face_normals(surface.vertices_world, met).reshape(inward.shape)
         return (hits.face >= 0) & ((outward * inward).sum(dim=-1) < 0)

@@ -26,6 +26,7 @@ from pimper_torch.ground.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.ground.kernels.arrays import as_array, pulled_back
 from pimper_torch.ground.kernels.signatures import FractionRows, PictureRows, Projection, Samples
 from pimper_torch.ground.kernels.switch import compiled_for
+from pimper_torch.ground.shapes import PatchMasks
 from pimper_torch.method.patches.patches_config import WarpConfig
 from pimper_torch.method.patches.template_priors import merged
 from pimper_torch.records import (
@@ -120,12 +121,8 @@ class _Resampled(torch.autograd.Function):
 
 
 def occluded(
-    valid: Bool[Tensor, "patch view height width"],
-    cameras: Cameras,
-    caster: RayCaster,
-    templates: Templates,
-    stride: int,
-) -> Bool[Tensor, "patch view height width"]:
+    valid: PatchMasks, cameras: Cameras, caster: RayCaster, templates: Templates, stride: int
+) -> PatchMasks:
     """Find samples that a surface occludes; a constant to autograd.
 
     One ray for every ``stride`` samples either way, from the camera to just before the surface,

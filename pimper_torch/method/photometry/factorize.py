@@ -14,7 +14,7 @@ from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.ground.geometry.template_normals import transferred_normals
 from pimper_torch.ground.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.ground.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
-from pimper_torch.ground.shapes import Scalar
+from pimper_torch.ground.shapes import PatchMasks, PatchRaster, PatchVectors, Scalar
 from pimper_torch.method.photometry.balm import solve_balm
 from pimper_torch.method.photometry.bilinear import Bilinear, Factors, Solver
 from pimper_torch.method.photometry.cone import Cone
@@ -85,7 +85,7 @@ class _Bucket(Record):
 
     templates: Templates
     registered: Observations
-    normals: Float[Tensor, "patch height width 3"]
+    normals: PatchVectors
 
 
 class Factorize(Stage):
@@ -170,11 +170,7 @@ class Factorize(Stage):
         return solved.replace(lights_patch=lights, exposure=exposure)
 
     def _prepare(
-        self,
-        bucket: _Bucket,
-        illuminated: Bool[Tensor, "patch view height width"],
-        shadowed: Bool[Tensor, "patch view height width"],
-        light: Illumination,
+        self, bucket: _Bucket, illuminated: PatchMasks, shadowed: PatchMasks, light: Illumination
     ) -> tuple[Rows, Int[Tensor, " patch"], Bilinear]:
         """Return samples, status and problem; in light that never moves, shadows take part.
 
@@ -332,8 +328,8 @@ def _lit(
     rows: Rows,
     field: LightField,
     patch_from_world: Float[Tensor, "patch 4 4"],
-    illuminated: Bool[Tensor, "patch view height width"],
-    shadowed: Bool[Tensor, "patch view height width"],
+    illuminated: PatchMasks,
+    shadowed: PatchMasks,
 ) -> tuple[Bool[Tensor, "patch view sample"], Float[Tensor, "patch view 4"]]:
     """Find samples under first-order light, and that light.
 
@@ -368,7 +364,7 @@ def _samples(
     if guessed is None:
         return samples
 
-    def row(raster: Float[Tensor, "patch height width"]) -> Float[Tensor, "patch sample"]:
+    def row(raster: PatchRaster) -> Float[Tensor, "patch sample"]:
         return raster.flatten(1).gather(1, rows.index)
 
     normals, information = guessed.normals_patch.flatten(1, 2), guessed.normal_information
@@ -425,7 +421,7 @@ def _with_albedo(
 @torch.no_grad()
 def _illuminated(
     bucket: _Bucket, field: LightField, caster: RayCaster | None
-) -> tuple[Bool[Tensor, "patch view height width"], Bool[Tensor, "patch view height width"]]:
+) -> tuple[PatchMasks, PatchMasks]:
     """Find observed samples that are not in cast shadows, and those that are; no edges of them."""
     registered, templates = bucket.registered, bucket.templates
     if caster is None:

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, rotate
 from pimper_torch.ground.geometry.template_normals import transferred_normals
-from pimper_torch.ground.shapes import Scalar
+from pimper_torch.ground.shapes import PatchVectors, Scalar
 from pimper_torch.method.photometry.factor_priors import RELATIVE_NOISE
 from pimper_torch.method.photometry.light_field import LightField, harmonics, rotate_lights
 from pimper_torch.method.photometry.lights import light_of_mesh
@@ -126,9 +126,7 @@ def _excess_variance(
     return (found - claims).clamp_min(0)
 
 
-def _beside_guesses(
-    normals: Float[Tensor, "patch height width 3"], guessed: PatchPriors | None
-) -> Float[Tensor, "patch height width 3"]:
+def _beside_guesses(normals: PatchVectors, guessed: PatchPriors | None) -> PatchVectors:
     """Average the surface's normals with those that were guessed, where there are any."""
     if guessed is None:
         return normals

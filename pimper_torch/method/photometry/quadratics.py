@@ -12,8 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+Columns = Float[Tensor, "*batch size item"]
+Packed = Float[Tensor, "*batch packed item"]
+Components = Float[Tensor, "*batch smaller item"]
 
-def outer(vectors: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch packed item"]:
+
+def outer(vectors: Columns) -> Packed:
     """Return the upper triangle of ``v v^T`` for each column ``v``.
 
     >>> outer(torch.tensor([[1.0], [2.0]]))[:, 0]
@@ -29,9 +33,7 @@ def diagonal(size: int) -> list[int]:
     return [slot for slot, pair in enumerate(zip(rows, columns, strict=True)) if len({*pair}) < 2]
 
 
-def unpacked(
-    packed: Float[Tensor, "*batch packed item"], size: int
-) -> Float[Tensor, "*batch item size size"]:
+def unpacked(packed: Packed, size: int) -> Float[Tensor, "*batch item size size"]:
     """Return the full matrices."""
     rows, columns = _triangle(size)
     index = torch.zeros(size, size, dtype=torch.long, device=packed.device)
@@ -41,9 +43,7 @@ def unpacked(
     return packed.mT[..., index]
 
 
-def apply_packed(
-    packed: Float[Tensor, "*batch packed item"], vectors: Float[Tensor, "*batch size item"]
-) -> Float[Tensor, "*batch size item"]:
+def apply_packed(packed: Packed, vectors: Columns) -> Columns:
     """Multiply each packed matrix with its vector."""
     entries, parts = packed.unbind(dim=-2), vectors.unbind(dim=-2)
     rows, columns = _triangle(len(parts))
@@ -55,9 +55,7 @@ def apply_packed(
     return torch.stack(total, dim=-2)
 
 
-def dot(
-    first: Float[Tensor, "*batch size item"], second: Float[Tensor, "*batch size item"]
-) -> Float[Tensor, "*batch item"]:
+def dot(first: Columns, second: Columns) -> Float[Tensor, "*batch item"]:
     """Return inner products; several times as fast as a sum over the axis."""
     total = torch.zeros_like(second[..., 0, :])
     for a, b in zip(first.unbind(dim=-2), second.unbind(dim=-2), strict=True):
@@ -65,16 +63,12 @@ def dot(
     return total
 
 
-def coordinates(
-    columns: Sequence[Tensor], vectors: Float[Tensor, "*batch size item"]
-) -> Float[Tensor, "*batch smaller item"]:
+def coordinates(columns: Sequence[Tensor], vectors: Columns) -> Components:
     """Return ``B^T v`` for matrices ``B`` given by their columns."""
     return torch.stack([dot(column, vectors) for column in columns], dim=-2)
 
 
-def combination(
-    columns: Sequence[Tensor], weights: Float[Tensor, "*batch smaller item"]
-) -> Float[Tensor, "*batch size item"]:
+def combination(columns: Sequence[Tensor], weights: Components) -> Columns:
     """Return ``B c`` for matrices ``B`` given by their columns."""
     total = torch.zeros_like(columns[0])
     for column, weight in zip(columns, weights.unbind(dim=-2), strict=True):
@@ -82,9 +76,7 @@ def combination(
     return total
 
 
-def congruence(
-    packed: Float[Tensor, "*batch packed item"], columns: list[Float[Tensor, "*batch size item"]]
-) -> Float[Tensor, "*batch smaller item"]:
+def congruence(packed: Packed, columns: list[Columns]) -> Components:
     """Return ``B^T A B``, packed, for matrices ``B`` given by their columns."""
     images = [apply_packed(packed, column) for column in columns]
     rows, others = _triangle(len(columns))
@@ -94,9 +86,7 @@ def congruence(
     )
 
 
-def solve_packed(
-    packed: Float[Tensor, "*batch packed item"], rhs: Float[Tensor, "*batch size item"]
-) -> Float[Tensor, "*batch size item"]:
+def solve_packed(packed: Packed, rhs: Columns) -> Columns:
     """Solve symmetric positive systems by Cholesky, in float64; see :class:`PackedCholesky`."""
     return PackedCholesky(packed, rhs.shape[-2]).solve(rhs)
 
@@ -109,7 +99,7 @@ class PackedCholesky:
     taken for the identity. Differentiable.
     """
 
-    def __init__(self, packed: Float[Tensor, "*batch packed item"], size: int) -> None:
+    def __init__(self, packed: Packed, size: int) -> None:
         rows, columns = _triangle(size)
         entries = {
             (column, row): entry.double()
@@ -127,7 +117,7 @@ class PackedCholesky:
                     total = torch.addcmul(total, lower[i, k], lower[j, k], value=-1)
                 lower[i, j] = torch.maximum(total, floor).sqrt() if i == j else total / lower[j, j]
 
-    def solve(self, rhs: Float[Tensor, "*batch size item"]) -> Float[Tensor, "*batch size item"]:
+    def solve(self, rhs: Columns) -> Columns:
         """Return ``A^-1 b``, in the dtype of ``b``."""
         solution = self.whiten(rhs.unbind(dim=-2))
         for i in reversed(range(self._size)):

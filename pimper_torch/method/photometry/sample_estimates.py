@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from pimper_torch.ground.shapes import PatchMask, PatchVectors
 from pimper_torch.method.photometry import bilinear
 from pimper_torch.method.photometry.bilinear import Bilinear, Entries, Factors, Lights, Shading
 from pimper_torch.method.photometry.quadratics import apply_packed, solve_packed
@@ -35,9 +36,7 @@ class Rows(Record):
         return self.replace(seen=seen, radiance=torch.where(seen[:, :, None], self.radiance, 0))
 
 
-def rows_of(
-    templates: Templates, registered: Observations, normals: Float[Tensor, "patch height width 3"]
-) -> Rows:
+def rows_of(templates: Templates, registered: Observations, normals: PatchVectors) -> Rows:
     """Gather the samples inside each template."""
     inside = templates.inside.flatten(1)
     longest = max(int(inside.sum(dim=1).max()), 1) if len(inside) else 1
@@ -68,8 +67,8 @@ def in_row(
 def on_raster(
     row: Float[Tensor, "patch sample *channel"] | Bool[Tensor, "patch sample"],
     index: Int[Tensor, "patch sample"],
-    background: Float[Tensor, "patch height width *channel"] | Bool[Tensor, "patch height width"],
-) -> Float[Tensor, "patch height width *channel"] | Bool[Tensor, "patch height width"]:
+    background: Float[Tensor, "patch height width *channel"] | PatchMask,
+) -> Float[Tensor, "patch height width *channel"] | PatchMask:
     """Scatter a row to its raster, over a background."""
     expanded = index if row.ndim == 2 else index[..., None].expand_as(row)
     return background.flatten(1, 2).scatter(1, expanded, row).reshape(background.shape)

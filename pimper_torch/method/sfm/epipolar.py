@@ -19,22 +19,17 @@ from pimper_torch.method.sfm.matching import PhotographPair, VerifiedPair
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.records import Cameras
 
+Matched = Float[Tensor, "match 2"]
 Ends = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ 2"]]  # of matches, in two photographs
 
 
-def sampson_errors(
-    geometry: Matrix3, first: Float[Tensor, "match 2"], second: Float[Tensor, "match 2"]
-) -> Float[Tensor, " match"]:
+def sampson_errors(geometry: Matrix3, first: Matched, second: Matched) -> Float[Tensor, " match"]:
     """Return the first-order distance of matches from an epipolar geometry, in pixels."""
     ends = first.double(), second.double()
     return sampson_epipolar_distance(*ends, geometry, squared=False)
 
 
-def fundamental_matrix(
-    first: Float[Tensor, "match 2"],
-    second: Float[Tensor, "match 2"],
-    weight: Float[Tensor, " match"],
-) -> Matrix3:
+def fundamental_matrix(first: Matched, second: Matched, weight: Float[Tensor, " match"]) -> Matrix3:
     """Fit ``F``, with ``second^T F first = 0``, by weighted least squares; float64.
 
     kornia's ``find_fundamental`` weighs the normalization of the pixels, too: reweighted, still and
@@ -91,9 +86,7 @@ def epipolar_geometry(cameras: Cameras, views: PhotographPair) -> Matrix3:
     return fundamental_from_essential(essential_from_Rt(*motion), *intrinsics)
 
 
-def undistorted_pixels(
-    model: SparseModel, view: int, pixels: Float[Tensor, "match 2"]
-) -> Float[Tensor, "match 2"]:
+def undistorted_pixels(model: SparseModel, view: int, pixels: Matched) -> Matched:
     """Return where a pinhole of the lens's own focal length has pixels of a photograph."""
     K = pinhole_of(model.lenses[view])
     return undistort_pixels(model.lenses[view], pixels) * K.diagonal()[:2] + K[:2, 2]

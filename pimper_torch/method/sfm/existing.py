@@ -9,14 +9,7 @@ from PIL import Image
 
 from pimper_torch.doors.camera_files.read_cameras import read_cameras
 from pimper_torch.ground.geometry.lens_models import rescale_lens
-from pimper_torch.method.sfm import colmap
-from pimper_torch.method.sfm.lenses import (
-    QUARTERS,
-    turned_lens,
-    turned_pixels,
-    turned_pose,
-    turned_size,
-)
+from pimper_torch.method.sfm import colmap, lenses
 from pimper_torch.method.sfm.model import SparseModel, match_names
 from pimper_torch.method.sfm.model_files import largest_model
 from pimper_torch.records import Lens, Views
@@ -66,7 +59,7 @@ def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
     turned when they are read. One photograph whose shape shows it decides for all.
     """
     tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
-    exif = [QUARTERS.get(tag, 0) for tag in tags]
+    exif = [lenses.QUARTERS.get(tag, 0) for tag in tags]
     sizes = views.sizes_px.tolist()
     odd = [
         f"{name} is {width}x{height}, its camera's picture {lens.width}x{lens.height}"
@@ -74,7 +67,7 @@ def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
         if not resize_fits(lens, width, height)
     ]
     as_stored = all(
-        resize_fits(lens, *turned_size(width, height, quarters))
+        resize_fits(lens, *lenses.turned_size(width, height, quarters))
         for lens, (width, height), quarters in zip(model.lenses, sizes, exif, strict=True)
     )
     if odd and not as_stored:
@@ -166,22 +159,22 @@ def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> S
         views: The photographs, in the model's order.
         turns: Clockwise quarters by which each picture is turned in its photograph.
     """
-    lenses = []
+    placed = []
     cameras: dict[tuple[int, ...], int] = {}
     fresh = 1 + max(lens.camera for lens in model.lenses)
     pixels = torch.empty_like(model.observation_pixels)
     poses = torch.empty_like(model.cam_from_world)
     for view, (lens, quarters) in enumerate(zip(model.lenses, turns, strict=True)):
         width, height = views.sizes_px[view].tolist()
-        size = turned_size(width, height, quarters)
+        size = lenses.turned_size(width, height, quarters)
         # Photographs of one camera that were resized or turned differently no longer share it; the
         # first of them keep its number.
         key, known = (lens.camera, *size, quarters), lens.camera in cameras.values()
         camera = cameras.setdefault(key, fresh + len(cameras) if known else lens.camera)
         resized = rescale_lens(lens, *size).replace(camera=camera)
-        lenses.append(turned_lens(resized, quarters))
+        placed.append(lenses.turned_lens(resized, quarters))
         scale = pixels.new_tensor([size[0] / lens.width, size[1] / lens.height])
         here = model.observation_view == view
-        pixels[here] = turned_pixels(model.observation_pixels[here] * scale, *size, quarters)
-        poses[view] = turned_pose(model.cam_from_world[view], quarters)
-    return model.replace(lenses=tuple(lenses), cam_from_world=poses, observation_pixels=pixels)
+        pixels[here] = lenses.turned_pixels(model.observation_pixels[here] * scale, *size, quarters)
+        poses[view] = lenses.turned_pose(model.cam_from_world[view], quarters)
+    return model.replace(lenses=tuple(placed), cam_from_world=poses, observation_pixels=pixels)

@@ -30,6 +30,9 @@ from pimper_torch.records import Cameras, Record
 from pimper_torch.runtime.mapped import drop_pages, zeros
 from pimper_torch.runtime.parallel import side_by_side
 
+Seen = Bool[Tensor, "point view"]
+
+
 # Half the side of a patch, in steps of the plane, which are about pixels of the reference.
 _RADIUS = 8
 # Cosine between normal and ray down to which a view is worth asking.
@@ -54,12 +57,10 @@ class Tangents(Record):
     points_world: Points
     steps_world: Float[Tensor, "point 2 3"]
     reference: Int[Tensor, " point"]
-    candidates: Bool[Tensor, "point view"]
+    candidates: Seen
 
 
-def tangents(
-    points_world: Points, observed: Bool[Tensor, "point view"], cameras: Cameras
-) -> Tangents:
+def tangents(points_world: Points, observed: Seen, cameras: Cameras) -> Tangents:
     """Lay a plane through every point and choose the views to look for it in."""
     at_once = max(1, 2**22 // cameras.num_views)  # 100 MB of rays
     points, seen = torch.split(points_world, at_once), torch.split(observed, at_once)
@@ -69,16 +70,12 @@ def tangents(
     return Tangents.cat([_laid(some, by, across, cameras) for some, by, across in laid])
 
 
-def _towards(
-    points_world: Points, observed: Bool[Tensor, "point view"], cameras: Cameras
-) -> Points:
+def _towards(points_world: Points, observed: Seen, cameras: Cameras) -> Points:
     rays = normalize(cameras.centers_world - points_world[:, None], dim=-1)
     return normalize((rays * observed[..., None]).sum(dim=1), dim=-1)
 
 
-def _laid(
-    points_world: Points, observed: Bool[Tensor, "point view"], normals: Points, cameras: Cameras
-) -> Tangents:
+def _laid(points_world: Points, observed: Seen, normals: Points, cameras: Cameras) -> Tangents:
     rays = cameras.centers_world - points_world[:, None]
     distance = rays.norm(dim=-1)
     cosine = (normalize(rays, dim=-1) * normals[:, None]).sum(dim=-1)
@@ -106,9 +103,7 @@ def _laid(
     )
 
 
-def evenly(
-    candidates: Bool[Tensor, "point view"], most: Int[Tensor, "point 1"]
-) -> Bool[Tensor, "point view"]:
+def evenly(candidates: Seen, most: Int[Tensor, "point 1"]) -> Seen:
     """Keep so many views of each point at most, evenly spread among the candidates."""
     place = candidates.cumsum(dim=1) * most
     count = torch.maximum(candidates.sum(dim=1, keepdim=True), most).clamp_min(1)

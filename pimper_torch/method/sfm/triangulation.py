@@ -10,15 +10,8 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
 from pimper_torch.ground.geometry.local_frame import local_origin, to_local
-from pimper_torch.method.sfm import epipolar, matching
+from pimper_torch.method.sfm import epipolar, features, matching
 from pimper_torch.method.sfm.colmap import model_of, observation_errors, reconstruction_of
-from pimper_torch.method.sfm.features import (
-    Workspace,
-    find_features,
-    image_ids,
-    too_small,
-    workspace,
-)
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.method.sfm.refine_tracks import refine_tracks
@@ -59,12 +52,12 @@ def triangulate(
         Poses and lenses bit for bit as given. With the points as they were where no more are
         found, which a :class:`~pimper_torch.runtime.errors.PimperWarning` says.
     """
-    if too_small(views):
+    if features.too_small(views):
         _warn_of_no_points(0, where)
         return given
     lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
-    with workspace(views, settings.num_threads) as space:
-        counts = find_features(space, settings, [None] * views.num_views, lenses)
+    with features.workspace(views, settings.num_threads) as space:
+        counts = features.find_features(space, settings, [None] * views.num_views, lenses)
         release_memory()
         if sum(count > 0 for count in counts) >= 2:
             matching.match_pairs(space, pairs_to_match(space), settings)
@@ -138,7 +131,7 @@ def require_agreement(
 
 
 def _match_along_lines(
-    space: Workspace,
+    space: features.Workspace,
     model: SparseModel,
     verified: Sequence[matching.VerifiedPair],
     settings: ReconstructConfig,
@@ -146,15 +139,15 @@ def _match_along_lines(
     """Replace what was verified by matches along the cameras' epipolar lines."""
     pairs, cameras = _pairs(model, verified, settings), epipolar.pinholes_of(model)
     with quiet(), loaded().Database.open(space.database) as stored:
-        image_of = image_ids(stored, space)
+        image_of = features.image_ids(stored, space)
         bent = [matching.read_features(stored, image) for image in image_of]
-        features = [
+        straight = [
             its.replace(pixels=epipolar.undistorted_pixels(model, view, its.pixels))
             for view, its in enumerate(bent)
         ]
 
         def matches(pair: matching.PhotographPair) -> Tensor:
-            first, second = (features[number] for number in pair)
+            first, second = (straight[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
             near = matching.Near(epipolar.epipolar_geometry(cameras, pair), settings.max_error_px)
@@ -191,7 +184,7 @@ def _pairs(
     return matching.strongest(weights, model.num_views, max(settings.guided_pairs, 1))
 
 
-def _triangulated(space: Workspace, model: SparseModel, seed: int) -> SparseModel:
+def _triangulated(space: features.Workspace, model: SparseModel, seed: int) -> SparseModel:
     pycolmap = loaded()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1

@@ -8,12 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from pimper_torch.ground.geometry.lens_models import (
-    distort,
-    is_pinhole,
-    pinhole_of,
-    undistort_pixels,
-)
+from pimper_torch.ground.geometry import lens_models
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.ground.shapes import Mask, Matrix3
@@ -34,6 +29,9 @@ from pimper_torch.runtime.mapped import zeros
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
 
+Picture = Float[Tensor, "channel height width"]
+Places = Float[Tensor, "1 height width 2"]
+
 
 def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tensor, "view 3 3"]]:
     """Resample photographs so that straight lines in space are straight in the image.
@@ -48,7 +46,7 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
         view without distortion is left untouched.
     """
     pinholes = pinholes_for(lenses).to(views.images)
-    if all(map(is_pinhole, lenses)):
+    if all(map(lens_models.is_pinhole, lenses)):
         return views, pinholes
     shape, device = views.images.shape, views.images.device
     images = zeros(shape, views.images.dtype, device)
@@ -61,9 +59,7 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
     return views.replace(images=images, masks=None if whole else valid), pinholes
 
 
-def undistorted(
-    views: Views, lenses: tuple[Lens, ...]
-) -> Iterator[tuple[Float[Tensor, "channel height width"], Mask]]:
+def undistorted(views: Views, lenses: tuple[Lens, ...]) -> Iterator[tuple[Picture, Mask]]:
     """Undistort photographs one by one, as :func:`undistort` does, without padding."""
     shared = source_grid(lenses[0], like=views.images) if len(set(lenses)) == 1 else None
 
@@ -81,7 +77,7 @@ def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
     return torch.stack([found[lens] for lens in lenses])
 
 
-_Grid = tuple[Float[Tensor, "1 height width 2"], Mask]
+_Grid = tuple[Places, Mask]
 
 
 def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _Grid | None:
@@ -94,7 +90,7 @@ def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _G
     Returns:
         Places for ``grid_sample``; nothing for a lens without distortion.
     """
-    if is_pinhole(lens):
+    if lens_models.is_pinhole(lens):
         return None
     width, height = width or lens.width, height or lens.height
     sources = photograph_pixels(lens, width, height).to(like)
@@ -107,7 +103,7 @@ def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _G
 
 def _undistort_image(
     views: Views, index: int, lens: Lens, grid: _Grid | None
-) -> tuple[Float[Tensor, "channel height width"], Mask]:
+) -> tuple[Picture, Mask]:
     """Undistort one photograph, without padding; no grid for a lens without distortion."""
     image = views.images[index, :, : lens.height, : lens.width]
     mask = None if views.masks is None else views.masks[index, : lens.height, : lens.width]
@@ -124,9 +120,7 @@ def _undistort_image(
     return radiance, inside
 
 
-def _sampled(
-    raster: Float[Tensor, "channel height width"], grid: Float[Tensor, "1 height width 2"]
-) -> Float[Tensor, "channel height width"]:
+def _sampled(raster: Picture, grid: Places) -> Picture:
     return grid_sample(raster[None], grid, mode="bilinear", align_corners=False)[0]
 
 
@@ -138,8 +132,8 @@ def pinhole_for(lens: Lens) -> Matrix3:
     pulls the corners out (pincushion) the focal length grows until no pixel looks past the
     photograph's edge, but never by more than a quarter.
     """
-    K = pinhole_of(lens)
-    if is_pinhole(lens):
+    K = lens_models.pinhole_of(lens)
+    if lens_models.is_pinhole(lens):
         return K
     size = K.new_tensor([lens.width, lens.height])
     along = torch.linspace(0, 1, 65, dtype=K.dtype)[:, None] * size  # 64 steps: smooth curves
@@ -147,7 +141,8 @@ def pinhole_for(lens: Lens) -> Matrix3:
     for axis, end in ((0, 0), (0, lens.width), (1, 0), (1, lens.height)):
         edge = along.clone()
         edge[:, axis] = end
-        reach = undistort_pixels(lens, edge)[:, axis].nan_to_num(nan=torch.inf).abs().min()
+        straight = lens_models.undistort_pixels(lens, edge)[:, axis]
+        reach = straight.nan_to_num(nan=torch.inf).abs().min()
         needed = (end - K[axis, 2]).abs() / K[axis, axis]
         zoom = torch.maximum(zoom, needed / reach.clamp_min(1e-12))
     zoom = zoom.clamp_max(1.25)
@@ -171,7 +166,7 @@ def photograph_pixels(
     for some, into in zip(*parts, strict=True):
         plane = (some * scale - K[:2, 2]) / K.diagonal()[:2]
         rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
-        into.copy_(distort(lens, rays) / scale)
+        into.copy_(lens_models.distort(lens, rays) / scale)
     return found.reshape(height, width, 2)
 
 
@@ -253,10 +248,7 @@ def _filled(raster: Tensor, values: Tensor) -> Tensor:
 
 
 def _weighted(
-    values: _Raster,
-    variance: Float[Tensor, "1 height width"],
-    places: Float[Tensor, "1 height width 2"],
-    inside: Mask,
+    values: _Raster, variance: Float[Tensor, "1 height width"], places: Places, inside: Mask
 ) -> tuple[_Raster, Float[Tensor, "1 height width"], _Raster]:
     """Return means by precision, one over the mean precision, and variances about the means."""
     known = variance.isfinite()

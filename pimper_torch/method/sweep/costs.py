@@ -27,12 +27,13 @@ from pimper_torch.ground.kernels.arrays import as_array, pulled_back
 from pimper_torch.ground.kernels.switch import compiled_for
 from pimper_torch.records import Cameras, Observations, Photometry, Record, Templates
 
+PerView = Float[Tensor, "sample view"]
 _Array = NDArray[Any]
 
 
 def inconsistency(
     radiance: Float[Tensor, "sample view hypothesis"],
-    shading: Float[Tensor, "sample view"],
+    shading: PerView,
     seen: Bool[Tensor, "sample view"],
     scale: Float[Tensor, " sample"],
     iterations: int = 2,
@@ -66,7 +67,7 @@ def inconsistency(
 
 
 def best_views(
-    score: Float[Tensor, "sample view"], usable: Bool[Tensor, "sample view"], count: int
+    score: PerView, usable: Bool[Tensor, "sample view"], count: int
 ) -> tuple[Int[Tensor, "sample chosen"], Bool[Tensor, "sample chosen"]]:
     """Choose, for every sample, the usable views of the best scores, ``count`` of them at most.
 
@@ -83,10 +84,8 @@ def best_views(
 
 
 def poses_first(
-    score: Float[Tensor, "sample view"],
-    usable: Bool[Tensor, "sample view"],
-    poses: Int[Tensor, " view"],
-) -> Float[Tensor, "sample view"]:
+    score: PerView, usable: Bool[Tensor, "sample view"], poses: Int[Tensor, " view"]
+) -> PerView:
     """Rate the best usable view of every pose before the second of any, and so on.
 
     Views of one pose say nothing of a height: they agree whatever it is.
@@ -110,11 +109,7 @@ def poses_first(
     return found
 
 
-def view_scores(
-    facing: Float[Tensor, "sample view"],
-    footprint: Float[Tensor, "sample view"],
-    shading: Float[Tensor, "sample view"],
-) -> Float[Tensor, "sample view"]:
+def view_scores(facing: PerView, footprint: PerView, shading: PerView) -> PerView:
     """Rate views by angle, resolution and light.
 
     Args:
@@ -327,7 +322,7 @@ def _compared(given: Hypotheses, num_views: int, min_views: int) -> _Samples:
 
 def _footprint(
     points: Float[Tensor, "sample 3"], spacing: Float[Tensor, " sample"], cameras: Cameras
-) -> Float[Tensor, "sample view"]:
+) -> PerView:
     """Return the pixels that a sample would span in each view if it faced it."""
     focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
     axes = cameras.cam_from_world[:, 2]

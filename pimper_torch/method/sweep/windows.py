@@ -7,11 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from pimper_torch.ground.shapes import PatchRaster
+
 
 def window_mean(
-    values: Float[Tensor, "patch channel height width"],
-    weight: Float[Tensor, "patch height width"],
-    radius: float,
+    values: Float[Tensor, "patch channel height width"], weight: PatchRaster, radius: float
 ) -> Float[Tensor, "patch channel height width"]:
     """Average with a Gaussian of standard deviation ``radius``, in samples.
 
@@ -49,11 +49,8 @@ def window_size(radius: float) -> float:
 
 
 def level_weight(
-    depth: Float[Tensor, "patch height width"],
-    swept: Float[Tensor, "patch height width"],
-    spacing: Float[Tensor, " patch"],
-    max_slope: float = 4.0,
-) -> Float[Tensor, "patch height width"]:
+    depth: PatchRaster, swept: PatchRaster, spacing: Float[Tensor, " patch"], max_slope: float = 4.0
+) -> PatchRaster:
     """Return the weight of every sample in windows: none on a cliff.
 
     A window would otherwise mix the two sides of a depth edge.

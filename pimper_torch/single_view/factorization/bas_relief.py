@@ -24,6 +24,9 @@ from pimper_torch.ground.shapes import Mask, Scalars
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 
+Shading = Float[Tensor, "3 pixel"]
+PerPixel = Float[Tensor, " pixel"]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class BasRelief(Record):
@@ -72,9 +75,7 @@ class BasRelief(Record):
         )
 
 
-def standard_relief(
-    shading: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"] | None = None
-) -> BasRelief:
+def standard_relief(shading: Shading, weight: PerPixel | None = None) -> BasRelief:
     r"""Find the transformation to a canonical form, the same for all bas-reliefs of a surface.
 
     After it a surface is upright on average and as deep as a ball:
@@ -92,12 +93,7 @@ def standard_relief(
     return BasRelief(mu=lam * tilt_x, nu=lam * tilt_y, lam=lam)
 
 
-def convex(
-    relief: BasRelief,
-    shading: Float[Tensor, "3 pixel"],
-    weight: Float[Tensor, " pixel"],
-    mask: Mask,
-) -> BasRelief:
+def convex(relief: BasRelief, shading: Shading, weight: PerPixel, mask: Mask) -> BasRelief:
     """Choose the convex one of a transformation and its mirror image, which fit equally well.
 
     Args:
@@ -113,10 +109,7 @@ def convex(
 
 
 def relief_from_strength(
-    lights: Float[Tensor, "view 3"],
-    shading: Float[Tensor, "3 pixel"],
-    weight: Float[Tensor, " pixel"],
-    mask: Mask,
+    lights: Float[Tensor, "view 3"], shading: Shading, weight: PerPixel, mask: Mask
 ) -> BasRelief:
     """Find the bas-relief transformation that gives most point lights one strength; convex.
 

@@ -29,6 +29,8 @@ from pimper_torch.method.photometry.variable_projection import solve_variable_pr
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 
+Matrices = Float[Tensor, "batch row column"]
+
 
 @dataclass(frozen=True, slots=True)
 class Free:
@@ -65,9 +67,7 @@ class Free:
 
 
 def low_rank_problem(
-    matrix: Float[Tensor, "batch row column"],
-    weight: Float[Tensor, "batch row column"],
-    start: Float[Tensor, "batch row rank"],
+    matrix: Matrices, weight: Matrices, start: Float[Tensor, "batch row rank"]
 ) -> Bilinear:
     r"""Return the problem :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
 
@@ -108,10 +108,10 @@ def low_rank_problem(
 
 
 def singular_left(
-    matrix: Float[Tensor, "batch row column"],
-    weight: Float[Tensor, "batch row column"],
+    matrix: Matrices,
+    weight: Matrices,
     rank: int,
-    guess: Float[Tensor, "batch row column"] | None = None,
+    guess: Matrices | None = None,
     imputations: int = 20,
 ) -> Float[Tensor, "batch row rank"]:
     """Initialize by singular vectors of the matrix, missing entries imputed iteratively.
