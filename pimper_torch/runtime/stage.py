@@ -102,7 +102,13 @@ class Then(Stage):
 def check_handed(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
     """Refuse records of other types than a stage takes, and those that cannot be used."""
     where = type(stage).__name__
-    for name, value, hint in _handed(stage, args, kwargs):
+    try:
+        bound = inspect.signature(stage.forward).bind(*args, **kwargs)
+    except TypeError:
+        return  # torch reports what does not fit
+    hints = typing.get_type_hints(stage.forward)
+    for name, value in bound.arguments.items():
+        hint = hints.get(name)
         kinds = [kind for kind in (typing.get_args(hint) or (hint,)) if isinstance(kind, type)]
         records = [kind for kind in kinds if issubclass(kind, Record)]
         if records and not isinstance(value, tuple(kinds)):
@@ -122,15 +128,3 @@ def _source(value: object, kinds: list[type]) -> str:
     if Views in kinds and isinstance(value, Tensor | np.ndarray | Sequence):
         return "`scene_of` puts images in tensors or arrays beside their cameras."
     return "It comes from whoever called the stage, in a chain the stage before."
-
-
-def _handed(
-    stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]
-) -> list[tuple[str, object, object]]:
-    """Return the names, values and annotated types of what ``forward`` is handed."""
-    try:
-        bound = inspect.signature(stage.forward).bind(*args, **kwargs)
-    except TypeError:
-        return []  # torch tells what does not fit
-    hints = typing.get_type_hints(stage.forward)
-    return [(name, value, hints.get(name)) for name, value in bound.arguments.items()]

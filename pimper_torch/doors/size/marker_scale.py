@@ -88,15 +88,11 @@ def find_markers(scene: SparseScene) -> list[Marker]:
         for square in squares:
             found.setdefault(square.code, []).append((view, square.corners))
     cameras = scene.cameras.detach().to("cpu", torch.float64)
-    placed = [
-        _placed(
-            code,
-            cameras.take([view for view, _ in seen]),
-            torch.stack([corners for _, corners in seen]),
-        )
-        for code, seen in sorted(found.items())
-        if len(seen) > 1
-    ]
+    placed = []
+    for code, seen in sorted(found.items()):
+        if len(seen) > 1:
+            views, corners = zip(*seen, strict=True)
+            placed.append(_placed(code, cameras.take(views), torch.stack(corners)))
     return [marker for marker in placed if marker is not None]
 
 
@@ -137,7 +133,7 @@ def _placed(code: int, cameras: Cameras, pixels: Float[Tensor, "view 4 2"]) -> M
     used = one_hot(pairs, count).any(dim=1)
     near = _near(_triangulated(rays, cameras, used), cameras, pixels)
     best = near[near.sum(dim=1).argmax()]
-    # Fewer agree where a marker stands still before an object that turns.
+    # Fewer agree where a marker stays at rest in front of an object that turns.
     if not int(best.sum()) >= max(2, 0.6 * count):
         return None
     corners = _triangulated(rays, cameras, best[None])

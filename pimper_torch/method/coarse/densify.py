@@ -275,23 +275,18 @@ def filled(maps: DepthMaps, view: int) -> Map:
     """
     field, known = maps.inverse_depth[view], maps.valid[view]
     sources = maps.sources[view]
-    splat = torch.zeros_like(field)
+    splat, one = torch.zeros_like(field), torch.tensor([view], device=field.device)
     for source in sources[sources >= 0].tolist():
-        splat = torch.maximum(splat, _seen_from(maps, source, view))
+        pixels, ratio = pair(maps.level, source, one).look(maps.inverse_depth[source])
+        chosen = maps.valid[source] & (ratio[0] > 0)
+        value = (maps.inverse_depth[source] / ratio[0].clamp_min(1e-6))[chosen]
+        splat = torch.maximum(splat, _splatted(pixels[0][:, chosen].mT, value, field))
     field = torch.where(known, field, splat)
     return push_pull(field, known | (splat > 0))
 
 
-def _seen_from(maps: DepthMaps, source: int, view: int) -> Map:
-    """Project a source's valid depths into a view: the nearest of each pixel, 0 for none."""
-    one = torch.tensor([view], device=maps.valid.device)
-    pixels, ratio = pair(maps.level, source, one).look(maps.inverse_depth[source])
-    chosen = maps.valid[source] & (ratio[0] > 0)
-    value = (maps.inverse_depth[source] / ratio[0].clamp_min(1e-6))[chosen]
-    return _splatted(pixels[0][:, chosen].mT, value, maps.inverse_depth[view])
-
-
 def _splatted(pixels: Pixels, values: Float[Tensor, " point"], like: Map) -> Map:
+    """Draw the inverse depths of points: the nearest of each pixel, 0 for none."""
     height, width = like.shape
     column, row = pixels.floor().long().unbind(dim=1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.linalg import cross
@@ -53,8 +53,10 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
         clouds, finer = [], None
         for one in reversed(maps):
             wanted = torch.ones_like(one.valid[view])
-            if finer is not None:
-                wanted &= ~_covered(finer, wanted)
+            if finer is not None:  # on or beside what is valid there
+                height, width = wanted.shape
+                fraction = adaptive_avg_pool2d(finer[None, None].float(), (height, width))
+                wanted &= max_pool2d(fraction, 3, 1, 1)[0, 0] == 0
             cloud, finer = _of_view(one, view, wanted)
             clouds.append(cloud)
         return OrientedPoints.cat(clouds)
@@ -68,13 +70,6 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
         count += len(cloud.noise)
     points, normals, noise = torch.split(rows[:count], [3, 3, 1], dim=1)
     return OrientedPoints(points_world=points, normals_world=normals, noise=noise[:, 0])
-
-
-def _covered(finer: Bool[Tensor, "fine_height fine_width"], like: Mask) -> Mask:
-    """Find coarse pixels on or beside which a finer one is valid."""
-    height, width = like.shape
-    fraction = adaptive_avg_pool2d(finer[None, None].float(), (height, width))
-    return max_pool2d(fraction, 3, 1, 1)[0, 0] > 0
 
 
 def _of_view(maps: DepthMaps, view: int, wanted: Mask) -> tuple[OrientedPoints, Mask]:

@@ -155,8 +155,10 @@ def fit_light_field(
     own_normals = normals[some].double()
     positions = torch.zeros_like(own_normals) if points is None else points[some].double()
     origin = positions.mean(dim=0)
-    size = _mean_distance(positions - origin)
-    geometry = own_normals, (positions - origin) / size
+    offsets = positions - origin
+    away = offsets[(offsets != 0).any(dim=1)]
+    size = away.norm(dim=1).sum() / len(offsets) if len(away) else offsets.new_ones(())
+    geometry = own_normals, offsets / size
     step = -(-views // _TOGETHER)
     groups = [samples.at((slice(None), slice(first, None, step))) for first in range(step)]
     name = _selected(groups[0], *geometry, iterations) if model == "auto" else model
@@ -271,12 +273,6 @@ def _selected(
         if not best or light_models.predicts_better(misfit, least):
             best, least = name, misfit
     return best
-
-
-def _mean_distance(positions: SampleVectors) -> Scalar:
-    """Return the mean distance of points from the origin; 1 if all are there."""
-    offsets = positions[(positions != 0).any(dim=1)]
-    return offsets.norm(dim=1).sum() / len(positions) if len(offsets) else positions.new_ones(())
 
 
 def _subsampled(templates: Templates, step: int) -> Templates:

@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -108,7 +107,9 @@ def integrate_normal_map(
         steps = perspective_steps(unit, mask, intrinsics)
     continuity = None
     anchor, unknown = _known(known_depth, mask, steps, intrinsics)
-    weights = _weights(steps, weight)
+    reliability = torch.where(steps.valid, weight.double(), 0)
+    least = torch.where(steps.reliable, at_both_ends(torch.minimum, reliability), _FILLED_WEIGHT)
+    weights = at_both_ends(torch.logical_and, steps.inside) * least / steps.unit**2
     if method == "discontinuities":
         continuity = find_discontinuities(steps, weights, anchor, unknown)
         weights = weights * joined(continuity.right, continuity.down)
@@ -123,13 +124,6 @@ def integrate_normal_map(
         valid=pad(steps.valid & mask, frame),
         continuity=continuity,
     )
-
-
-def _weights(steps: Steps, weight: Map) -> Float[Tensor, " step"]:
-    """Return the weights of squared differences of the unknown, zero outside the mask."""
-    reliability = torch.where(steps.valid, weight.double(), 0)
-    least = torch.where(steps.reliable, at_both_ends(torch.minimum, reliability), _FILLED_WEIGHT)
-    return at_both_ends(torch.logical_and, steps.inside) * least / steps.unit**2
 
 
 def _known(depth: Map, mask: Mask, steps: Steps, intrinsics: Matrix3 | None) -> tuple[Map, Map]:
