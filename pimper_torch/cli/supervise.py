@@ -1,8 +1,9 @@
 """The console's ``pimper``: a light process that watches the one that does the work.
 
-What kills the work, as a system without memory does, leaves the watcher, which says so; it passes
-on signals, and a second Ctrl-C ends the work at once. Where processes cannot be forked, as on
-Windows, there is one process alone.
+What kills the work, as a system without memory does, leaves the watcher, which says so. It passes
+on signals to stop, and kills work that has not ended a few seconds later, as a long call of a
+library does not hear them; a second Ctrl-C kills it at once. Where processes cannot be forked, as
+on Windows, there is one process alone.
 """
 
 import ctypes
@@ -16,12 +17,15 @@ import types
 from contextlib import suppress
 
 from pimper_torch.cli.stopping import SIGNALS
+from pimper_torch.runtime.scratch import remove_scratch
 
 _SHRINK = (
     "Shrink the photographs (`--max-size-px`), close other programs, or give `--max-memory` to be "
     "told before the surface takes too much."
 )
 _GOES_ON = "No result was written; the same command goes on from what stages finished."
+# A choice: with it every command ends within five seconds.
+_PATIENCE_SECONDS = 4.0
 
 
 def main() -> int:
@@ -36,15 +40,18 @@ def main() -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     watcher, worker = os.getpid(), os.fork()
 
-    presses: list[float] = []
+    first: list[tuple[float, int]] = []
 
     def heard(number: int, frame: types.FrameType | None) -> None:
-        if worker != 0:  # which `stoppable` stops; behind it, its end is near
-            presses.append(time.monotonic())
-            # The first press of Ctrl-C may reach both processes; nobody presses again so fast.
-            again = presses[-1] - presses[0] > 0.2
-            with suppress(ProcessLookupError):  # it has just ended
-                os.kill(worker, signal.SIGKILL if again else number)
+        if worker == 0:  # which `stoppable` stops; behind it, its end is near
+            return
+        if not first:
+            first.append((time.monotonic(), number))
+            signal.setitimer(signal.ITIMER_REAL, _PATIENCE_SECONDS)
+        # The first press of Ctrl-C may reach both processes; nobody presses again so fast.
+        again = number == signal.SIGALRM or time.monotonic() - first[0][0] > 0.2
+        with suppress(ProcessLookupError):  # it has just ended
+            os.kill(worker, signal.SIGKILL if again else number)
 
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as by nohup
@@ -57,6 +64,7 @@ def main() -> int:
             sys.stderr.flush()
             os._exit(code)
         return code
+    signal.signal(signal.SIGALRM, heard)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     _, status = os.waitpid(worker, 0)  # signals are heard while this waits
     ended = os.waitstatus_to_exitcode(status)
@@ -65,10 +73,11 @@ def main() -> int:
     from pimper_torch.cli.deaths import what_killed
     from pimper_torch.cli.output import Output
 
+    remove_scratch()
     output = Output(as_json="--json" in sys.argv)
-    if presses:
-        ended = -signal.SIGINT
-        output.error("Interrupted", f"ended at once. {_GOES_ON}", 128 - ended)
+    if first:
+        ended = -first[0][1]
+        output.error("Interrupted", f"killed, as it did not end by itself. {_GOES_ON}", 128 - ended)
     else:
         output.error("Killed", f"{what_killed(ended)} {_SHRINK} {_GOES_ON}", 128 - ended)
     return 128 - ended

@@ -52,4 +52,5 @@ def world(tmp_path, monkeypatch):
     monkeypatch.setattr(task, "_TRIES", 2)
     monkeypatch.setattr(task, "_LOOK_SECONDS", 0.05)
     monkeypatch.setattr(task, "_PATIENCE_SECONDS", 0.3)
+    monkeypatch.setattr(task, "_END_SECONDS", 0.3)
     return World(tmp_path)

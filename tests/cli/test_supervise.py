@@ -10,8 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli import supervise
+from pimper_torch.cli.options import bundled_photographs
 from pimper_torch.cli.stopping import stoppable
+from pimper_torch.doors.io.meshes import write_ply
+from pimper_torch.records import Mesh
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process alone")
 
@@ -119,14 +123,60 @@ def test_a_signal_is_one_message(tmp_path, number, group, importing):
     assert (last["event"], last["exit_code"]) == ("error", 128 + number)
 
 
+DEAF = f"while True:\n try:\n  {WAITS}\n except BaseException: pass"
+LEAVES = "from pimper_torch.runtime.scratch import scratch\nheld = scratch()\nheld.__enter__()\n"
+
+
+def test_what_does_not_hear_a_signal_is_killed_within_five_seconds(tmp_path, monkeypatch):
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    ran = Ran(tmp_path, at_run(LEAVES + DEAF))
+    assert any(temporary.iterdir())
+    began = time.monotonic()
+    ran.process.terminate()
+    returned, _, err = ran.end()
+    assert 4 < time.monotonic() - began < 5.5  # half a second for a busy machine
+    assert returned == 143
+    assert err.startswith("error: killed, as it did not end by itself. No result was written")
+    assert not any(temporary.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["evaluate", "reconstruct"])
+def test_a_command_inside_a_library_ends_within_five_seconds_of_a_signal(tmp_path, command):
+    """Ten million samples keep one call of a library busy for longer, as features may."""
+    vertices, faces = icosphere(7)
+    mesh, cloud = tmp_path / "mesh.ply", tmp_path / "cloud.ply"
+    write_ply(Mesh(vertices_world=vertices, faces=faces), mesh)
+    write_ply(Mesh(vertices_world=vertices, faces=faces[:0]), cloud)
+    given = {
+        "evaluate": [mesh, cloud, "--samples", "10000000"],
+        "reconstruct": [bundled_photographs(), "-o", tmp_path / "out"],
+    }
+    ran = subprocess.Popen(
+        [sys.executable, "-m", "pimper_torch", command, *map(str, given[command])],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(20)  # inside of the call, for most
+    began = time.monotonic()
+    ran.terminate()
+    _, err = ran.communicate(timeout=30)
+    assert time.monotonic() - began < 5.5
+    assert ran.returncode == 143
+    assert "No result was written" in err or "no result was written" in err
+    assert not (tmp_path / "out" / "mesh.ply").exists()
+
+
 def test_a_second_press_ends_what_cannot_be_interrupted(tmp_path):
-    ran = Ran(tmp_path, at_run(f"while True:\n try:\n  {WAITS}\n except BaseException: pass"))
+    ran = Ran(tmp_path, at_run(DEAF))
     os.killpg(ran.process.pid, signal.SIGINT)
     time.sleep(0.5)
     os.killpg(ran.process.pid, signal.SIGINT)
     returned, _, err = ran.end()
     assert returned == 130
-    assert "ended at once" in err
+    assert "killed, as it did not end by itself" in err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others look once a second")

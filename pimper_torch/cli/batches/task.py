@@ -44,8 +44,10 @@ sys.exit(main())
 _OF_MEMORY = ("MemoryError", "OutOfMemoryError")
 _TRIES = 3  # a choice
 _LOOK_SECONDS = 0.5
+_PATIENCE_SECONDS = 10.0  # a choice
 # A choice: a stage's step is longer in large runs, which are killed then; their stages are kept.
-_PATIENCE_SECONDS = 10.0
+# The batch itself has four seconds to end.
+_END_SECONDS = 2.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,6 +200,6 @@ def _end(child: "subprocess.Popen[bytes]") -> None:
     if child.poll() is None:
         child.terminate()
         with suppress(subprocess.TimeoutExpired):
-            child.wait(_PATIENCE_SECONDS)
+            child.wait(_END_SECONDS)
     child.kill()
     child.wait()

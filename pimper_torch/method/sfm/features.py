@@ -1,7 +1,6 @@
 """SIFT features of photographs, found by COLMAP on the CPU."""
 
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from pimper_torch.records import Views
 from pimper_torch.runtime.mapped import drop_pages
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.progress import track
+from pimper_torch.runtime.scratch import scratch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,9 +63,9 @@ class Workspace:
 @contextmanager
 def workspace(views: Views, threads: int) -> Iterator[Workspace]:
     """Write photographs and masks to a temporary folder, which goes when the block ends."""
-    with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
+    with scratch() as folder:
         space = Workspace(
-            folder=Path(folder),
+            folder=folder,
             files=tuple(f"{index:06d}.png" for index in range(views.num_views)),
             masked=views.masks is not None,
         )

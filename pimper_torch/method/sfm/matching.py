@@ -20,6 +20,7 @@ from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES, ReconstructC
 from pimper_torch.records import Record
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.runtime.progress import track
+from pimper_torch.runtime.scratch import scratch
 
 # Photographs up to which a set is small: every pair is matched, and every point is looked for in
 # every view. Beyond, work grows with their number, not its square; see docs/decisions.md.
@@ -288,8 +289,8 @@ class Verifier:
         verifying = pycolmap.GeometricVerifierOptions()
         verifying.num_threads = settings.num_threads
         ids = {pair: tuple(matched.ids[view] for view in pair) for pair in pairs}
-        with tempfile.TemporaryDirectory(prefix="pimper_") as folder:
-            path = Path(folder) / "pairs.db"
+        with scratch() as folder:
+            path = folder / "pairs.db"
             with pycolmap.Database.open(path) as stored:
                 for camera in {camera.camera_id: camera for camera in matched.cameras}.values():
                     stored.write_camera(camera, use_camera_id=True)
