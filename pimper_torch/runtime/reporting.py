@@ -3,6 +3,7 @@
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -22,6 +23,7 @@ from pimper_torch.records import (
     Mesh,
     OrientedPoints,
     PatchSet,
+    PatchStatus,
     PatchViews,
     PhotometricPatches,
     Silhouettes,
@@ -267,9 +269,10 @@ def _(photometric: PhotometricPatches) -> dict[str, int | float]:
     inside = sum(int(templates.inside.sum()) for templates, _ in pairs)
     count = photometric.patches.num_patches
     ended = [bucket.convergence for _, bucket in pairs]
+    statuses = Counter(code for _, bucket in pairs for code in bucket.status.tolist())
     return {
         "valid_fraction": sum(int(bucket.valid.sum()) for _, bucket in pairs) / inside,
-        "determined_patches": sum(int(bucket.determined.sum()) for _, bucket in pairs),
+        **{f"{status.name.lower()}_patches": statuses[status] for status in PatchStatus},
         "converged_patches": sum(int(end.converged.sum()) for end in ended),
         "mean_iterations": sum(float(end.iterations.sum()) for end in ended) / count,
         "mean_residual": sum(float(end.residual.detach().sum()) for end in ended) / count,

@@ -171,6 +171,7 @@ def test_the_summary_counts(reconstruction):
         "triangles": 2,
         "samples": 96,
         "missing_fraction": 0.25,
+        "undetermined_fraction": 0.5,
         "vertices": 225,
         "seconds": 2.0,
         "peak_memory_mb": 310.0,

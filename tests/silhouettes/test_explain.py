@@ -47,6 +47,11 @@ def test_what_sticks_out_is_told_with_the_photograph(contours):
     assert found.uncovered.max() < 0.01
 
 
+def test_no_more_than_plain_sets_have_is_a_figure_and_no_warning(contours, recwarn):
+    assert 0.05 < explain(sphere(1.03), contours, NAMES).outside.max() < 0.09
+    assert not recwarn.list
+
+
 def test_unsure_silhouettes_and_views_that_are_not_relied_on_count_less(contours):
     silhouettes = contours.silhouettes
     unsure = torch.where(silhouettes.inside < 0.5, 0.25, silhouettes.inside)

@@ -131,8 +131,10 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
     scene = result.scene
     figures = {key: value for report in result.report for key, value in report.figures.items()}
     samples, missing = figures.get("samples"), figures.get("missing_samples", 0)
-    ends = [bucket.convergence for bucket in result.patches.photometric.buckets]
+    buckets = result.patches.photometric.buckets
+    ends = [bucket.convergence for bucket in buckets]
     patches = sum(len(end.converged) for end in ends)
+    undetermined = sum(int((~bucket.determined).sum()) for bucket in buckets)
     # Peaks are of the process so far: the first that reaches the highest raised it.
     peak = max(result.report, key=lambda report: report.peak_memory_mb, default=None)
     return {
@@ -151,6 +153,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "triangles": len(result.coarse.mesh.faces),
         "samples": samples,
         "missing_fraction": missing / samples if samples else None,
+        "undetermined_fraction": undetermined / max(1, patches),
         "vertices": len(result.mesh.vertices_world),
         "faces": len(result.mesh.faces),
         "seconds": sum(report.seconds for report in result.report),

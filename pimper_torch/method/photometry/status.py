@@ -10,6 +10,9 @@ from torch import Tensor
 from pimper_torch.records import PatchStatus, Photometry
 from pimper_torch.runtime.errors import caution
 
+# Plain sets have up to 0.48: jar 0.48, balls 0.43 and potatoes 0.40 (12 views along the arc,
+# 320x240, fast), the demo 0.28. Half of these facets are at the back, where no view sees them.
+_MOST_UNDETERMINED = 0.6
 _DOUBT = (
     " If the light did move between the photographs, cameras or silhouettes are wrong: look at "
     "`overview.png`, and give masks or put a plain cloth behind the object."
@@ -64,14 +67,14 @@ def light_varies(
 def warn_of_undetermined(
     buckets: Sequence[Photometry], min_views: int, min_light_variation: float
 ) -> None:
-    """Warn once, with the number of patches whose light does not determine normals, by cause.
+    """Warn once, with counts by cause, where light does not determine the normals of most patches.
 
-    Those that failed are told by :mod:`pimper_torch.runtime.failures`.
+    :mod:`pimper_torch.runtime.failures` reports those that failed.
     """
     statuses = Counter(code for bucket in buckets for code in bucket.status.tolist())
     total = sum(statuses.values())
     undetermined = total - statuses[PatchStatus.DETERMINED] - statuses[PatchStatus.FAILED]
-    if undetermined == 0:
+    if undetermined <= _MOST_UNDETERMINED * total:
         return
     causes = {
         PatchStatus.UNSEEN: "{} have no valid sample in any view",
