@@ -310,13 +310,12 @@ def check(job: Job) -> Job:
                 require_name(path, InputError)
     present = [image_name(path, job.photos) for path in list_images(job.photos)]
     least = job.config.factorize.min_views
-    require(
-        len(present) >= least,
-        f"{job.photos}: the number of photographs",
-        len(present),
-        f"{least} at least, better 10 or more: a normal comes from {least} lights or more "
-        "(`factorize.min_views`)",
-    )
+    if len(present) < least:
+        raise InputError(
+            f"{job.photos}: the number of photographs is {len(present)}; needed: {least} at least, "
+            f"better 10 or more: a normal comes from {least} lights or more "
+            "(`factorize.min_views`)."
+        )
     references = [job.config.coarse_surface.reference]
     if isinstance(job.config, PublishedConfig):
         references.append(job.config.triangulate.reference)

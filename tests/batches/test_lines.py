@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import pytest
 
@@ -47,7 +48,7 @@ def test_names_and_messages_are_text_on_the_page(tmp_path):
         Outcome(name=name, status="ended", seconds=1.25),
         Outcome(name="x", status="failed", message="<script>"),
     ]
-    write_table(outcomes, tmp_path, {name: "photos", "x": "photos"})
+    write_table(outcomes, tmp_path, {name: "photos", "x": "scans/x"})
     page = (tmp_path / "batch.html").read_text()
     assert "<script>" not in page
     assert "<b>" not in page
@@ -56,3 +57,27 @@ def test_names_and_messages_are_text_on_the_page(tmp_path):
     read = [*csv.DictReader((tmp_path / "batch.csv").open(newline=""))]
     assert [row["name"] for row in read] == [name, "x"]
     assert [row["faces"] for row in read] == ["12", ""]
+
+
+def test_the_page_rounds_figures_and_has_each_reason_once(tmp_path):
+    (tmp_path / "cup").mkdir()
+    summary = {"views": 24, "registered": 23, "vertices": 86801, "peak_memory_mb": 1245.81640625}
+    (tmp_path / "cup" / "summary.json").write_text(json.dumps(summary | {"seconds": 71.18979}))
+    outcomes = [
+        Outcome(name="cup", status="kept"),
+        Outcome(name="jar", status="failed", message="scans/jar: 2 photographs; see `--masks`."),
+        Outcome(name="jug", status="failed", message="scans/jug: 2 photographs; see `--masks`."),
+        Outcome(name="pot", status="lost", message=f"{tmp_path / 'pot'}: it is full."),
+    ]
+    write_table(outcomes, tmp_path, {one.name: f"scans/{one.name}" for one in outcomes})
+    page = (tmp_path / "batch.html").read_text()
+    shown = ("23 of 24", "86,801", "71 s", "1,246 MB", "1 of 4 objects", "1 kept, 2 failed, 1 lost")
+    assert all(f">{one}<" in page for one in shown)
+    rows = re.findall(r'<tr><td class="text">(.*)</td><td class="text">(.*)</td></tr>', page)
+    assert rows == [
+        ("PHOTOS: 2 photographs; see <code>--masks</code>.", "jar, jug"),
+        (f"{tmp_path / 'pot'}: it is full.", "pot"),
+    ]
+    assert "var(--bad)" in page  # the report's style
+    (cup, *_) = csv.DictReader((tmp_path / "batch.csv").open(newline=""))
+    assert (cup["seconds"], cup["peak_memory_mb"]) == ("71.2", "1245.8")

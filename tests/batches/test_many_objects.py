@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import time
 from concurrent.futures import (
     CancelledError,
@@ -111,6 +112,41 @@ def test_what_is_whole_is_passed_over_and_what_changed_is_refused(world):
     assert "--overwrite" in found["ball"].message
     assert world.begun("ball") == 1
     assert world.statuses(overwrite=True) == {"ball": "ended", "cup": "kept"}
+
+
+def test_too_few_photographs_are_a_failed_row_and_not_the_end_of_all(world):
+    world.add("ball")
+    photos = world.add("cup")
+    for name in ("2.png", "3.png"):
+        (photos / name).unlink()
+    found = world.batch()
+    assert (found["ball"].status, found["cup"].status) == ("ended", "failed")
+    assert "cup: the number of photographs is 2; needed: 4" in found["cup"].message
+
+
+def test_what_changed_since_the_result_is_named(world):
+    photos, masks = world.add("ball"), world.folder / "masks"
+    masks.mkdir()
+    for number in range(4):
+        shutil.copy(photos / f"{number}.png", masks)
+    given = ["--masks", str(masks), "--faces", "500", "--cache", str(world.folder / "cache")]
+    assert world.statuses(settings=given) == {"ball": "ended"}
+    (world.folder / "cache").mkdir()
+    (world.folder / "cache" / "kept").touch()  # of runs, not of what is read
+    assert world.statuses(settings=given) == {"ball": "kept"}
+    (masks / "0.png").write_bytes((masks / "0.png").read_bytes() + b"more")
+    (photos / "1.png").rename(photos / "5.png")
+    (photos / "more.txt").touch()
+    given[3] = "600"
+    (told,) = world.batch(settings=[*given, "--stl"]).values()
+    assert told.status == "failed"
+    assert told.message.endswith(
+        " Differences since it was made: without --faces 500; with --faces 600, --stl; changed "
+        "0.png (--masks); added 5.png (PHOTOS), more.txt (PHOTOS); missing 1.png (PHOTOS)."
+    )
+    (world.out / ".stages" / "ball.key").write_text("0123456789abcdef0123456789abcdef")
+    (told,) = world.batch(settings=given).values()
+    assert "An earlier version made it, and did not record its settings" in told.message
 
 
 def test_results_inside_the_list_are_no_objects(world):

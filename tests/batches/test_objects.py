@@ -29,6 +29,27 @@ def test_a_folder_of_folders_has_an_object_each(scans):
     ]
 
 
+def test_a_link_has_its_own_name(scans):
+    (scans / "bowl").symlink_to(scans / "cup")
+    assert names(scans) == ["ball", "bowl", "cup"]
+    assert names([scans / "bowl", scans / "bowl" / ".."]) == ["bowl", "scans"]
+
+
+def test_the_name_in_a_table_wins_over_that_of_the_folder(scans, tmp_path):
+    (scans / ".raw").mkdir()
+    table = tmp_path / "list.csv"
+    table.write_text("photos,name\nscans/.raw,bowl\nscans/cup,\n")
+    assert names(table) == ["bowl", "cup"]
+
+
+def test_a_cell_of_several_values_is_split_as_by_a_shell(scans, tmp_path):
+    table = tmp_path / "list.csv"
+    table.write_text("photos;scale-bar;masks\nscans/cup;'a b.png,1,2' 1.png,3,4 25;my masks\n")
+    (cup,) = read_objects(table)
+    masks = str(tmp_path / "my masks")  # one value is taken as it is
+    assert cup.settings == ("--scale-bar", "a b.png,1,2", "1.png,3,4", "25", "--masks", masks)
+
+
 def test_a_table_has_settings_in_every_row(scans, tmp_path):
     (tmp_path / "mine.yaml").write_text("scales: [0.5]\n")
     table = tmp_path / "list.csv"
@@ -66,6 +87,7 @@ def test_a_table_has_settings_in_every_row(scans, tmp_path):
         ("photos,name\nscans/cup,.stages\n", "does not begin with a dot"),
         ("photos,name\nscans/cup,batch.csv\n", "row 2: the name is 'batch.csv'"),
         ("photos,name\nscans/cup,a\nscans/ball,A\n", "several objects have one name"),
+        ("photos;scale-bar\nscans/cup;'a.png,1,2 b.png,3,4 5\n", "row 2: --scale-bar is 'a.png"),
         ("photos\n", "no objects; needed: a folder of folders"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import csv
 import re
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -75,9 +76,13 @@ def read_objects(given: Path | str | Sequence["Object | Path | str"]) -> list[Ob
     return found
 
 
-def _in_folder(folder: Path) -> Object:
-    inner = folder / "photos"
-    return Object(name=folder.resolve().name, photos=inner if inner.is_dir() else folder)
+def _in_folder(
+    folder: Path, name: str = "", settings: tuple[str, ...] = (), where: str = ""
+) -> Object:
+    """Return an object by the name of its folder, for a link its own, unless another is given."""
+    own = folder if folder.name not in ("", "..") else folder.resolve()
+    photos = folder / "photos" if (folder / "photos").is_dir() else folder
+    return Object(name=name or own.name, photos=photos, settings=settings, where=where)
 
 
 def _in_table(path: Path) -> list[Object]:
@@ -116,16 +121,13 @@ def _in_table(path: Path) -> list[Object]:
             word
             for column, cell in cells.items()
             if cell
-            for word in _words(f"--{column.replace('_', '-')}", cell, kinds, path.parent)
+            for word in _words(where, f"--{column.replace('_', '-')}", cell, kinds, path.parent)
         ]
-        one = _in_folder(path.parent / photos)
-        found.append(
-            Object(name=name or one.name, photos=one.photos, settings=(*settings,), where=where)
-        )
+        found.append(_in_folder(path.parent / photos, name, (*settings,), where))
     return found
 
 
-def _words(option: str, cell: str, kinds: Mapping[str, str], base: Path) -> list[str]:
+def _words(where: str, option: str, cell: str, kinds: Mapping[str, str], base: Path) -> list[str]:
     """Write a cell as on a command line; paths are relative to the table."""
     kind = kinds.get(option)
     if kind == "" and cell.lower() in (*_YES, *_NO):
@@ -134,4 +136,10 @@ def _words(option: str, cell: str, kinds: Mapping[str, str], base: Path) -> list
         return [option] if cell.lower() in _YES else [negated] if negated in kinds else []
     if kind in _PATHS or (option == "--preset" and (base / cell).is_file()):
         cell = str((base / cell).absolute())
-    return [option, *(cell.split() if kind and " " in kind else [cell])]
+    try:
+        return [option, *(shlex.split(cell) if kind and " " in kind else [cell])]
+    except ValueError as error:
+        raise ConfigError(
+            f"{where}: {option} is {cell}, which a shell does not split ({error}); needed: quotes "
+            "in pairs around a name with spaces."
+        ) from error

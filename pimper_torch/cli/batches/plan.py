@@ -1,8 +1,9 @@
 """Plan of every object before anything starts: its arguments, and its expected cost."""
 
-import hashlib
+import json
+import shlex
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import accumulate
@@ -16,7 +17,7 @@ from pimper_torch.cli.doctor.cost import estimate
 from pimper_torch.cli.doctor.machine import available_gb
 from pimper_torch.cli.options import check, inputs_of, parse
 from pimper_torch.runtime.cores import usable_cores
-from pimper_torch.runtime.errors import ConfigError, PimperError
+from pimper_torch.runtime.errors import ConfigError, OutputError, PimperError, some
 
 _REPLACES = "--overwrite"
 # A try may take so many times the estimate, and an hour in any case: a choice. What a slower
@@ -50,7 +51,7 @@ def planned_batch(
                 name=thing.name,
                 arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
                 out=target,
-                key=_key(own, inputs_of(job).values()),
+                key=_made_from(own, inputs_of(job)),
                 limit_s=max(_LEAST_S, _PATIENCE * seconds),
                 mem_gb=gigabytes,
             )
@@ -60,7 +61,8 @@ def planned_batch(
         except ConfigError as error:
             raise ConfigError(f"{thing.where or thing.name}: {error}") from error
         except PimperError as error:
-            return Outcome(name=thing.name, status="failed", message=str(error))
+            since = _changes(task) if isinstance(error, OutputError) else ""
+            return Outcome(name=thing.name, status="failed", message=f"{error}{since}")
         return task
 
     with warnings.catch_warnings():
@@ -90,15 +92,39 @@ def _pixels(photos: Path, max_size_px: int) -> tuple[float, int]:
     return 24.0 * len(files), len(files)  # Pillow reads none of them, as camera raw
 
 
-def _key(words: Sequence[str], inputs: Iterable[Path | None]) -> str:
-    """Hash arguments, and the names, sizes and times of all files that a run reads."""
-    hashed = hashlib.blake2b(repr(words).encode(), digest_size=16)
+def _made_from(words: Sequence[str], inputs: Mapping[str, Path | None]) -> str:
+    """List what a result is made from: arguments, and the size and time of every file, as JSON."""
+    options = [f"PHOTOS {inputs['PHOTOS']}"]
+    for word in words:
+        if word.startswith("--"):
+            options.append(word)
+        else:
+            options[-1] += f" {shlex.quote(word)}"
+    read = [(name, path) for name, path in inputs.items() if path and name != "--cache"]
     presets = [Path(word) for word in words if word.endswith((".yaml", ".yml"))]
-    for given in (*inputs, *presets):
-        if given is None:
-            continue
+    files = {}
+    for name, given in (*read, *(("--preset", path) for path in presets)):
         for path in (given, *sorted(given.rglob("*"))):
             if path.is_file():
                 about = path.stat()
-                hashed.update(f"{path} {about.st_size} {about.st_mtime_ns}\n".encode())
-    return hashed.hexdigest()
+                inside = path.relative_to(given if given.is_dir() else given.parent)
+                files[f"{inside} ({name})"] = [about.st_size, about.st_mtime_ns]
+    return json.dumps({"options": options, "files": files})
+
+
+def _changes(task: Task) -> str:
+    """State in a sentence how what a result was made from differs from what it would be now."""
+    try:
+        former, now = (json.loads(one) for one in (task.made_from() or task.key, task.key))
+        then, files = former["options"], former["files"]
+    except (ValueError, TypeError, KeyError):
+        return " An earlier version made it, and did not record its settings and files."
+    parts = {
+        "without": [one for one in then if one not in now["options"]],
+        "with": [one for one in now["options"] if one not in then],
+        "changed": [one for one, about in now["files"].items() if files.get(one, about) != about],
+        "added": [one for one in now["files"] if one not in files],
+        "missing": [one for one in files if one not in now["files"]],
+    }
+    told = "; ".join(f"{how} {some(names)}" for how, names in parts.items() if names)
+    return f" Differences since it was made: {told}." if told else ""

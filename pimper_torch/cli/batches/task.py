@@ -56,7 +56,7 @@ class Task:
 
     Attributes:
         arguments: Of ``pimper reconstruct``, with absolute paths.
-        key: Hash of the arguments and of all files that are read.
+        key: Arguments and all files that are read, as JSON.
         limit_s: Seconds after which a try is ended.
     """
 
@@ -71,6 +71,11 @@ class Task:
     def beside(self, suffix: str) -> Path:
         """Return a file of the object in ``.stages`` of the batch."""
         return self.out.parent / STAGES / f"{self.name}{suffix}"
+
+    def made_from(self) -> str:
+        """Return the key that was written before the latest run began; empty without one."""
+        path = self.beside(".key")
+        return path.read_text(encoding="utf-8") if path.exists() else ""
 
     @property
     def stopped(self) -> bool:
@@ -134,10 +139,9 @@ def is_whole(task: Task) -> bool:
 
     It is newer than the key that was written before its run, whoever saw how that ended.
     """
-    key = task.beside(".key")
     with suppress(OSError):
-        written = (task.out / MARKER).stat().st_mtime_ns >= key.stat().st_mtime_ns
-        return written and key.read_text(encoding="utf-8") == task.key
+        written, begun = (one.stat() for one in (task.out / MARKER, task.beside(".key")))
+        return written.st_mtime_ns >= begun.st_mtime_ns and task.made_from() == task.key
     return False
 
 
@@ -148,9 +152,8 @@ def _tried(task: Task, latest: float) -> tuple[Status, str]:
             with locked(task.out, task.out):
                 if is_whole(task):
                     return "kept", ""
-                key = task.beside(".key")
-                if not (key.exists() and key.read_text(encoding="utf-8") == task.key):
-                    key.write_text(task.key, encoding="utf-8")
+                if task.made_from() != task.key:
+                    task.beside(".key").write_text(task.key, encoding="utf-8")
             break
         except OutputError as error:  # another run holds it: that is said, and nothing taken away
             if time.monotonic() > patient:
