@@ -3,7 +3,7 @@ import unicodedata
 import pytest
 
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.runtime.file_names import match_files
+from pimper_torch.runtime.file_names import match_files, match_poses
 
 
 def matched(wanted, present, folder=""):
@@ -101,3 +101,27 @@ def test_two_photographs_that_fit_one_image_are_refused_with_both():
 
 def test_an_image_that_is_taken_exactly_is_no_other_photograph_s():
     assert matched(["a.jpg", "A.jpg"], ["a.jpg"]) == [0, None]
+
+
+PHOTOGRAPHS = ["p1/a.jpg", "p1/b.jpg", "p2/a.jpg", "p2/b.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("present", "places"),
+    [
+        (["p1/b.jpg", "p2/a.jpg"], [0, 0, 1, 1]),
+        (["p2.png", "p1.png"], [1, 1, 0, 0]),
+        (["x/p2/mean.png", "x/p1/mean.png"], [1, 1, 0, 0]),
+        (["p1/b.jpg", "p1.png", "p1/a.jpg"], [2, 0, None, None]),  # its own goes before
+        (["p1/b.jpg", "p1.png"], [0, 0, None, None]),
+        (["p1/c.jpg", "p1/d.jpg", "P2.JPG"], [None, None, 2, 2]),  # which of two is not known
+        (["p2/a.jpg"], [None, None, 0, 0]),
+        (["p3/a.jpg", "p1/a.jpg", "p3/b.jpg"], [1, 1, None, None]),
+    ],
+)
+def test_what_a_photograph_lacks_is_that_of_its_pose(present, places):
+    assert match_poses(PHOTOGRAPHS, present, where="model", what="image") == places
+
+
+def test_photographs_without_folders_are_of_no_pose():
+    assert match_poses(["a.jpg", "b.jpg"], ["a.jpg"], where="model", what="image") == [0, None]

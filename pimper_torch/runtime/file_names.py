@@ -68,6 +68,54 @@ def match_files(
     return _of_one_folder(paths, present, found)
 
 
+def match_poses(
+    wanted: Sequence[str], present: Sequence[str], *, folder: str = "", where: str, what: str
+) -> list[int | None]:
+    """Find the file of each photograph, or of the pose whose folder the photograph is in.
+
+    Where none is found by :func:`match_files`, it is that of another photograph in the folder, else
+    the one that is called like the folder, else the only one in a folder of that name.
+
+    >>> match_poses(["p1/a.jpg", "p1/b.jpg", "p2/a.jpg"], ["p2.png", "p1/b.jpg"], where="", what="")
+    [1, 1, 0]
+    """
+    poses = [name.rpartition("/")[0] for name in wanted]
+    folders = [next(iter(_folders(name)), "") for name in present]
+    found: list[int | None] = [None] * len(wanted)
+
+    def match(views: Sequence[int], places: Sequence[int]) -> None:
+        names = [wanted[view] for view in views], [present[place] for place in places]
+        matched = match_files(*names, folder=folder, where=where, what=what)
+        for view, at in zip(views, matched, strict=True):
+            found[view] = None if at is None else places[at]
+
+    for pose in dict.fromkeys(filter(None, poses)):
+        own = [place for place, one in enumerate(folders) if one == _folded(pose)]
+        match([view for view, one in enumerate(poses) if one == pose], own)
+    known = {place for place in found if place is not None}
+    elsewhere = [
+        place for place, one in enumerate(folders) if place not in known and not (known and one)
+    ]
+    match([view for view, place in enumerate(found) if place is None], elsewhere)
+
+    of_pose: dict[str, int] = {}
+    for pose, place in zip(poses, found, strict=True):
+        if pose and place is not None:
+            of_pose.setdefault(pose, place)
+    free = [place for place in range(len(present)) if place not in found]
+    alone = [folders[place] for place in free]
+    alone = [one if alone.count(one) == 1 else "" for one in alone]
+    for called in ([present[place] for place in free], alone):
+        lost = [pose for pose in dict.fromkeys(filter(None, poses)) if pose not in of_pose]
+        for pose, at in zip(lost, match_files(lost, called, where=where, what=what), strict=True):
+            if at is not None:
+                of_pose[pose] = free[at]
+    return [
+        of_pose.get(pose) if place is None else place
+        for pose, place in zip(poses, found, strict=True)
+    ]
+
+
 def _of_one_folder(
     paths: Sequence[str], present: Sequence[str], found: list[int | None]
 ) -> list[int | None]:

@@ -14,7 +14,7 @@ from torch.testing import assert_close
 
 from pimper_torch.method.sfm.existing import existing_model
 from pimper_torch.method.sfm.undistort import pinholes_for
-from pimper_torch.records import Cameras
+from pimper_torch.records import Cameras, Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 
@@ -115,6 +115,39 @@ def test_a_model_of_jpegs_is_that_of_raw_photographs_of_the_same_names(rig, suff
     found = existing_model(views, rigs.of_colmap(rig, tmp_path, names=jpegs))
     assert found.names == views.names
     assert_close(found.cam_from_world, rig.cam_from_world, rtol=0, atol=1e-6)
+
+
+def of_poses() -> Views:
+    """Photographs in folders that are called as the rig's, under two lights each."""
+    views = rigs.views_of()
+    poses = torch.arange(3).repeat_interleave(2)
+    names = [
+        f"{Path(rigs.NAMES[pose]).stem}/light {light}.png" for pose in range(3) for light in "xy"
+    ]
+    return views.take(poses.tolist()).replace(names=tuple(names), poses=poses)
+
+
+@pytest.mark.parametrize("write", WAYS)
+def test_one_camera_a_folder_is_that_of_every_light_of_the_pose(rig, write, tmp_path):
+    found = existing_model(of_poses(), write(rig, tmp_path))
+    assert found.names == of_poses().names
+    every = rig.take(torch.arange(3).repeat_interleave(2))
+    assert_close(found.cam_from_world, every.cam_from_world, rtol=0, atol=1e-6)
+    assert_close(pinholes_for(found.lenses), every.intrinsics, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("10/light y.png", "2/light x.png", "a b/light_x.jpg"),
+        ("photos/10/mean.png", "photos/2/mean.png", "photos/a_b/mean.png"),
+        ("10/light x.png", "2.jpg", "A B/sum.png"),
+    ],
+)
+def test_a_camera_of_any_picture_of_a_pose_is_that_of_its_lights(rig, names, tmp_path):
+    found = existing_model(of_poses(), rigs.of_colmap(rig, tmp_path, names=names))
+    every = rig.cam_from_world.repeat_interleave(2, dim=0)
+    assert_close(found.cam_from_world, every, rtol=0, atol=1e-6)
 
 
 def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):

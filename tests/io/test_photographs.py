@@ -1,3 +1,4 @@
+import shutil
 import struct
 import time
 import tracemalloc
@@ -221,6 +222,23 @@ def test_folders_inside_hold_the_photographs_of_a_pose_each(tmp_path, pixels):
     with pytest.warns(PimperWarning, match="3 poses"):
         shared = load_views(tmp_path / "photos", masks=tmp_path / "shared")
     assert torch.equal(shared.masks, views.masks)
+
+
+@pytest.mark.parametrize("beside", ["masks", "Mask", "silhouettes", "normals", "depth"])
+def test_a_folder_of_masks_or_maps_beside_those_of_poses_is_no_pose(tmp_path, pixels, beside):
+    for pose in (1, 2, 3):
+        save(tmp_path / f"pose_{pose}" / "1.png", pixels)
+        save(tmp_path / beside / f"pose_{pose}.png", pixels[..., 0])
+    with pytest.warns(PimperWarning) as told:
+        views = load_views(tmp_path, masks=tmp_path / beside)
+    assert views.names == tuple(f"pose_{pose}/1.png" for pose in (1, 2, 3))
+    assert views.poses.tolist() == [0, 1, 2]
+    passed = [str(one.message) for one in told if "were not read" in str(one.message)]
+    assert len(passed) == 1
+    assert f"folder of images (1); {beside}." in passed[0]
+    shutil.rmtree(tmp_path / "pose_3")
+    with pytest.raises(InputError, match="no images"):
+        load_views(tmp_path)
 
 
 def test_two_folders_inside_are_no_poses(tmp_path, pixels):

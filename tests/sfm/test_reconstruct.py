@@ -76,6 +76,23 @@ def test_photographs_that_the_model_lacks_are_left_out_with_a_warning(scene, vie
         )
 
 
+def test_one_image_a_folder_places_every_photograph_of_the_pose(scene, views, tmp_path):
+    write_model(scene, tmp_path)
+    twice = [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
+    names = [
+        f"{name.rpartition('.')[0]}/light_{light}.tif" for name in views.names for light in "ab"
+    ]
+    lit = views.take(twice).replace(names=tuple(names), poses=torch.tensor(twice))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        placed, plain = Reconstruct()(lit, tmp_path), Reconstruct()(views, tmp_path)
+    assert placed.views.names == tuple(names)
+    assert placed.unregistered == ()
+    assert torch.equal(placed.cameras.cam_from_world, plain.cameras.cam_from_world[twice])
+    assert torch.equal(placed.points_world, plain.points_world)
+    assert torch.equal(placed.observed, plain.observed[:, twice])
+
+
 def test_a_models_subfolders_do_not_matter(scene, views, tmp_path):
     inside = scene.replace(
         views=scene.views.replace(names=tuple(f"images/{name}" for name in views.names))

@@ -43,7 +43,8 @@ def read_camera_arrays(
     - or ``projections`` or ``P``, 3x4 each, ``K [R | t]`` up to a factor.
 
     They belong to ``names``, if that array is there, or else to the photographs in plain order of
-    their names (``10`` before ``2``), of which there are as many.
+    their names (``10`` before ``2``), of which there are as many, or else to their folders, of
+    which each holds the photographs of a pose.
 
     Returns:
         Without cameras of photographs that are not there.
@@ -56,13 +57,15 @@ def read_camera_arrays(
         names = [str(name) for name in arrays["names"].reshape(-1).tolist()]
         file.expect(len(names) == len(poses), f"{len(poses)} names", f"{len(names)}")
     else:
+        folders = {name.rpartition("/")[0] for name in photographs} - {""}
+        names = sorted(folders if len(folders) == len(poses) else photographs)
+        of_poses = f" or of {len(folders)} folders" if folders else ""
         file.expect(
-            len(poses) == len(photographs),
-            f"one camera for each of {len(photographs)} photographs, in plain order of their "
-            "names, or an array `names`",
+            len(poses) == len(names),
+            f"one camera for each of {len(photographs)} photographs{of_poses}, in plain order of "
+            "their names, or an array `names`",
             f"{len(poses)} cameras",
         )
-        names = sorted(photographs)
     cameras = [
         PosedCamera(
             name=name, lens=pinhole_lens(K, size), skew_px=float(K[0, 1]), cam_from_world=pose

@@ -23,6 +23,10 @@ _PICTURES = re.compile(
     re.IGNORECASE,
 )
 _VIDEO = re.compile(r"\.(mp4|mov|avi|mkv|m4v|webm|mts)", re.IGNORECASE)
+# Folders next to those of poses that hold what belongs to photographs.
+_MAPS = re.compile(
+    r"(masks?|silhouettes?|mattes?|segmentations?|normals?|depths?|disparit(y|ies))", re.IGNORECASE
+)
 
 # Which of several files of one name is read: the extra that they need; least first.
 _RANKS = {"raw": 0, "": 1, "heic": 2}
@@ -39,7 +43,7 @@ def list_images(folder: Path | str) -> list[Path]:
     """List the image files of a folder in natural order: ``img2`` before ``img10``.
 
     Of a folder that holds none, those of the folders inside, if three at least hold some: each
-    holds the photographs of one pose of the camera.
+    holds the photographs of one pose of the camera. Folders of masks and maps are not poses.
 
     Raises:
         InputError: No such folder, no images in it, or two of one stem.
@@ -55,7 +59,8 @@ def list_images(folder: Path | str) -> list[Path]:
         raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
     paths = _readable(entries)
     if not paths:
-        inside = [path for path in sorted(entries) if path.is_dir() and _holds_images(path)]
+        poses = [path for path in sorted(entries) if not _MAPS.fullmatch(path.name)]
+        inside = [path for path in poses if path.is_dir() and _holds_images(path)]
         if len(inside) >= MIN_PHOTOGRAPHS:
             paths = [image for one in inside for image in _readable(_visible(one))]
     if not paths:

@@ -14,15 +14,16 @@ from pimper_torch.method.sfm.model import SparseModel, match_names
 from pimper_torch.method.sfm.model_files import largest_model
 from pimper_torch.records import Lens, Views
 from pimper_torch.runtime.errors import InputError, ReconstructionError, caution, some
-from pimper_torch.runtime.file_names import match_files
+from pimper_torch.runtime.file_names import match_poses
 
 
 def existing_model(views: Views, path: Path) -> SparseModel:
     """Read cameras and put them in the photographs' order, sizes and orientations.
 
     Args:
-        views: Matched by file name; cameras may have been made from photographs of another size,
-            and from the pixels that files store where EXIF turns them by a quarter.
+        views: Matched by file name; photographs of one folder that the cameras lack have the camera
+            of their pose. Cameras may have been made from photographs of another size, and from the
+            pixels that files store where EXIF turns them by a quarter.
         path: Folder of a COLMAP model, or of several in folders, of which the
             largest is read; or a file of cameras, see
             :func:`~pimper_torch.doors.camera_files.read_cameras.read_cameras`.
@@ -135,7 +136,7 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
 def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[int, int] | None]:
     """Return the sizes of photographs in their files, which others' programs count pixels of."""
     where = place(path)
-    found = match_files(views.names, names, folder=views.folder, where=where, what="camera")
+    found = match_poses(views.names, names, folder=views.folder, where=where, what="camera")
     sizes = {at: _stored_size(views, view) for view, at in enumerate(found) if at is not None}
     return [sizes.get(at) for at in range(len(names))]
 

@@ -11,7 +11,7 @@ from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Lens, Record, pairs_table
 from pimper_torch.records.scene import no_maps, no_series
 from pimper_torch.runtime.errors import InputError, some
-from pimper_torch.runtime.file_names import match_files
+from pimper_torch.runtime.file_names import match_poses
 from pimper_torch.runtime.ledger import leave_out
 
 
@@ -135,12 +135,12 @@ def match_names(
     """Find the photographs in a model by file name and put it in their order.
 
     A model's image may lie in a subfolder, and its name may have been rewritten by another program:
-    see :func:`~pimper_torch.runtime.file_names.match_files`.
+    see :func:`~pimper_torch.runtime.file_names.match_poses`. Photographs of a pose share its image.
 
     Raises:
         InputError: No photograph is in the model, or a name may be any of several.
     """
-    found = match_files(names, model.names, folder=photographs, where=where, what="image")
+    found = match_poses(names, model.names, folder=photographs, where=where, what="image")
     chosen = [index for index in found if index is not None]
     if not chosen:
         raise InputError(
