@@ -153,20 +153,36 @@ def test_what_is_no_folder_of_photographs_is_refused(tmp_path, photos, name, why
         load_views(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ("name", "array", "why"),
-    [
-        ("2.png", np.full((8, 12, 3), 2, dtype=np.uint8), r"2\.png is black"),
-        (
-            "2.jpg",
-            np.full((8, 12, 3), 90, dtype=np.uint8),
-            r"2\.(jpg|png) and 2\.(jpg|png) differ only in",
-        ),
-    ],
-)
-def test_photographs_black_or_of_one_stem_are_refused(photos, name, array, why):
-    save(photos / name, array)
-    with pytest.raises(InputError, match=why):
+def test_photographs_of_one_stem_are_refused(photos, pixels):
+    save(photos / "2.jpg", pixels)
+    with pytest.raises(InputError, match=r"2\.(jpg|png) and 2\.(jpg|png) differ only in"):
+        load_views(photos)
+
+
+def test_a_photograph_whose_flash_did_not_fire_is_left_out_by_name(photos, pixels):
+    masks = photos.parent / "masks"
+    for name in ("1", "2", "3", "10"):
+        save(masks / f"{name}.png", pixels[..., 0])
+    save(photos / "3.png", pixels)
+    save(photos / "2.png", np.full((16, 12, 3), 2, dtype=np.uint8))
+    save(masks / "2.png", np.zeros((16, 12), np.uint8))  # and no segmenter finds anything in it
+    with pytest.warns(
+        PimperWarning, match=r"1 of 4 photographs \(2\.png\) are black all over.*left out"
+    ):
+        views = load_views(photos, masks=masks)
+    (photos / "2.png").unlink()
+    plain = load_views(photos, masks=masks)
+    assert views.names == plain.names == ("1.png", "3.png", "10.png")
+    assert torch.equal(views.images[..., :8, :], plain.images)
+    assert torch.equal(views.masks[..., :8, :], plain.masks)
+    assert torch.equal(views.sizes_px, plain.sizes_px)
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_a_folder_with_too_few_photographs_that_show_something_is_refused(photos, count):
+    for index in range(count):
+        save(photos / f"{index + 2}.png", np.full((8, 12, 3), 2, dtype=np.uint8))
+    with pytest.raises(InputError, match=r"2\.png.*are black all over; needed: 3 photographs"):
         load_views(photos)
 
 

@@ -72,10 +72,11 @@ def load_views(
         On the CPU, float32.
 
     Raises:
-        InputError: Names the photographs or masks that are missing, damaged, black or
-            saturated all over, do not belong together or do not fit the encoding, and says
-            what to do. A :class:`~pimper_torch.runtime.errors.PimperWarning` names photographs of
-            which hardly anything is left, and tells a level of saturation that was found.
+        InputError: Names the photographs or masks that are missing, damaged or saturated all
+            over, do not belong together or do not fit the encoding, and says what to do; most
+            photographs are black. A :class:`~pimper_torch.runtime.errors.PimperWarning` names
+            photographs that are black all over, which are left out, and those of which hardly
+            anything is left, and tells a level of saturation that was found.
     """
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
@@ -108,8 +109,8 @@ def load_views(
         drop_pages()
     if has_masks and not opacities:
         _tell_alpha(pictures.opaque, names, Path(folder))
-    _judge(images, drawn, sizes, names, Path(folder), masks)
-    return Views(
+    lit = _judge(images, drawn, sizes, names, Path(folder), masks)
+    views = Views(
         images=images,
         sizes_px=torch.tensor(sizes),
         names=names,
@@ -119,6 +120,7 @@ def load_views(
         poses=_poses(paths, Path(folder)),
         folder=Path(os.path.abspath(folder)).as_posix(),  # noqa: PTH100 - follows no links
     )
+    return views.take(lit)
 
 
 def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
@@ -282,20 +284,32 @@ def _judge(
     names: tuple[str, ...],
     folder: Path,
     masks: Path | str | None,
-) -> None:
-    """Refuse photographs black or saturated all over, and masks of nothing; warn of nearly so."""
+) -> list[int]:
+    """Find the photographs that are not black all over, and warn of the others.
+
+    Photographs saturated all over, masks of nothing, and folders of mostly black photographs are
+    refused; what is nearly saturated is warned of.
+    """
     black, empty, left = list[str](), list[str](), dict[str, float]()
     for name, (image, mask), (wide, high) in zip(names, each(images, drawn), sizes, strict=True):
         # A thousandth of saturation is level 3 of 255 in sRGB: what a lens cap gives.
         if float((image[:, :high, :wide] > 1e-3).float().mean()) <= _LIT_FRACTION:
             black.append(name)
+            continue
         if not bool(mask.any()):
             empty.append(name)
         left[name] = float((image.amax(dim=0)[mask] < SATURATED).float().mean())
-    if black:
+    count = f"{len(black)} of {len(names)} photographs ({some(black)})"
+    if black and len(names) - len(black) < max(MIN_PHOTOGRAPHS, len(black)):
         raise InputError(
-            f"{folder}: {some(black)} {'is' if len(black) == 1 else 'are'} black all over. Take "
-            "them out of the folder; at least some of the object has to be lit."
+            f"{folder}: {count} are black all over; needed: {MIN_PHOTOGRAPHS} photographs or "
+            "more, and half of the folder, in which some of the object is lit. Expose "
+            "longer, or lower `photographs.black`."
+        )
+    if black:
+        caution(
+            f"{folder}: {count} are black all over, as where a flash did not fire; left out.",
+            stacklevel=3,
         )
     if empty:
         where = f"{masks}: the masks" if masks else "the alpha channels"
@@ -315,3 +329,4 @@ def _judge(
             f"{folder}: hardly anything is left of {some(scant)}; all else is saturated. {what}.",
             stacklevel=3,
         )
+    return [index for index, name in enumerate(names) if name not in black]
