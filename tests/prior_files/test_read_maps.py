@@ -13,7 +13,7 @@ from pimper_torch.doors.io.decode import write_deep_png
 from pimper_torch.priors.map_config import NORMALS_ERROR_DEG
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Views
-from pimper_torch.runtime.errors import ConfigError, InputError
+from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
 
 
 @pytest.fixture
@@ -126,7 +126,8 @@ def test_depth_of_every_format_is_what_was_written(views, tmp_path):
     drawn[0, :3] = 0, np.nan, np.inf
     write_exr(drawn[..., None], tmp_path / "a b_depth.exr")
     np.savez(tmp_path / "cup_1.npz", depth=drawn[:, :24], normals=drawn, allow_pickle=False)
-    found = read_depth(tmp_path, views, False, gauge="scale", error=0.1)
+    with pytest.warns(PimperWarning, match="2 pixels of 2 maps hold inf, .* for no depth"):
+        found = read_depth(tmp_path, views, False, gauge="scale", error=0.1)
     for index, width in ((0, 32), (1, 24)):
         expected = torch.from_numpy(drawn[:, :width])
         assert found.variance[index, 0, :3].isinf().all()
@@ -134,11 +135,55 @@ def test_depth_of_every_format_is_what_was_written(views, tmp_path):
         assert_close(found.variance[index, 1:, :width], (0.1 * expected[1:]) ** 2)
     assert (found.inverse, found.along, found.gauge) == (False, "axis", "scale")
     found.check("test")
-    left_open = read_depth(tmp_path, views, error=0.1)
+    with pytest.warns(PimperWarning, match="hold inf"):
+        left_open = read_depth(tmp_path, views, error=0.1)
     assert left_open.inverse is None
     # Where maps have an offset of their own, relative to their range without its ends: 0.96 x 3.
     span = math.sqrt(float(left_open.variance[0, 5, 5])) / 0.1
     assert span == pytest.approx(0.96 * 3, rel=0.05)
+
+
+def depth_with(none, *, dtype=np.float32, near=1000, far=9000):
+    """Depth of 24 x 32 whose first row is ``none``."""
+    drawn = np.random.default_rng(4).uniform(near, far, size=(24, 32))
+    drawn[0] = none
+    return drawn.astype(dtype)
+
+
+@pytest.mark.parametrize(
+    ("none", "dtype", "told"),
+    [
+        (65504, np.float32, "65504"),
+        (65504, np.float16, "65504"),
+        (65535, np.float32, "65535"),
+        (65535, np.uint16, "65535"),
+        (65535, np.int32, "65535"),
+        (1e10, np.float32, r"1e\+10"),
+        (np.inf, np.float32, "inf"),
+        (np.array([65504, np.inf] * 16), np.float32, "65504, inf"),
+    ],
+)
+def test_what_programs_write_where_there_is_no_depth_says_nothing_and_is_counted(
+    none, dtype, told, views, tmp_path
+):
+    np.save(tmp_path / "a b.npy", depth_with(none, dtype=dtype), allow_pickle=False)
+    with pytest.warns(PimperWarning, match=f"32 pixels of 1 maps hold {told}, which is taken for "):
+        found = read_depth(tmp_path, views)
+    assert found.variance[0, 0].isinf().all()
+    assert found.variance[0, 1:].isfinite().all()
+    np.save(tmp_path / "a b.npy", depth_with(np.nan).astype(np.float32), allow_pickle=False)
+    plain = read_depth(tmp_path, views)
+    span = found.variance[0, 5, 5] / plain.variance[0, 5, 5]
+    scale = float(found.depth[0, 5, 5] / plain.depth[0, 5, 5])
+    assert float(span) == pytest.approx(scale**2, rel=2e-3)  # of the other values alone
+
+
+def test_the_largest_values_of_a_map_that_fills_its_scale_are_depth(views, tmp_path):
+    levels = depth_with(65535, dtype=np.uint16, near=20_000, far=65_535)
+    Image.fromarray(levels).save(tmp_path / "a b.png")
+    found = read_depth(tmp_path, views)
+    assert found.variance.isfinite()[0].all()
+    assert_close(found.depth[0] * 65535, torch.from_numpy(levels.astype(np.float32)))
 
 
 def test_depth_in_levels_of_sixteen_bits_is_up_to_its_scale(views, tmp_path):
@@ -248,6 +293,8 @@ def test_whole_numbers_and_named_layers_are_read(views, normals, tmp_path):
 
 
 ONES = np.ones((24, 32, 3), np.float32)
+LABELS = np.arange(24 * 32, dtype=np.uint8).reshape(24, 32) % 5
+COLOURED = np.where(LABELS[..., None] > 2, [1.0, -1, -1], [-1, 1, 1])
 
 
 @pytest.mark.parametrize(
@@ -263,6 +310,14 @@ ONES = np.ones((24, 32, 3), np.float32)
         (read_normals, "a b.txt", ONES, r"holds no maps; needed: files ending in .npz"),
         (read_depth, "a b.npy", 0 * ONES[..., 0], "a b.jpg hold nothing that can be used"),
         (read_depth, "a b.png", ONES * [1, 0, -1], "has colours; needed: one value a pixel"),
+        (read_normals, "a b.npy", 127.5 * (ONES + 1), "from 0 to 255; .* Divide levels by 255"),
+        (read_normals, "a b.npy", LABELS, "one value a pixel; .* Are they labels"),
+        (read_depth, "a b.npy", LABELS, "holds whole numbers below 32, labels; needed: depth"),
+        (read_depth, "a b.npy", LABELS.astype(np.int64), "whole numbers below 32, labels"),
+        (read_depth, "a b.png", COLOURED, "has labels in 2 colours; needed: one value a pixel"),
+        (read_depth, "a b.npy", np.ones((5, 24, 32)), "a stack of 5 maps; .* Write maps apart"),
+        (read_depth, "a b.npy", np.eye(24) * np.arange(3)[:, None, None], "nor a stack of maps"),
+        (read_normals, "a b.npy", np.ones((2, 24, 32, 3)), "a stack of 2 maps"),
         (read_depth, "a b.npz", ONES[0, 0], "holds normals, albedo; .* one array .* called depth"),
     ],
 )

@@ -62,6 +62,11 @@ def test_every_kind_of_file_holds_the_same_mask(views, tmp_path, name, write, er
 
 def test_labels_and_what_is_not_known(views, tmp_path):
     Image.fromarray(np.eye(16, 24, dtype=np.uint8)).save(tmp_path / "a.png")
+    labels = np.arange(16 * 24).reshape(16, 24) % 4
+    Image.fromarray(labels.astype(np.uint16)).save(tmp_path / "b.png")
+    prior = read_silhouettes(tmp_path, views)
+    assert torch.equal(prior.inside[1], torch.from_numpy(labels > 0).float())
+    (tmp_path / "b.png").unlink()
     np.save(tmp_path / "c.npy", np.where(np.eye(16, 24) > 0, np.nan, 0.25))
     prior = read_silhouettes(tmp_path, views)
     assert prior.names == ("a.jpg", "c.jpg")
@@ -76,6 +81,8 @@ def test_labels_and_what_is_not_known(views, tmp_path):
         ("b.npy", 8 * SOFT - 4, "b.npy: holds values from -4 to 4; needed: the probability"),
         ("b.npy", SOFT.T, "b.npy: is 16 x 24, but the photograph b.jpg is 48 x 32; it seems"),
         ("b.npy", np.stack([SOFT, SOFT, 1 - SOFT], axis=-1), "has colours"),
+        ("b.npy", np.rint(255 * SOFT / SOFT.max()), "from 0 to 255; .*Divide these levels by 255"),
+        ("b.npy", np.stack([SOFT] * 4), "a stack of 4 maps; .* under the names of their photogr"),
         ("d.npy", SOFT, "no map for a.jpg, b.jpg, c.jpg, and no photograph for d.npy"),
         ("b.npy", np.array(["object"]), "needed: real numbers"),
     ],

@@ -14,7 +14,7 @@ from pimper_torch.method.sfm.poses import (
     pictures_of_poses,
     with_poses,
 )
-from pimper_torch.records import Lens
+from pimper_torch.records import Lens, SilhouettePrior
 from pimper_torch.runtime.errors import InputError
 
 POSES = (0, 1, 0, 2, 1, 0)
@@ -111,3 +111,27 @@ def test_one_photograph_stands_for_its_pose_with_what_all_of_it_observe(reconstr
     order = torch.argsort(3 * scene.observation_point + scene.observation_view)
     assert_close(named.scene.observation_pixels, scene.observation_pixels[order])
     assert one_view_a_pose(scene).scene is scene
+
+
+def test_silhouettes_of_any_photograph_of_a_pose_are_those_of_the_one_that_is_kept(reconstruction):
+    scene = reconstruction.scene
+    copies = torch.tensor([0, 1, 2, 1, 1])
+    names = ("a.png", "b.png", "c.png", "d.png", "e.png")
+    views = scene.views.take(copies).replace(names=names, poses=copies)
+    prior = SilhouettePrior(
+        names=("e.png", "c.png", "b.png", "gone.png"),
+        sizes_px=torch.tensor([[3, 2]] * 4),
+        inside=torch.arange(4.0)[:, None, None].expand(4, 2, 3) / 4,
+    )
+    five = scene.replace(
+        views=views.replace(priors=(prior,)),
+        cameras=scene.cameras.take(copies),
+        lenses=scene.lenses + scene.lenses[:2],
+    )
+
+    def kept(*needed):
+        (found,) = one_view_a_pose(five, needed).scene.views.priors
+        return dict(zip(found.names, (4 * found.inside[:, 0, 0]).int().tolist(), strict=True))
+
+    assert kept("d") == {"d.png": 0, "c.png": 1}  # that of the first photograph with one
+    assert kept("b") == {"b.png": 2, "c.png": 1}  # its own

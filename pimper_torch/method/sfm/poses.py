@@ -5,7 +5,7 @@ pose, and what it finds holds for all photographs of the pose; silhouettes and d
 of one photograph a pose. Lights are fitted to all.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pimper_torch.ground.shapes import Scalar
 from pimper_torch.method.sfm.model import SparseModel, select_views
-from pimper_torch.records import Cameras, SparseScene, Views, pairs_table
+from pimper_torch.records import Cameras, Prior, SilhouettePrior, SparseScene, Views, pairs_table
 from pimper_torch.records.scene_parts import OneAPose, with_views
 from pimper_torch.runtime.errors import InputError, some
 from pimper_torch.runtime.mapped import by_view
@@ -88,6 +88,8 @@ def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
 def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPose:
     """Keep the most textured photograph of every pose; without poses, the scene as it is.
 
+    Guessed silhouettes of other photographs of a pose become those of the one that is kept.
+
     Args:
         needed: Names, with their suffix or without, of photographs that go before others.
     """
@@ -112,8 +114,28 @@ def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPos
         observation_point=point, observation_view=seer, observation_pixels=pixels[point, seer]
     )
     few = with_views(one, kept)
-    few = few.replace(views=few.views.replace(poses=None), unregistered=scene.unregistered)
+    carried = tuple(_with_leads(prior, scene.views.names, lead) for prior in few.views.priors)
+    views = few.views.replace(poses=None, priors=carried)
+    few = few.replace(views=views, unregistered=scene.unregistered)
     return OneAPose(few, kept.nonzero()[:, 0], (kept.long().cumsum(dim=0) - 1)[lead])
+
+
+def _with_leads(prior: Prior, names: Sequence[str], lead: Int[Tensor, " view"]) -> Prior:
+    """Carry silhouettes of any photograph of a pose to the one that is kept, unless it has its own.
+
+    Args:
+        lead: Of every view, the one that is kept of its pose.
+    """
+    if not isinstance(prior, SilhouettePrior):
+        return prior
+    leads = dict(zip(names, (names[one] for one in lead.tolist()), strict=True))
+    maps = {
+        leads[name]: index
+        for index, name in reversed(list(enumerate(prior.names)))
+        if name in leads
+    }
+    maps |= {name: index for index, name in enumerate(prior.names) if leads.get(name) == name}
+    return prior.take(list(maps.values())).replace(names=tuple(maps))
 
 
 def _texture(views: Views) -> Float[Tensor, " view"]:

@@ -10,33 +10,43 @@ import torch
 from torch import Tensor
 
 from pimper_torch.priors.from_maps import Maps, stacked
-from pimper_torch.priors.prior_files.map_file import FORMATS, VARIANCE, read_layers
+from pimper_torch.priors.prior_files.map_file import FORMATS, LABELS, VARIANCE, Layer, read_layer
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, some
-from pimper_torch.runtime.file_names import match_files
+from pimper_torch.runtime.file_names import match_poses
 
-# What estimators add to the name of a photograph.
-_ADDED = re.compile(
-    r"([ _.-](normals?|norm|depth|disparity|pred|raw|map|npy|16bit|fp32"
-    r"|mask|alpha|matte|silhouette|segmentation|cutout|rmbg|nobg))+$",
-    re.IGNORECASE,
-)
+# What estimators add to the name of a photograph, by what the file holds.
+_WORDS = {
+    "normal": "normal|norm",
+    "depth": "depth|disparity|disp",
+    "mask": "mask|alpha|matte|silhouette|segmentation|cutout|rmbg|nobg",
+    "picture": "vis|colou?r(ed)?",
+    "": "pred|raw|map|npy|16bit|fp32",
+}
+_ADDED = re.compile(rf"([ _.-]({'|'.join(_WORDS.values())})s?)+$", re.IGNORECASE)
 _OF_VARIANCE = re.compile(rf"[ _.-]{VARIANCE}$", re.IGNORECASE)
+# How deep files are looked for: in folders of poses, each with a folder a photograph.
+_LEVELS = ("*", "*/*", "*/*/*")
+_OTHER = 2
 
 
 def read_maps(
     folder: Path | str,
     views: Views,
     kinds: tuple[str, ...],
-    check: Callable[[Path, np.ndarray], np.ndarray],
+    check: Callable[[Path, Layer], np.ndarray],
     *,
     undistorted: bool,
     cut_out: bool = False,
 ) -> Maps:
     """Read the maps of photographs, matched by name.
 
+    A map that is for all photographs of a pose becomes that of the first of them, so that what it
+    says counts once.
+
     Args:
-        kinds: How names of arrays begin that hold the maps, such as ``normal``.
+        kinds: How names of arrays begin that hold the maps; the first is ``normal``, ``depth`` or
+            ``mask``.
         check: Refuses a map that cannot be of that kind, and returns the channels that count.
         undistorted: Whether they are of the photographs as a run undistorts them.
         cut_out: Whether pictures that are somewhere transparent hold the map as their opacity.
@@ -47,11 +57,12 @@ def read_maps(
     """
     found: dict[str, tuple[Tensor, Tensor | None]] = {}
     sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
-    for name, path in _matched(Path(folder), views.names).items():
-        values, variance = read_layers(path, kinds, cut_out)
+    for name, path in _matched(Path(folder), views.names, kinds[0]).items():
+        layer = read_layer(path, kinds, cut_out)
+        variance = layer.variance
         if beside := [one for one in path.parent.iterdir() if _is_variance_of(one, path)]:
-            variance = read_layers(beside[0], (VARIANCE,))[0][..., 0]
-        values = check(path, values)
+            variance = read_layer(beside[0], (VARIANCE,)).values[..., 0]
+        values = check(path, layer)
         _require_shape(path, values, name, *sizes[name])
         if variance is not None and variance.shape != values.shape[:2]:
             raise InputError(
@@ -63,11 +74,16 @@ def read_maps(
     return stacked(found, undistorted)
 
 
-def single(path: Path, values: np.ndarray) -> np.ndarray:
+def single(path: Path, layer: Layer) -> np.ndarray:
     """Return the one channel of a map, also where a file has it three times."""
+    values = layer.values
     if not (values == values[..., :1]).all(where=np.isfinite(values)):
+        colours = np.unique(values.reshape(-1, values.shape[2]), axis=0)
+        labels = layer.full and 1 < len(colours) <= LABELS
+        found = f"labels in {len(colours)} colours" if labels else "colours"
         raise InputError(
-            f"{path}: has colours; needed: one value a pixel, not a picture of it in colours."
+            f"{path}: has {found}; needed: one value a pixel, not a picture of it in colours, nor "
+            "a stack of maps."
         )
     return values[..., :1]
 
@@ -78,39 +94,89 @@ def _is_variance_of(path: Path, of: Path) -> bool:
     return mine and stem in (of.stem, _ADDED.sub("", of.stem))
 
 
-def _matched(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """Find the map of each photograph; some photographs, or some maps, may be alone."""
+def _matched(folder: Path, names: Sequence[str], kind: str) -> dict[str, Path]:
+    """Find the map of each photograph or pose; some photographs, or some maps, may be alone."""
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing"
-        raise InputError(f"{folder}: found {found}; needed: a folder of maps.")
+        raise InputError(f"{folder}: found {found}; needed: a folder of maps, one a photograph.")
     files: dict[str, Path] = {}
-    stems_of = {Path(name).stem for name in names}
-    for path in sorted(folder.iterdir()):
-        rank = path.suffix.lower()
-        if path.name.startswith(".") or rank not in FORMATS or _OF_VARIANCE.search(path.stem):
-            continue
-        stem = path.stem if path.stem in stems_of else _ADDED.sub("", path.stem)
-        other = files.get(stem)
-        if other is None or FORMATS.index(rank) < FORMATS.index(other.suffix.lower()):
-            files[stem] = path
+    places: list[int | None] = []
+    posed = any("/" in name for name in names)
+    for level in _LEVELS:
+        files = _called(folder, level, names, kind) | files
+        places = match_poses(names, list(files), where=str(folder), what="map")
+        matched = [place is not None for place in places]
+        if all(matched) or (any(matched) and not posed):
+            break
     if not files:
-        raise InputError(f"{folder}: holds no maps; needed: files ending in {', '.join(FORMATS)}.")
-    stems = list(files)
-    places = match_files(names, stems, where=str(folder), what="map")
-    found_maps = {
-        name: files[stems[place]]
-        for name, place in zip(names, places, strict=True)
-        if place is not None
-    }
-    lacking = [name for name in names if name not in found_maps]
-    free = [path.name for path in files.values() if path not in found_maps.values()]
+        there = some(sorted(path.name for path in folder.iterdir())) or "nothing"
+        raise InputError(
+            f"{folder}: holds no maps; needed: files ending in {', '.join(FORMATS)}, one a "
+            f"photograph. It holds {there}. Write pages of a TIFF apart, such as to NPY."
+        )
+    paths = list(files.values())
+    lacking = [name for name, place in zip(names, places, strict=True) if place is None]
+    free = [
+        path.relative_to(folder).as_posix()
+        for place, path in enumerate(paths)
+        if place not in places
+    ]
     if lacking and free:
         near = difflib.get_close_matches(Path(lacking[0]).stem, free, n=1, cutoff=0) or free[:1]
         raise InputError(
             f"{folder}: no map for {some(lacking)}, and no photograph for {some(free)}; needed: "
             f"names of the photographs. The nearest name to {lacking[0]} is {near[0]}. Rename them."
         )
-    return found_maps
+    return {
+        name: paths[place]
+        for view, (name, place) in enumerate(zip(names, places, strict=True))
+        if place is not None and place not in places[:view]
+    }
+
+
+def _called(folder: Path, level: str, names: Sequence[str], kind: str) -> dict[str, Path]:
+    """List the files at a level that may be maps of a kind, by the photographs that they name.
+
+    Of several files of one name, those come first whose names state the kind, and then those in
+    whose formats least is lost. Files of other kinds count where there are no others.
+    """
+    stems = {str(Path(name).with_suffix("")) for name in names}
+    known = {part for stem in stems for part in Path(stem).parts}
+    flat = {stem.replace("/", mark): stem for stem in stems for mark in "_- ."}
+    ranked: list[tuple[int, int, str, Path]] = []
+    for path in sorted(folder.glob(level)):
+        inside, suffix = path.relative_to(folder), path.suffix.lower()
+        hidden = any(part.startswith(".") for part in inside.parts)
+        if hidden or suffix not in FORMATS or not path.is_file() or _OF_VARIANCE.search(path.stem):
+            continue
+        called, added = [], ""
+        for part in (*inside.parts[:-1], path.stem):
+            name = part if part in known else _ADDED.sub("", f" {part}")[1:]
+            added += f" {part}"[len(name) + 1 :]
+            called += [name] if name else []
+        stem = "/".join(called)
+        ranked.append((_rank(added, kind), FORMATS.index(suffix), flat.get(stem, stem), path))
+    others = min(ranked, default=(0,))[0] == _OTHER
+    files: dict[str, Path] = {}
+    for rank, _, stem, path in sorted(ranked, key=lambda one: one[:2]):
+        if others or rank < _OTHER:
+            files.setdefault(stem, path)
+
+    def belongs(stem: str) -> bool:  # to another map, as what MoGe writes next to it
+        folder, _, last = stem.rpartition("/")
+        return folder in files and last not in known
+
+    return {stem: path for stem, path in files.items() if not belongs(stem)}
+
+
+def _rank(added: str, kind: str) -> int:
+    """Return 0 where the words added to a name are of a kind, 1 where they are of none."""
+    words = re.findall(r"[^ _.-]+", added.lower())
+    kinds = {
+        of for of, some_of in _WORDS.items() for one in words if re.fullmatch(f"({some_of})s?", one)
+    }
+    kinds -= {""}
+    return int(not kinds) if kinds <= {kind} else _OTHER
 
 
 def _require_shape(path: Path, values: np.ndarray, name: str, width: int, height: int) -> None:

@@ -1,5 +1,6 @@
 """Depth and normals of an estimator."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -8,8 +9,9 @@ import numpy as np
 from pimper_torch.priors import from_maps
 from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.priors.prior_files.folder import read_maps, single
+from pimper_torch.priors.prior_files.map_file import LABELS, Layer
 from pimper_torch.records import DepthPrior, NormalPrior, Views
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.errors import InputError, caution
 
 
 def read_normals(
@@ -38,9 +40,17 @@ def read_normals(
     return from_maps.normals_from(maps, axes, error_deg=error_deg)
 
 
-def _vectors(path: Path, values: np.ndarray) -> np.ndarray:
+def _vectors(path: Path, layer: Layer) -> np.ndarray:
+    values = layer.values
     if values.shape[2] != 3:
-        raise InputError(f"{path}: has one value a pixel; needed: normals, of three. Is it depth?")
+        guess = "Are they labels?" if layer.labelled else "Is it depth?"
+        raise InputError(f"{path}: has one value a pixel; needed: normals, of three. {guess}")
+    low, high = float(np.nanmin(values, initial=0)), float(np.nanmax(values, initial=0))
+    if low >= 0 and 127.5 < high <= 255:  # some component is above 0
+        raise InputError(
+            f"{path}: holds values from {low:g} to {high:g}; needed: unit normals, or (n + 1) / 2 "
+            "from 0 to 1. Divide levels by 255, or write them as whole numbers of 8 bits."
+        )
     return values
 
 
@@ -56,9 +66,10 @@ def read_depth(
 ) -> DepthPrior:
     """Read depth of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
 
-    A map has the photograph's name, with what estimators append, its shape, and any size. 0, NaN
-    and infinity say nothing. PNG counts in its full scale, that of MoGe in metres (text ``near``
-    and ``far``). ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, has squared units.
+    A map has the photograph's name, with what estimators append, its shape, and any size. 0, NaN,
+    infinity, 1e10, and 65504 and 65535 apart from other values say nothing; a warning counts these.
+    PNG counts in its full scale, that of MoGe in metres (text ``near`` and ``far``).
+    ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, has squared units.
 
     Args:
         inverse: Whether maps hold one over depth (disparity: Depth Anything 2, MiDaS); ``None``
@@ -71,5 +82,35 @@ def read_depth(
         undistorted: Whether they are of the photographs as a run undistorts them.
     """
     kinds = ("depth", "disp", "dist", "z")
-    maps = read_maps(folder, views, kinds, single, undistorted=undistorted)
+    lost: Counter[str] = Counter()
+
+    def distances(path: Path, layer: Layer) -> np.ndarray:
+        values = single(path, layer)
+        if layer.labelled:
+            raise InputError(f"{path}: holds whole numbers below {LABELS}, labels; needed: depth.")
+        none = _none_in(values * (layer.full or 1))
+        lost.update(f"{one:g}" for one in values[none] * (layer.full or 1))
+        return np.where(none, np.float32(np.nan), values)
+
+    maps = read_maps(folder, views, kinds, distances, undistorted=undistorted)
+    if lost:
+        caution(
+            f"{folder}: {sum(lost.values()):,} pixels of {len(maps.names)} maps hold "
+            f"{', '.join(sorted(lost))}, which is taken for no depth.",
+            stacklevel=2,
+        )
     return from_maps.depth_from(maps, inverse, along=along, gauge=gauge, error=error)
+
+
+def _none_in(levels: np.ndarray) -> np.ndarray:
+    """Find what programs write where there is no depth.
+
+    Infinity, and 1e10, which no map has; the largest half (65504) and whole number of 16 bits
+    (65535), unless other values come close, as of a map that was stretched to full scale.
+    """
+    none = np.isinf(levels) | (levels >= 1e10)
+    for one in (65504, 65535):
+        # Within a tenth: a choice.
+        if not ((levels > 0.9 * one) & (levels != one) & ~none).any():
+            none |= levels == one
+    return none

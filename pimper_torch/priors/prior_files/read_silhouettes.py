@@ -9,6 +9,7 @@ import torch
 from pimper_torch.doors.size.given import Mark, number_of, require_inside
 from pimper_torch.priors.from_maps import silhouettes_from, stacked
 from pimper_torch.priors.prior_files.folder import read_maps, single
+from pimper_torch.priors.prior_files.map_file import Layer
 from pimper_torch.records import SilhouettePrior, Views
 from pimper_torch.runtime.errors import InputError
 
@@ -31,19 +32,23 @@ def read_silhouettes(
     return silhouettes_from(maps)
 
 
-def _chance(path: Path, values: np.ndarray) -> np.ndarray:
-    values = single(path, values)
+def _chance(path: Path, layer: Layer) -> np.ndarray:
+    values = single(path, layer)
     known = values[np.isfinite(values)]
+    if layer.labelled:  # all but 0 is the object
+        return (values > 0).astype(np.float32)
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     if low < 0 or high > 1:
+        levels = low >= 0 and high in (255, 65535)
+        advice = (
+            f"Divide these levels by {high:g}, or write them as whole numbers."
+            if levels
+            else "A network's logits go through a sigmoid first."
+        )
         raise InputError(
             f"{path}: holds values from {low:g} to {high:g}; needed: the probability of the "
-            "object, from 0 to 1. A network's logits go through a sigmoid first."
+            f"object, from 0 to 1. {advice}"
         )
-    levels = 255 * known
-    # Files of 8 bits whose levels are all below 32 hold labels: all but 0 is the object.
-    if 0 < high < 32 / 255 and np.allclose(levels, np.rint(levels), atol=1e-3):
-        return (values > 0).astype(np.float32)
     return values
 
 

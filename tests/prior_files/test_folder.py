@@ -1,0 +1,106 @@
+"""Which file of a folder is the map of which photograph."""
+
+import numpy as np
+import pytest
+import torch
+
+from pimper_torch.priors.prior_files.folder import read_maps
+from pimper_torch.records import Views
+from pimper_torch.runtime.errors import InputError
+
+KINDS = {"normal": ("normal",), "depth": ("depth",), "mask": ("mask",)}
+FLAT = ("cup_1.jpg", "cup_2.jpg")
+POSES = ("p_1/a.png", "p_1/b.png", "p_2/a.png", "p_2/b.png")
+
+
+def views_of(names):
+    return Views(
+        images=torch.zeros(len(names), 3, 4, 6),
+        sizes_px=torch.tensor([[6, 4]] * len(names)),
+        names=names,
+        focals_px=torch.full((len(names),), torch.nan),
+    )
+
+
+def numbers_of(folder, names, kind="depth"):
+    """Return for each photograph that has a map the number that the map holds."""
+    maps = read_maps(
+        folder, views_of(names), KINDS[kind], lambda _, layer: layer.values, undistorted=False
+    )
+    return dict(zip(maps.names, maps.values[:, 0, 0, 0].int().tolist(), strict=True))
+
+
+def write(folder, files):
+    """Write maps that hold their numbers in the list."""
+    for number, file in enumerate(files):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        np.save(folder / file, np.full((4, 6), number, np.float32), allow_pickle=False)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_maps_of_several_kinds_in_one_folder_the_wanted_kind_is_read(kind, tmp_path):
+    """As of MoGe (a folder a photograph), and of estimators that append what it is."""
+    kinds = ("depth", "depth_vis", "mask", "normal")
+    for layout in ("cup_{}/{}.npy", "cup_{}_{}.npy", "{1}/cup_{0}.npy", "cup_{}-pred_{}.npy"):
+        folder = tmp_path / layout[:9]
+        write(folder, [layout.format(name, of) for name in (1, 2) for of in kinds])
+        number = kinds.index(kind)
+        assert numbers_of(folder, FLAT, kind) == dict(zip(FLAT, (number, number + 4), strict=True))
+
+
+def test_what_moge_writes_next_to_a_map_is_not_a_map_without_a_photograph(tmp_path):
+    write(tmp_path, ["cup_2/depth.npy", "cup_2/image.npy", "cup_2/points.npy"])
+    assert numbers_of(tmp_path, FLAT) == {"cup_2.jpg": 0}
+    write(tmp_path, ["cup_2/depth.npy", "cup_3/depth.npy"])
+    with pytest.raises(InputError, match=r"no map for cup_1\.jpg, .* for cup_3/depth\.npy"):
+        numbers_of(tmp_path, FLAT)
+
+
+ONE_A_PHOTOGRAPH = dict(zip(POSES, range(4), strict=True))
+ONE_A_POSE = {"p_1/a.png": 0, "p_2/a.png": 1}  # the first stands for its pose
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (["p_1/a.npy", "p_1/b.npy", "p_2/a.npy", "p_2/b.npy"], ONE_A_PHOTOGRAPH),
+        (["p_1/a_depth.npy", "p_1/b.npy", "p_2/a.npy", "p_2/b.npy"], ONE_A_PHOTOGRAPH),
+        ([f"{name[:-4]}/depth.npy" for name in POSES], ONE_A_PHOTOGRAPH),
+        (["p_1_a.npy", "p_1_b.npy", "p_2_a.npy", "p_2_b.npy"], ONE_A_PHOTOGRAPH),
+        (["p_1-a_depth.npy", "p_1-b.npy", "p_2-a.npy", "p_2-b.npy"], ONE_A_PHOTOGRAPH),
+        (["p_1.npy", "p_2.npy"], ONE_A_POSE),
+        (["p_1_depth.npy", "p_2_depth.npy", "p_1_normal.npy", "p_2_normal.npy"], ONE_A_POSE),
+        (["p_1/depth.npy", "p_2/depth.npy", "p_1/normal.npy", "p_2/normal.npy"], ONE_A_POSE),
+        (["p_1/mean.npy", "p_2/mean.npy"], ONE_A_POSE),
+        (["p_1/b.npy", "p_2.npy"], ONE_A_POSE),
+        (["p_1/b.npy", "p_2/b.npy"], ONE_A_POSE),
+        (["p_2/b.npy"], {"p_2/a.png": 0}),
+    ],
+)
+def test_maps_of_poses_are_flat_or_nested_one_a_pose_or_one_a_photograph(files, expected, tmp_path):
+    write(tmp_path, files)
+    assert numbers_of(tmp_path, POSES) == expected
+
+
+def test_what_was_read_of_a_plain_folder_does_not_depend_on_folders_in_it(tmp_path):
+    write(tmp_path, ["cup_1.npy", "old/cup_1.npy", "cup_1/depth.npy", "old/cup_2.npy"])
+    assert numbers_of(tmp_path, FLAT) == {"cup_1.jpg": 0}
+
+
+def test_photographs_that_are_called_like_maps_keep_their_names(tmp_path):
+    names = ("a_depth.jpg", "a_normal.jpg", "mask.jpg")
+    write(tmp_path, ["a_depth.npy", "a_normal.npy", "mask.npy"])
+    assert numbers_of(tmp_path, names) == dict(zip(names, range(3), strict=True))
+
+
+def test_a_folder_of_maps_of_another_kind_alone_is_read_and_left_to_its_content(tmp_path):
+    write(tmp_path, ["cup_1_normal.npy", "cup_2_normal.npy"])
+    assert numbers_of(tmp_path, FLAT) == dict(zip(FLAT, range(2), strict=True))
+
+
+def test_a_stack_of_pages_and_a_file_in_the_place_of_a_folder_are_refused(tmp_path):
+    (tmp_path / "stack.tif").write_bytes(b"pages")
+    with pytest.raises(InputError, match=r"one a photograph. It holds stack\.tif. Write pages of"):
+        numbers_of(tmp_path, FLAT)
+    with pytest.raises(InputError, match="found a file; needed: a folder of maps, one a photograp"):
+        numbers_of(tmp_path / "stack.tif", FLAT)
