@@ -21,15 +21,24 @@ from pimper_torch.records import StageReport
 class Bars:
     """An observer with a bar for every stage, and beside it the time left for the run.
 
-    Where the output is no terminal, it writes a line when a stage ends instead.
+    Where the output is no terminal, it writes lines instead: one when a stage ends, and in a long
+    stage one for each tenth that is done.
 
     Args:
         figures: How many of a stage's figures are shown at its end; ``None`` is all.
+        seconds: Lines inside a stage come no more often; a choice.
     """
 
-    def __init__(self, console: Console, forecast: Forecast, figures: int | None = 3) -> None:
+    def __init__(
+        self,
+        console: Console,
+        forecast: Forecast,
+        figures: int | None = 3,
+        seconds: float = 10.0,
+    ) -> None:
         self.console, self._forecast = console, forecast
-        self._most = figures
+        self._most, self._seconds = figures, seconds
+        self._tenths, self._last = 0, 0.0
         self._progress = Progress(
             TextColumn("{task.description:<12}"),
             BarColumn(),
@@ -51,13 +60,19 @@ class Bars:
     def started(self, stage: str) -> None:
         """Begin a bar; it moves to and fro until the stage tells how far it has come."""
         self._forecast.started(stage)
+        self._tenths, self._last = 0, time.perf_counter()
         self._task = self._progress.add_task(stage, total=None, found=self._left())
 
     def progressed(self, done: int, total: int) -> None:
-        """Fill the bar."""
-        if self._task is not None:
-            self._forecast.progressed(done, total)
-            self._progress.update(self._task, completed=done, total=total, found=self._left())
+        """Fill the bar, or write a line."""
+        if self._task is None:
+            return
+        self._forecast.progressed(done, total)
+        self._progress.update(self._task, completed=done, total=total, found=self._left())
+        tenths, now = 10 * done // total, time.perf_counter()
+        if self._tenths < tenths < 10 and now - self._last >= self._seconds:
+            self._tenths, self._last = tenths, now
+            self._line(self._progress.tasks[self._task].description, f"{done / total:9.0%}")
 
     def finished(self, report: StageReport) -> None:
         """Complete the bar, and say what was found."""
@@ -66,12 +81,15 @@ class Bars:
         found = ", ".join(f"{name.replace('_', ' ')} {_short(value)}" for name, value in figures)
         if self._task is not None:
             self._progress.update(self._task, completed=1, total=1, found=found)
-        if not self.console.is_terminal:
-            took = "     kept" if report.kept else f"{report.seconds:7.1f} s"
-            left = f"  [{self._left()}]" if self._left() else ""
-            line = f"{report.name:<12} {took}  {found}{left}"
-            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        took = "     kept" if report.kept else f"{report.seconds:7.1f} s"
+        self._line(report.name, f"{took}  {found}")
         self._task = None
+
+    def _line(self, stage: str, text: str) -> None:
+        if not self.console.is_terminal:
+            left = f"  [{self._left()}]" if self._left() else ""
+            line = f"{stage:<12} {text}{left}"
+            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _left(self) -> str:
         seconds = self._forecast.seconds_left()

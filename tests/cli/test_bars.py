@@ -1,5 +1,6 @@
 import io
 
+import pytest
 from rich.console import Console
 
 from pimper_torch.cli.bars import Bars
@@ -37,6 +38,25 @@ def test_a_terminal_sees_a_bar_that_ends_full():
 def test_a_log_file_sees_one_line_a_stage():
     shown = show(terminal=False)
     assert " ".join(shown.split()) == "warp 2.5 s samples 12,345, missing samples 3,086"
+
+
+@pytest.mark.parametrize(
+    ("terminal", "seconds", "shown"),
+    [
+        (False, 0.0, ["10%", "20%", "50%", "60%", "70%", "80%", "90%"]),
+        (False, 60.0, []),
+        (True, 0.0, []),
+    ],
+)
+def test_a_log_file_sees_each_tenth_of_a_long_stage_once(terminal, seconds, shown):
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=terminal, width=120)
+    with Bars(console, Forecast(), seconds=seconds) as bars:
+        bars.started("write")
+        for done in (1, 2, 3, 4, 5, *range(10, 21)):
+            bars.progressed(done, 20)
+    lines = [line.split() for line in text.getvalue().splitlines()]
+    assert [words[1] for words in lines if len(words) == 2 and words[0] == "write"] == shown
 
 
 def test_the_time_left_for_the_run_is_told_in_the_line_of_the_stage():
