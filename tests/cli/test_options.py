@@ -63,7 +63,7 @@ RUNS = {
         "{ball} -o {out} {tiny} --no-turned-over --lights-per-pose 2",
     ],
     "export": [
-        "{result} --out {out} --format colmap nerfstudio alicevision maps lights --axes lub "
+        "{result} --out {out} --format colmap nerfstudio alicevision maps rti --axes lub "
         "--photos {photos} --overwrite"
     ],
     "evaluate": [

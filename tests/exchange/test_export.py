@@ -13,8 +13,8 @@ def contents(folder):
 
 def test_each_format_has_a_folder_of_its_name(folder, tmp_path, capsys):
     out = tmp_path / "more"
-    assert run("export", folder, "-o", out, "--format", "lights", "maps", "lights") == 0
-    assert {path.name for path in out.iterdir()} == {".pimper.json", "lights", "maps"}
+    assert run("export", folder, "-o", out, "--format", "rti", "maps", "rti") == 0
+    assert {path.name for path in out.iterdir()} == {".pimper.json", "rti", "maps"}
     assert f"{out / 'maps'} is the result as maps" in capsys.readouterr().out
 
 
@@ -22,23 +22,46 @@ def test_a_former_export_is_replaced_if_nothing_else_is_there(folder, tmp_path, 
     out = tmp_path / "more"
     assert run("export", folder, "-o", out, "--format", "maps") == 0
     before = contents(out)
-    assert run("export", folder, "-o", out, "--format", "lights") == 2
+    assert run("export", folder, "-o", out, "--format", "rti") == 2
     assert "--overwrite" in capsys.readouterr().err
     assert contents(out) == before
-    assert run("export", folder, "-o", out, "--format", "lights", "--overwrite") == 0
-    assert {path.name for path in out.iterdir()} == {".pimper.json", "lights"}
-    (out / "lights" / "mine.txt").write_text("mine")
+    assert run("export", folder, "-o", out, "--format", "rti", "--overwrite") == 0
+    assert {path.name for path in out.iterdir()} == {".pimper.json", "rti"}
+    (out / "rti" / "mine.txt").write_text("mine")
     assert run("export", folder, "-o", out, "--format", "maps", "--overwrite") == 2
-    assert "lights/mine.txt" in capsys.readouterr().err
+    assert "rti/mine.txt" in capsys.readouterr().err
 
 
-def test_where_photographs_moved_nothing_is_written(folder, photographs, tmp_path, capsys):
+@pytest.mark.parametrize("format", ["colmap", "nerfstudio", "alicevision"])
+def test_where_photographs_moved_a_format_with_them_is_not_written(
+    folder, photographs, tmp_path, capsys, format
+):
     moved = photographs.rename(tmp_path / "moved")
     out = tmp_path / "more"
-    assert run("export", folder, "-o", out, "--format", "maps") == 2
+    assert run("export", folder, "-o", out, "--format", "maps", format) == 2
     assert "Name their folder by `--photos DIR`" in capsys.readouterr().err
     assert not out.exists()
-    assert run("export", folder, "-o", out, "--format", "maps", "--photos", moved) == 0
+    assert run("export", folder, "-o", out, "--format", format, "--photos", moved) == 0
+
+
+def test_formats_without_photographs_are_the_same_where_these_are_gone(
+    folder, photographs, tmp_path
+):
+    formats = ("--format", "maps", "rti", "nerfstudio")
+    assert run("export", folder, "-o", tmp_path / "with", *formats) == 0
+    photographs.rename(tmp_path / "moved")
+    assert run("export", folder, "-o", tmp_path / "without", *formats[:3]) == 0
+    for name in ("maps", "rti"):
+        assert contents(tmp_path / "without" / name) == contents(tmp_path / "with" / name)
+
+
+@pytest.mark.parametrize("inside", [".", "more", "../link/more"])
+def test_an_export_into_the_result_itself_is_refused(folder, tmp_path, capsys, inside):
+    (tmp_path / "link").symlink_to(folder)
+    before = contents(folder)
+    assert run("export", folder, "-o", folder / inside, "--format", "maps", "--overwrite") == 2
+    assert "lies in" in capsys.readouterr().err
+    assert contents(folder) == before
 
 
 @pytest.mark.parametrize(("formats", "needed"), [(["gif"], "colmap"), ([], "one format or more")])

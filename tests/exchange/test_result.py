@@ -1,4 +1,5 @@
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
-from pimper_torch.doors.exchange import read_result
+from pimper_torch.doors.exchange import read_result, read_written, write_formats
 from pimper_torch.doors.exchange.nerfstudio import write_nerfstudio
 from pimper_torch.doors.io import results
 from pimper_torch.doors.io.estimates import estimate_of
@@ -16,7 +17,7 @@ from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.result.asset.mesh_files import MeshFiles
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.errors import InputError, PimperWarning
 
 
 def test_a_folder_of_results_is_read_back_as_the_run_had_it(folder, run):
@@ -38,6 +39,7 @@ def test_a_folder_of_results_is_read_back_as_the_run_had_it(folder, run):
     assert found.silhouettes.source == "found"
     assert found.reference == "b.png"
     assert found.summary["registered"] == 3
+    assert list(found.summary["thumbnails"]) == ["a.png", "b.png", "c.png"]
     assert found.mesh.vertices_world.dtype == torch.float32
     assert_close(
         found.lights_world,
@@ -57,6 +59,76 @@ def test_photographs_that_moved_are_named(folder, photographs, tmp_path):
         read_result(folder)
     found = read_result(folder, moved)
     assert torch.equal(found.scene.views.images, there.scene.views.images)
+
+
+def swap(first, second, aside):
+    first.rename(aside)
+    second.rename(first)
+    aside.rename(second)
+
+
+def test_photographs_under_each_others_names_are_refused(folder, photographs):
+    swap(photographs / "a.png", photographs / "b.png", photographs.parent / "aside")
+    why = r"other names now: a\.png shows b\.png, b\.png shows a\.png; needed"
+    with pytest.raises(InputError, match=why):
+        read_result(folder)
+
+
+def test_converted_photographs_are_read_with_a_warning_and_under_their_old_names(
+    folder, photographs
+):
+    there = read_result(folder)
+    with Image.open(photographs / "a.png") as picture:
+        picture.save(photographs / "a.tif")
+    (photographs / "a.png").unlink()
+    with pytest.warns(PimperWarning, match=r"were converted since .*; a\.tif for a\.png are read"):
+        found = read_result(folder)
+    assert found.scene.views.names == there.scene.views.names
+    assert torch.equal(found.scene.views.images, there.scene.views.images)
+
+
+def test_converted_and_exchanged_photographs_are_refused(folder, photographs):
+    for old, new in (("a", "b"), ("b", "a")):
+        with Image.open(photographs / f"{old}.png") as picture:
+            picture.save(photographs / f"{new}.tif")
+    for name in ("a.png", "b.png"):
+        (photographs / name).unlink()
+    with (
+        pytest.warns(PimperWarning, match="were converted"),
+        pytest.raises(InputError, match=r"a\.png shows b\.png"),
+    ):
+        read_result(folder)
+
+
+def test_a_photograph_that_looks_different_is_named(folder, photographs):
+    with Image.open(photographs / "c.png") as picture:
+        darker = picture.point(lambda level: level // 2)
+    darker.save(photographs / "c.png")
+    with pytest.warns(PimperWarning, match=r"look different now: c\.png\."):
+        read_result(folder)
+
+
+@pytest.mark.parametrize("known", [None, [], {"a.png": "xy", "b.png": 3, "d.png": "00" * 64}])
+def test_results_without_thumbnails_take_any_photographs_of_the_names(folder, photographs, known):
+    swap(photographs / "a.png", photographs / "b.png", photographs.parent / "aside")
+    summary = json.loads((folder / "summary.json").read_text())
+    (folder / "summary.json").write_text(json.dumps({**summary, "thumbnails": known}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_result(folder)
+
+
+def test_a_result_is_read_without_photographs_as_with_them(folder, photographs, tmp_path):
+    there = read_result(folder)
+    photographs.rename(tmp_path / "moved")
+    found = read_written(folder)
+    assert torch.equal(found.mesh.vertices_world, there.mesh.vertices_world)
+    assert torch.equal(found.mesh_cameras.intrinsics, there.scene.cameras.intrinsics)
+    assert torch.equal(found.mesh_cameras.cam_from_world, there.scene.cameras.cam_from_world)
+    assert torch.equal(found.mesh_cameras.sizes_px, there.scene.cameras.sizes_px)
+    assert found.offset_world == there.scene.offset_world
+    with pytest.raises(InputError, match="colmap holds photographs"):
+        write_formats(found, ["colmap"], tmp_path / "more")
 
 
 def grey(path):
@@ -102,7 +174,9 @@ def test_larger_photographs_are_shrunk_to_those_of_the_run(folder, photographs):
     for path in photographs.iterdir():
         with Image.open(path) as picture:
             picture.resize((120, 80), Image.Resampling.NEAREST).save(path)
-    found = read_result(folder)
+    # They are noise, in which saturation spreads over a third of the pixels when it is shrunk.
+    with pytest.warns(PimperWarning, match=r"look different now: a\.png, b\.png, c\.png"):
+        found = read_result(folder)
     assert torch.equal(found.scene.views.sizes_px, there.scene.views.sizes_px)
     assert torch.equal(found.cameras.intrinsics, there.cameras.intrinsics)
 

@@ -1,8 +1,11 @@
 """Folders of results: written, read back, and written for other programs."""
 
 from pimper_torch.doors.exchange.layouts import write_formats
-from pimper_torch.doors.exchange.result import Result, read_result
+from pimper_torch.doors.exchange.result import Result, WrittenResult, read_result, read_written
 from pimper_torch.doors.io.results import write_result
 from pimper_torch.result.asset.mesh_files import MeshFiles
 
-__all__ = ["MeshFiles", "Result", "read_result", "write_formats", "write_result"]
+__all__ = [
+    *("MeshFiles", "Result", "WrittenResult", "read_result", "read_written"),
+    *("write_formats", "write_result"),
+]

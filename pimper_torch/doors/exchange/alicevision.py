@@ -15,6 +15,7 @@ from pimper_torch.ground.geometry.pixels import indices_from_pixels
 from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.records import Cameras
 from pimper_torch.result.viz.maps import albedo_scale, view_maps
+from pimper_torch.runtime.progress import part, track
 
 _VERSION = ("1", "2", "8")
 _SENSOR_MM = 36.0  # AliceVision's own default: focal lengths are in millimetres of it
@@ -28,16 +29,18 @@ def write_alicevision(result: Result, folder: Path) -> None:
     them to the world; albedo is EXR, linear, scaled into [0, 1]. Photographs are undistorted.
     """
     views, cameras, scale = result.masked_views, result.cameras, albedo_scale(result.mesh)
-    files = write_pictures(views.replace(masks=result.silhouettes.masks), folder)
+    with part(0, 2):
+        files = write_pictures(views.replace(masks=result.silhouettes.masks), folder)
     maps_of = [f"{Path(file).stem}.exr" for file in files]
     for kind in ("normals", "albedos"):
         (folder / kind).mkdir(parents=True)
-    for view, file in enumerate(maps_of):
-        maps = view_maps(result.mesh, result.scene.cameras, view)
-        normals = with_axes(maps.normals_cam, "opengl")
-        write_exr(normals, folder / "normals" / file, "x right, y up, z to the viewer")
-        albedo = colours((scale * maps.albedo).clamp(0, 1))
-        write_exr(albedo, folder / "albedos" / file, "linear, sRGB primaries")
+    with part(1, 2):
+        for view, file in enumerate(track(maps_of)):
+            maps = view_maps(result.mesh, result.scene.cameras, view)
+            normals = with_axes(maps.normals_cam, "opengl")
+            write_exr(normals, folder / "normals" / file, "x right, y up, z to the viewer")
+            albedo = colours((scale * maps.albedo).clamp(0, 1))
+            write_exr(albedo, folder / "albedos" / file, "linear, sRGB primaries")
     for name, kind, paths in (
         ("cameras", "images", files),
         ("normalMaps", "normals", maps_of),

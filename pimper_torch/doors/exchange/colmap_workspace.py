@@ -18,6 +18,7 @@ from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.method.sfm.sparse_scene import model_of_scene, point_colors
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.result.viz.maps import view_maps
+from pimper_torch.runtime.progress import part, track
 
 _KINDS = ("depth_maps", "normal_maps", "consistency_graphs")
 
@@ -61,7 +62,8 @@ def write_workspace(result: Result, folder: Path) -> None:
     both 0 where a view does not see the surface: ``stereo_fusion`` and the meshers run on them.
     """
     scene = result.scene
-    files = write_pictures(result.masked_views, folder, ".png")
+    with part(0, 2):
+        files = write_pictures(result.masked_views, folder, ".png")
     write_pinholes(scene, result.cameras, files, folder / "sparse")
     stereo = folder / "stereo"
     for kind in _KINDS:
@@ -69,11 +71,12 @@ def write_workspace(result: Result, folder: Path) -> None:
     pairs = "".join(f"{name}\n__auto__, 20\n" for name in files)
     (stereo / "patch-match.cfg").write_text(pairs, encoding="utf-8")
     (stereo / "fusion.cfg").write_text("".join(f"{name}\n" for name in files), encoding="utf-8")
-    for view, file in enumerate(files):
-        maps = view_maps(result.mesh, scene.cameras, view)
-        depths = maps.depth.nan_to_num(0)[..., None]
-        for kind, values in zip(_KINDS, (depths, maps.normals_cam), strict=False):
-            _write_array(values, stereo / kind / f"{file}.geometric.bin")
+    with part(1, 2):
+        for view, file in enumerate(track(files)):
+            maps = view_maps(result.mesh, scene.cameras, view)
+            depths = maps.depth.nan_to_num(0)[..., None]
+            for kind, values in zip(_KINDS, (depths, maps.normals_cam), strict=False):
+                _write_array(values, stereo / kind / f"{file}.geometric.bin")
 
 
 def write_pinholes(

@@ -8,14 +8,15 @@ from torch import Tensor
 
 from pimper_torch.doors.exchange.openexr import write_exr
 from pimper_torch.doors.exchange.picture_files import file_names
-from pimper_torch.doors.exchange.result import Result
+from pimper_torch.doors.exchange.result import WrittenResult
 from pimper_torch.doors.io.decode import write_deep_png
 from pimper_torch.doors.io.reports import write_json
 from pimper_torch.records.priors import AXES, Axes
 from pimper_torch.result.viz.maps import ViewMaps, view_maps
+from pimper_torch.runtime.progress import track
 
 
-def write_maps(result: Result, folder: Path, axes: Axes = "opengl") -> None:
+def write_maps(result: WrittenResult, folder: Path, axes: Axes = "opengl") -> None:
     """Write what every view shows of the surface, under the photograph's name.
 
     ``normals/`` has unit normals as EXR, and as 16-bit PNG of ``(n + 1) / 2``; ``depth/`` and
@@ -27,8 +28,9 @@ def write_maps(result: Result, folder: Path, axes: Axes = "opengl") -> None:
     """
     for kind in ("normals", "depth", "albedo", "arrays"):
         (folder / kind).mkdir(parents=True)
-    for view, file in enumerate(file_names(result.scene.views.names)):
-        maps = view_maps(result.mesh, result.scene.cameras, view)
+    cameras = result.mesh_cameras
+    for view, file in enumerate(track(file_names(result.names))):
+        maps = view_maps(result.mesh, cameras, view)
         normals, stem = with_axes(maps.normals_cam, axes), Path(file).stem
         write_exr(normals, folder / "normals" / f"{stem}.exr", AXES[axes][1])
         levels = (65535 * (normals + 1) / 2).round() * maps.seen.numpy()[..., None]
@@ -65,7 +67,7 @@ def colours(albedo: Float[Tensor, "height width channel"]) -> np.ndarray:
     return np.asarray(albedo.expand(-1, -1, 3).numpy(), np.float32)
 
 
-def _arrays(maps: ViewMaps, result: Result, view: int) -> dict[str, np.ndarray]:
+def _arrays(maps: ViewMaps, result: WrittenResult, view: int) -> dict[str, np.ndarray]:
     error = maps.expected_error
     return {
         "depth": maps.depth.numpy(),
@@ -75,5 +77,5 @@ def _arrays(maps: ViewMaps, result: Result, view: int) -> dict[str, np.ndarray]:
         **({} if error is None else {"expected_error": error.numpy()}),
         "intrinsics": result.cameras.intrinsics[view].numpy(),
         "cam_from_world": result.cameras.cam_from_world[view].numpy(),
-        "name": np.array(result.scene.views.names[view]),
+        "name": np.array(result.names[view]),
     }

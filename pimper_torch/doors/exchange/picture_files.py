@@ -10,6 +10,7 @@ from PIL import Image
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.records import Cameras, Views
 from pimper_torch.runtime.errors import InputError, some
+from pimper_torch.runtime.progress import track
 
 
 def write_picture(views: Views, index: int, path: Path) -> None:
@@ -43,7 +44,7 @@ def write_pictures(views: Views, folder: Path, mask_suffix: str = "") -> tuple[s
         The names of the photographs, see :func:`file_names`.
     """
     files = file_names(views.names)
-    for index, file in enumerate(files):
+    for index, file in enumerate(track(files)):
         write_picture(views, index, folder / "images" / file)
         if views.masks is not None:
             write_mask(views, index, folder / "masks" / f"{file}{mask_suffix}")

@@ -2,8 +2,9 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,6 +15,8 @@ from pimper_torch.doors.io.estimates import mask_path, read_lights, read_referen
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.photograph_files import image_name, list_images
 from pimper_torch.doors.io.photographs import load_views, read_mask
+from pimper_torch.doors.io.thumbnails import compare_thumbnails
+from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset, local_origin, to_local
 from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.model_files import read_model
@@ -21,33 +24,54 @@ from pimper_torch.method.sfm.sparse_scene import assemble_scene
 from pimper_torch.method.sfm.undistort import pinholes_for
 from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene, Views
 from pimper_torch.runtime.config import build, read_mapping
-from pimper_torch.runtime.errors import InputError, PimperWarning, some
+from pimper_torch.runtime.errors import InputError, PimperWarning, caution, some
 
 _KIND = "a result of `pimper reconstruct`"
 _FILES = ("mesh.ply", "sparse", "lights.json", "config.yaml", "summary.json")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Result(Record):
-    """All that a folder of results holds, with the photographs it was made from.
+class WrittenResult(Record):
+    """All that a folder of results holds by itself, without photographs.
 
     Attributes:
-        mesh: The surface as it was written, in the frame of ``scene``.
-        scene: Cameras, undistorted photographs and the sparse cloud; float32.
-        cameras: The same cameras in float64 and in the frame of the files, which is
-            ``scene.offset_world`` away from that of ``scene``.
-        silhouettes: As they were written, 0 or 1; without planes.
+        mesh: The surface as it was written, less ``offset_world``; float32.
+        names: Of the photographs that the surface was made from.
+        cameras: Pinholes of the undistorted photographs in float64, in the frame of the files.
+        offset_world: What was subtracted from that frame, see ``SparseScene.offset_world``.
         lights_world: First-order light of every view; NaN where unknown, ``None`` where all are.
         reference: Name of the view that the pictures of the result show.
     """
 
     mesh: Mesh
-    scene: SparseScene
+    names: tuple[str, ...]
     cameras: Cameras
-    silhouettes: Silhouettes
+    offset_world: Offset
     lights_world: Float[Tensor, "view 4"] | None
     reference: str
-    summary: Mapping[str, object] = field(repr=False)
+    summary: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def mesh_cameras(self) -> Cameras:
+        """The cameras in the frame of the mesh; float32."""
+        poses = self.cameras.cam_from_world
+        if self.offset_world != NO_OFFSET:
+            poses = to_local(poses, self.offset_world)
+        return self.cameras.replace(cam_from_world=poses).to(torch.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Result(WrittenResult):
+    """A folder of results, with the photographs it was made from.
+
+    Attributes:
+        scene: Cameras, undistorted photographs and the sparse cloud, in the frame of the mesh;
+            float32.
+        silhouettes: As they were written, 0 or 1; without planes.
+    """
+
+    scene: SparseScene
+    silhouettes: Silhouettes
 
     @property
     def masked_views(self) -> Views:
@@ -58,12 +82,31 @@ class Result(Record):
         return views.replace(masks=self.silhouettes.masks)
 
 
-def read_result(folder: Path | str, photographs: Path | str | None = None) -> Result:
-    """Read a folder of results, and the photographs it was made from with the same settings.
+def read_written(folder: Path | str) -> WrittenResult:
+    """Read a folder of results without its photographs, which may be gone.
 
     Args:
         folder: Written by ``pimper reconstruct`` or
             :func:`~pimper_torch.doors.io.results.write_result`.
+
+    Returns:
+        On the CPU.
+
+    Raises:
+        InputError: A file of the result is missing or damaged.
+    """
+    return _read(Path(folder))[0]
+
+
+def read_result(folder: Path | str, photographs: Path | str | None = None) -> Result:
+    """Read a folder of results, and the photographs it was made from with the same settings.
+
+    Photographs that were converted since are found by their names without suffixes, and a
+    :class:`~pimper_torch.runtime.errors.PimperWarning` says so. Another one names those that look
+    different from what ``summary.json`` keeps of them.
+
+    Args:
+        folder: As for :func:`read_written`.
         photographs: Their folder; by default the one that ``summary.json`` names. They may be
             larger than the run read them, and are shrunk then.
 
@@ -71,37 +114,54 @@ def read_result(folder: Path | str, photographs: Path | str | None = None) -> Re
         On the CPU.
 
     Raises:
-        InputError: A file of the result is missing or damaged, or the photographs are not where
-            they were, or others.
+        InputError: A file of the result is missing or damaged, the photographs are not where they
+            were, or one has the name of another.
     """
     folder = Path(folder)
+    written, model = _read(folder)
+    path = photographs or written.summary.get("photographs")
+    views = _photographs(folder, path, model)
+    scene = assemble_scene(views, model)
+    known = written.summary.get("thumbnails")
+    if isinstance(known, Mapping):  # not in older results
+        compare_thumbnails(scene.views, known, f"{path}: photographs of {folder}")
+    return Result(
+        **{one.name: getattr(written, one.name) for one in fields(written)},
+        scene=scene,
+        silhouettes=_silhouettes(
+            folder, scene.views, written.summary, given=views.masks is not None
+        ),
+    )
+
+
+def _read(folder: Path) -> tuple[WrittenResult, SparseModel]:
     if missing := [name for name in _FILES if not (folder / name).exists()]:
         found = f"holds no {some(missing)}" if folder.is_dir() else "is no folder"
         raise InputError(f"{folder}: {found}; needed: a folder written by `pimper reconstruct`.")
     summary = DataSetPath(folder / "summary.json", _KIND).read_json()
     model = read_model(folder / "sparse")
-    views = _photographs(folder, photographs or summary.get("photographs"), model)
-    scene = assemble_scene(views, model)
     mesh = read_mesh(folder / "mesh.ply")
+    offset = local_origin(model.cam_from_world, model.points_world)
+    local = mesh.vertices_world - mesh.vertices_world.new_tensor(offset)
     reference = summary.get("reference") or read_reference(folder / "depth.npz")
-    local = mesh.vertices_world - mesh.vertices_world.new_tensor(scene.offset_world)
-    return Result(
-        mesh=mesh.replace(vertices_world=local).to(scene.points_world.dtype),
-        scene=scene,
+    written = WrittenResult(
+        mesh=mesh.replace(vertices_world=local).to(torch.float32),
+        names=model.names,
         cameras=Cameras(
             intrinsics=pinholes_for(model.lenses),
             cam_from_world=model.cam_from_world,
-            sizes_px=scene.cameras.sizes_px,
+            sizes_px=torch.tensor([[lens.width, lens.height] for lens in model.lenses]),
         ),
-        silhouettes=_silhouettes(folder, scene.views, summary, given=views.masks is not None),
+        offset_world=offset,
         lights_world=read_lights(folder / "lights.json", model.names),
         reference=str(reference) if reference in model.names else model.names[0],
         summary=summary,
     )
+    return written, model
 
 
 def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
-    """Read the photographs of a model as the run read them.
+    """Read the photographs of a model as the run read them, under the names that they had.
 
     The longest side of the model's pictures is that which the run shrank photographs to. What
     reading them warns of was told by the run.
@@ -112,12 +172,20 @@ def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
             "Name it by `--photos DIR` (`photographs=`)."
         )
     path = Path(named)
-    names = {image_name(file, path) for file in list_images(path)} if path.is_dir() else set()
-    if missing := [name for name in model.names if name not in names]:
+    files = [image_name(file, path) for file in list_images(path)] if path.is_dir() else []
+    by_stem = {Path(file).with_suffix(""): file for file in files}
+    found = {name: by_stem.get(Path(name).with_suffix("")) for name in model.names}
+    if missing := [name for name, file in found.items() if file is None]:
         raise InputError(
             f"{folder}: its photographs {some(missing)} are not in {path.absolute()}; needed: all "
             f"{model.num_views} that it was made from. Name their folder by `--photos DIR` "
             "(`photographs=`)."
+        )
+    if converted := [f"{file} for {name}" for name, file in found.items() if file != name]:
+        caution(
+            f"{path}: photographs were converted since {folder} was made; {some(converted)} are "
+            "read. Name the folder of the originals by `--photos DIR` (`photographs=`).",
+            stacklevel=4,
         )
     settings = read_mapping(folder / "config.yaml").get("photographs") or {}
     where = f"{folder / 'config.yaml'}: photographs"
@@ -126,6 +194,8 @@ def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PimperWarning)
         views = load_views(path, encoding=encoding, max_size_px=longest)
+    former = {file: name for name, file in found.items()}
+    views = views.replace(names=tuple(former.get(file, file) for file in views.names))
     sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
     for name, lens in zip(model.names, model.lenses, strict=True):
         if sizes[name] != [lens.width, lens.height]:

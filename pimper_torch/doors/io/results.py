@@ -18,6 +18,7 @@ from pimper_torch.doors.io.reports import (
     summary_report,
     write_json,
 )
+from pimper_torch.doors.io.thumbnails import thumbnails
 from pimper_torch.doors.outputs.folders import written_whole
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.ground.radiometry import to_bytes
@@ -124,6 +125,7 @@ def write_result(
             **({"caps": ready.caps} if ready.caps else {}),
             "asset": asset.summary,
             "relighting": relighting_report(relighting),
+            "thumbnails": thumbnails(whole.scene.views),
         }
         write_json(summary, staging / "summary.json")
         with part(5, _PARTS):
