@@ -55,6 +55,7 @@ SOLE_IMPORTERS = {
     "tyro": {"cli/", "cli/batches/", "pimper_bench/cli/", "single_view/cli/"},
     "matplotlib": {"result/viz/", "pimper_bench/bench/contact_sheet.py"},
     "viser": {"result/viewer/"},
+    "pxr": {"result/asset/usd.py"},
     "onnxruntime": {"priors/network.py"},
     "distributed": {"cli/batches/engines.py"},
     "submitit": {"cli/batches/engines.py"},
@@ -64,6 +65,7 @@ SOLE_IMPORTERS = {
 MODULES = {
     "pyyaml": "yaml",
     "pillow": "PIL",
+    "usd-core": "pxr",
     "scikit-image": "skimage",
     "opencv-python-headless": "cv2",
 }

@@ -24,7 +24,7 @@ from pimper_torch.doors.size.given import (
 )
 from pimper_torch.method.chains.chain_config import Config, PublishedConfig, load_config
 from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
-from pimper_torch.result.asset.mesh_files import MeshFiles
+from pimper_torch.result.asset.mesh_files import MeshFiles, MeshFormat, TextureFormat
 from pimper_torch.result.viewer.server import require_viser
 from pimper_torch.runtime.config import bytes_of, presets, require
 from pimper_torch.runtime.errors import ConfigError, InputError
@@ -72,7 +72,10 @@ class CommonOptions:
         faces: Most that the mesh has, or all; as few as tell the surface unless given.
         watertight: Close the mesh; caps are marked as not measured.
         stl: Write the mesh as STL, too.
-        obj: Write the mesh as OBJ, too.
+        obj: Write mesh and asset as OBJ, too.
+        usdz: Write the asset as USDZ, too; needs pip install "pimper_torch[usd]".
+        texture: Of the pictures in asset.glb.
+        asset_cameras: Put the cameras of the photographs in asset.glb.
         no_report: Leave out report.html.
         fresh: Ignore what an earlier run kept.
         cache: Folder that keeps what stages find, for the next run; OUT/.stages unless given.
@@ -89,6 +92,9 @@ class CommonOptions:
     watertight: Flag = False
     stl: Flag = False
     obj: Flag = False
+    usdz: Flag = False
+    texture: TextureFormat = "png"
+    asset_cameras: Flag = False
     no_report: Flag = False
     fresh: Flag = False
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -105,8 +111,14 @@ class CommonOptions:
     @property
     def files(self) -> MeshFiles:
         """Form in which the surface is written."""
-        formats = (*(("stl",) if self.stl else ()), *(("obj",) if self.obj else ()))
-        return MeshFiles(faces=self.faces, watertight=self.watertight, formats=formats)
+        wanted: dict[MeshFormat, bool] = {"stl": self.stl, "obj": self.obj, "usdz": self.usdz}
+        return MeshFiles(
+            faces=self.faces,
+            watertight=self.watertight,
+            formats=tuple(name for name, written in wanted.items() if written),
+            texture=self.texture,
+            cameras=self.asset_cameras,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -199,7 +211,7 @@ class Job:
 _RARE = (
     *("--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
     *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
-    *("--silhouettes", "--object-at"),
+    *("--silhouettes", "--object-at", "--usdz", "--texture", "--asset-cameras"),
 )
 
 # The skull's cranium and face both show in this photograph.

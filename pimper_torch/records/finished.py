@@ -136,6 +136,8 @@ class Textured(Record):
         uv: Right and down over the textures, in [0, 1].
         tangent: Unit along ``u``, and the sign of the bitangent.
         normal: Along tangent, bitangent and normal: 0 is -1, and 255 is 1.
+        doubt: About the base colour: 0 where light determines it, 128 where too few lights do, and
+            255 where it is the neighbours'.
         reflectance: Metallic, roughness and specular in [0, 1]; ``None`` for matte.
     """
 
@@ -146,6 +148,7 @@ class Textured(Record):
     tangent: Float[Tensor, "copy 4"]
     base_color: UInt8[Tensor, "height width 3"]
     normal: UInt8[Tensor, "height width 3"]
+    doubt: UInt8[Tensor, "height width"]
     reflectance: Float[Tensor, "height width 3"] | None
     charts: int
 

@@ -31,7 +31,7 @@ def run(*arguments):
 
 
 ASKED_FOR = {  # in vain
-    *("masks", "mesh.stl", "mesh.obj"),
+    *("masks", "mesh.stl", "mesh.obj", "asset.usdz"),
     *("asset.obj", "asset.mtl", "asset_albedo.png", "asset_normal.png"),
 }
 

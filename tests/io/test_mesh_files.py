@@ -9,6 +9,7 @@ from torch.testing import assert_close
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.results import write_result
+from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.records import Mesh
 from pimper_torch.result.asset.mesh_files import MeshFiles
@@ -78,7 +79,8 @@ def test_meshes_are_written_as_other_programs_read_them(reconstruction, tmp_path
     assert bool((loaded.face_normals[:, 2] > -0.01).all())
 
 
-def test_far_away_an_obj_stands_and_an_stl_tells_the_offset(reconstruction, tmp_path):
+@pytest.mark.parametrize("metric", [False, True])
+def test_far_away_files_say_the_offset_and_the_asset_its_place(reconstruction, tmp_path, metric):
     offset = (448231.0, 5411923.0, 312.0)
     far = reconstruction.scene.replace(offset_world=offset)
     files = MeshFiles(faces="all", formats=("stl", "obj"))
@@ -87,14 +89,25 @@ def test_far_away_an_obj_stands_and_an_stl_tells_the_offset(reconstruction, tmp_
         Encoding(),
         tmp_path / "out",
         files=files,
+        about={"scale": {"unit": "in"}} if metric else None,
     )
     shift = torch.tensor(offset).double()
     vertices = half_ball().vertices_world
     obj = read_mesh(tmp_path / "out" / "mesh.obj").vertices_world
     assert_close(obj - shift, vertices.double(), atol=1e-5, rtol=0)
+    data = (tmp_path / "out" / "asset.glb").read_bytes()
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    extras = tree["nodes"][0]["extras"]
+    assert (extras["offset_world"], extras["metric"]) == (list(offset), metric)
+    back = torch.tensor(extras["scene_from_asset"]).reshape(4, 4).mT.double()
+    unit = float(back[:3, 0].norm())
+    assert unit == pytest.approx(39.3701 if metric else 2.0, rel=1e-5 if metric else 0.01)
     for name in ("asset.obj", "asset.glb"):
-        placed = read_mesh(tmp_path / "out" / name).vertices_world
-        assert_close(placed.mean(dim=0), obj.mean(dim=0), atol=0.05, rtol=0)
+        placed = read_mesh(tmp_path / "out" / name).vertices_world.double()
+        assert_close(placed.amin(dim=0)[1], torch.tensor(0.0).double(), atol=1e-5, rtol=0)
+        world = transform(back, placed) + shift
+        for one, other in zip(world.aminmax(dim=0), obj.aminmax(dim=0), strict=True):
+            assert_close(one, other, atol=0.05, rtol=0)  # of far fewer faces
     header = (tmp_path / "out" / "mesh.stl").read_bytes()[:80]
     assert header.rstrip() == b"offset 448231.0 5411923.0 312.0"
 

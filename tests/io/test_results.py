@@ -41,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 OBJ = {"mesh.obj", "asset.obj", "asset.mtl", "asset_albedo.png", "asset_normal.png"}
-ASKED_FOR = {"masks", "mesh.stl", *OBJ}  # in vain
+ASKED_FOR = {"masks", "mesh.stl", "asset.usdz", *OBJ}  # in vain
 
 
 def names(folder: Path):

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,12 +21,15 @@ from pimper_torch.doors.io.reports import (
 )
 from pimper_torch.doors.io.thumbnails import thumbnails
 from pimper_torch.doors.outputs.folders import written_whole
+from pimper_torch.doors.size.given import MILLIMETRES
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.sfm.sparse_scene import write_model
-from pimper_torch.records import Finished, Reconstruction
+from pimper_torch.records import Finished, Reconstruction, Textured
 from pimper_torch.result.asset.mesh_files import MeshFiles
+from pimper_torch.result.asset.placement import Placement, standing
+from pimper_torch.result.asset.usd import write_usdz
 from pimper_torch.result.asset.write import write_asset, write_asset_obj
 from pimper_torch.result.report.page import asset_within, write_page
 from pimper_torch.result.report.predictions import predictions
@@ -33,7 +37,7 @@ from pimper_torch.result.report.vertex_layers import surface_layers
 from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.result.viz.overview import draw_overview, headline
 from pimper_torch.result.viz.tiles import array
-from pimper_torch.result.viz.turn import draw_turn
+from pimper_torch.result.viz.turn import draw_turn, up_world
 from pimper_torch.runtime.config import to_yaml
 from pimper_torch.runtime.mapped import each
 from pimper_torch.runtime.progress import part
@@ -45,6 +49,7 @@ RESULT_NAMES = (
     "mesh.stl",
     "mesh.obj",
     "asset.glb",
+    "asset.usdz",
     "asset.obj",
     "asset.mtl",
     "asset_albedo.png",
@@ -79,7 +84,8 @@ def write_result(
 
     Everything is in the frame of the cameras that the photographs came with; ``summary.json`` tells
     the ``offset_world`` that was added to the frame of the run, zero unless they stand far from
-    their origin. The PLY then has doubles, and the GLB the offset as its node's translation.
+    their origin. The PLY then has doubles, and the mesh's GLB the offset as its node's translation.
+    The asset alone stands upright on the origin; its ``extras`` undo that.
 
     The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's
     spacing of it, its normal within 1.5 degrees, and its colour, confidence and expected error
@@ -113,9 +119,12 @@ def write_result(
         with part(0, _PARTS):
             _write_meshes(ready, files, offset, staging)
         with part(1, _PARTS):
-            write_asset(asset, staging / "asset.glb", offset)
+            placement = _placement(whole, asset, files, folder.absolute().name, about or {})
+            write_asset(asset, staging / "asset.glb", placement, files.texture)
+            if "usdz" in files.formats:
+                write_usdz(asset, staging / "asset.usdz", placement)
             if "obj" in files.formats:
-                write_asset_obj(asset, staging / "asset.obj", offset)
+                write_asset_obj(asset, staging / "asset.obj", placement)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
         found = found.replace(report=(*found.report, writing))
@@ -134,7 +143,7 @@ def write_result(
                     staging / "report.html",
                     title=folder.absolute().name,
                     headline=headline(whole),
-                    asset=asset_within(asset, staging / "asset.glb"),
+                    asset=asset_within(asset, staging / "asset.glb", placement),
                     scene=whole.scene,
                     silhouettes=whole.silhouettes,
                     reference=whole.coarse.reference,
@@ -143,6 +152,22 @@ def write_result(
                     summary=summary,
                     settings=(staging / "config.yaml").read_text(encoding="utf-8"),
                 )
+
+
+def _placement(
+    result: Reconstruction, asset: Textured, files: MeshFiles, name: str, about: Mapping[str, Any]
+) -> Placement:
+    """Return the place of an asset in its files; of known size if ``about`` names the unit."""
+    cameras, unit = result.cameras, (about.get("scale") or {}).get("unit")
+    metre = None if unit is None else MILLIMETRES["m"] / MILLIMETRES[unit]
+    up, reference = up_world(cameras), result.coarse.reference
+    return Placement(
+        name=name,
+        scene_from_asset=standing(asset.mesh, cameras, reference, up, metre),
+        offset_world=result.scene.offset_world,
+        metric=unit is not None,
+        cameras=(result.scene.views.names, cameras) if files.cameras else None,
+    )
 
 
 def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Path) -> None:

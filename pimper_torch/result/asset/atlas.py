@@ -1,5 +1,6 @@
 """Where on a texture every face of a mesh lies."""
 
+import math
 import subprocess
 import sys
 import tempfile
@@ -38,6 +39,7 @@ class Atlas(Record):
         vertex: The mesh's vertex that every vertex of the atlas is a copy of.
         faces: The mesh's faces, in its order, as vertices of the atlas.
         uv: Right and down over the texture, in [0, 1].
+        width: A power of two, as is the height: graphics cards store other textures badly.
     """
 
     vertex: Int[Tensor, " copy"]
@@ -52,7 +54,8 @@ def unwrapped(mesh: Mesh, texel: float) -> Atlas:
     """Lay a mesh out by xatlas; triangle by triangle where xatlas fails or takes too long.
 
     Args:
-        texel: Side wanted, scene units; larger where the texture would be larger than 4096.
+        texel: Side wanted, scene units. The texture's sides are the nearest powers of two, 4096 at
+            most, so that texels are up to 1.42 times as long or as short.
     """
     return _by_xatlas(mesh, texel) or by_triangles(mesh, texel)
 
@@ -96,8 +99,7 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
         with np.load(after, allow_pickle=False) as found:
             values = {name: torch.from_numpy(found[name]) for name in ("vertex", "faces", "uv")}
             size, charts = found["size"].tolist(), int(found["charts"])
-    shrunk = min(1.0, MAX_SIDE / max(size))
-    width, height = (max(1, round(shrunk * side)) for side in size)
+    width, height = (min(MAX_SIDE, 2 ** round(math.log2(side))) for side in size)
     faces = torch.empty_like(mesh.faces)
     faces[order] = values["faces"]
     return Atlas(
@@ -136,23 +138,22 @@ def by_triangles(mesh: Mesh, texel: float) -> Atlas:
     count = len(mesh.faces)
     a, b, c = mesh.vertices_world.detach().double()[mesh.faces].unbind(dim=1)
     area = torch.linalg.cross(b - a, c - a).norm(dim=1).mean() / 2
-    columns = max(1, int(np.ceil(np.sqrt(count / 2))))
-    wanted = int(np.ceil(np.sqrt(2 * float(area)) / texel)) + 3 * _GUTTER_TEXELS
-    side = min(wanted, MAX_SIDE // columns)
-    rows = -(-count // (2 * columns))
+    columns = math.ceil(math.sqrt(count / 2))
+    wanted = columns * (math.ceil(math.sqrt(2 * float(area)) / texel) + 3 * _GUTTER_TEXELS)
+    size = min(MAX_SIDE, 2 ** math.ceil(math.log2(wanted)))
+    side = size // columns
     # The right angle of the first lies at the cell's upper left, that of the second opposite.
     leg = side - 3 * _GUTTER_TEXELS
     first = torch.tensor([[0.0, 0], [0, leg], [leg, 0]]) + _GUTTER_TEXELS
     halves = torch.stack([first, side - first])
     cell = torch.arange(count) // 2
     corner = side * torch.stack([cell % columns, cell // columns], dim=1)
-    size = torch.tensor([side * columns, side * rows])
     placed = corner[:, None] + halves[torch.arange(count) % 2]
     return Atlas(
         vertex=mesh.faces.flatten(),
         faces=torch.arange(3 * count).reshape(-1, 3),
         uv=(placed / size).reshape(-1, 2),
-        width=int(size[0]),
-        height=int(size[1]),
+        width=size,
+        height=size,
         charts=count,
     )

@@ -15,9 +15,10 @@ from pimper_torch.ground.geometry.surfaces import (
 )
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster
 from pimper_torch.ground.radiometry import to_bytes
-from pimper_torch.ground.shapes import Mask, Vertices
+from pimper_torch.ground.shapes import Mask, PerVertex, Vertices
 from pimper_torch.records import Mesh, Textured
 from pimper_torch.result.asset.atlas import Atlas
+from pimper_torch.result.asset.inpaint import INPAINTED
 from pimper_torch.result.asset.tangents import frames, tangents
 from pimper_torch.result.viz.maps import albedo_scale, base_color, carried_normals
 from pimper_torch.runtime.parallel import side_by_side
@@ -29,6 +30,7 @@ def halved(asset: Textured) -> Textured:
     return asset.replace(
         base_color=_halved(asset.base_color.float()).round().to(torch.uint8),
         normal=_halved(asset.normal.float()).round().to(torch.uint8),
+        doubt=_halved(asset.doubt[..., None].float())[..., 0].round().to(torch.uint8),
         reflectance=None if reflectance is None else _halved(reflectance),
     )
 
@@ -39,7 +41,13 @@ def _halved(
     return avg_pool2d(texture.movedim(-1, 0), 2).movedim(0, -1)
 
 
-def baked(full: Mesh, few: Mesh, atlas: Atlas, reflectance: Vertices | None = None) -> Textured:
+def baked(
+    full: Mesh,
+    few: Mesh,
+    atlas: Atlas,
+    reflectance: Vertices | None = None,
+    doubt: PerVertex | None = None,
+) -> Textured:
     """Read albedo and normals of a surface off onto textures of a mesh that has fewer faces.
 
     From the centre of every texel, on a face of the mesh, a ray along the mesh's blended normals
@@ -50,13 +58,16 @@ def baked(full: Mesh, few: Mesh, atlas: Atlas, reflectance: Vertices | None = No
         full: The surface, on the CPU.
         few: The mesh that was laid out, its normals those that the normal map is relative to.
         reflectance: Metallic, roughness and specular of the mesh's vertices.
+        doubt: About the albedo of the surface's vertices; see
+            :func:`~pimper_torch.result.asset.inpaint.inpainted`.
     """
     normals = carried_normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
     shape = vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
     tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
-    values = torch.cat([carried_normals(full), colors], dim=1)
+    doubt = torch.zeros_like(full.vertices_world[:, 0]) if doubt is None else doubt
+    values = torch.cat([carried_normals(full), colors, doubt[:, None]], dim=1)
     surface, laid = _Surface(full, few), _laid(atlas)
     own = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
 
@@ -77,7 +88,9 @@ def baked(full: Mesh, few: Mesh, atlas: Atlas, reflectance: Vertices | None = No
     known = torch.zeros_like(laid.face, dtype=torch.bool)
     known[texels] = torch.cat([there for _, there in blocks])
     size = (atlas.height, atlas.width)
-    raster = raster[_nearest_known(known.reshape(size))[0]].reshape(*size, -1)
+    raster = raster[_nearest_known(known.reshape(size))[0]]
+    raster[(laid.face >= 0) & ~known, 6] = INPAINTED
+    raster = raster.reshape(*size, -1)
     return Textured(
         mesh=mesh,
         vertex=atlas.vertex,
@@ -86,7 +99,8 @@ def baked(full: Mesh, few: Mesh, atlas: Atlas, reflectance: Vertices | None = No
         tangent=tangent,
         normal=(255 * (0.5 + 0.5 * raster[..., :3])).round().to(torch.uint8),
         base_color=to_bytes(raster[..., 3:6]),
-        reflectance=None if reflectance is None else raster[..., 6:],
+        doubt=(255 * raster[..., 6]).round().to(torch.uint8),
+        reflectance=None if reflectance is None else raster[..., 7:],
         charts=atlas.charts,
     )
 

@@ -24,8 +24,9 @@ def main(pieces: str, found: str) -> None:
     for places, triangles in zip(vertices, faces, strict=True):
         atlas.add_mesh(places, triangles)
     options = xatlas.PackOptions()
-    # Two texels of every chart beside its own, so that three mip levels are apart.
-    options.padding, options.texels_per_unit = 4, 1.0
+    # On textures whose sides are rounded down to powers of two, two texels of every chart are left
+    # around its own, so that three mip levels are apart.
+    options.padding, options.texels_per_unit = 6, 1.0
     atlas.generate(xatlas.ChartOptions(), options)
     vertex: list[np.ndarray] = []
     uv: list[np.ndarray] = []

@@ -14,6 +14,7 @@ _TRIANGLES, _POINTS = 4, 0
 _KINDS = {"u1": 5121, "u2": 5123, "u4": 5125, "f4": 5126}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _LINEAR_MIPMAP_LINEAR, _LINEAR, _CLAMP = 9987, 9729, 33071
+_WEBP = "EXT_texture_webp"
 # glTF's own is metal.
 MATTE: dict[str, Any] = {
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
@@ -29,6 +30,10 @@ def gltf_of(
     material: Mapping[str, Any],
     images: Sequence[bytes] = (),
     offset_world: Offset = NO_OFFSET,
+    *,
+    name: str = "",
+    extras: Mapping[str, object] | None = None,
+    cameras: Sequence[Mapping[str, Any]] = (),
 ) -> bytes:
     """Return one mesh of one material as a GLB.
 
@@ -37,7 +42,11 @@ def gltf_of(
         faces: Three vertices each. Without any, the vertices are points.
         material: In glTF's words; its textures' indices are those of ``images``. Extensions that it
             names are declared.
-        images: PNG or JPEG files.
+        images: PNG, JPEG or WebP files.
+        offset_world: The node's ``translation``.
+        name: Of node, mesh and material.
+        extras: Of the node.
+        cameras: Nodes, each with a ``camera`` of its own.
     """
     buffer, views, accessors = bytearray(), [], []
 
@@ -66,10 +75,10 @@ def gltf_of(
     if len(faces):
         kind = "<u2" if len(places) < 65536 else "<u4"
         primitive["indices"] = stored(faces.astype(kind).ravel(), _INDICES)
-    for name, values in attributes.items():
-        rows = _unit(values) if name in ("NORMAL", "TANGENT") else np.asarray(values, "<f4")
-        more = bounds if name == "POSITION" else {}
-        primitive["attributes"][name] = stored(rows, _ARRAYS, **more)
+    for key, values in attributes.items():
+        rows = _unit(values) if key in ("NORMAL", "TANGENT") else np.asarray(values, "<f4")
+        more = bounds if key == "POSITION" else {}
+        primitive["attributes"][key] = stored(rows, _ARRAYS, **more)
     primitive["material"] = 0
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "pimper_torch"},
@@ -77,31 +86,53 @@ def gltf_of(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
-        "materials": [material],
+        "materials": [dict(material)],
         "accessors": accessors,
         "bufferViews": views,
     }
     if offset_world != NO_OFFSET:
         tree["nodes"][0]["translation"] = list(offset_world)
+    if name:
+        for kind in ("nodes", "meshes", "materials"):
+            tree[kind][0]["name"] = name
+    if extras:
+        tree["nodes"][0]["extras"] = extras
+    if cameras:
+        tree["cameras"] = [one["camera"] for one in cameras]
+        tree["nodes"] += [{**one, "camera": index} for index, one in enumerate(cameras)]
+        tree["scenes"] = [{"nodes": list(range(1 + len(cameras)))}]
+    extensions = set(material.get("extensions", ()))
     if images:
+        kinds = [_image_kind(image) for image in images]
         tree["images"] = [
-            {
-                "bufferView": viewed(image, None),
-                "mimeType": "image/png" if image.startswith(b"\x89PNG") else "image/jpeg",
-            }
-            for image in images
+            {"bufferView": viewed(image, None), "mimeType": kind}
+            for image, kind in zip(images, kinds, strict=True)
         ]
         sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR}
         tree["samplers"] = [{**sampler, "wrapS": _CLAMP, "wrapT": _CLAMP}]
-        tree["textures"] = [{"source": index, "sampler": 0} for index in range(len(images))]
-    if "extensions" in material:
-        tree["extensionsUsed"] = sorted(material["extensions"])
+        tree["textures"] = [
+            {"sampler": 0, "extensions": {_WEBP: {"source": index}}}
+            if kind == "image/webp"
+            else {"source": index, "sampler": 0}
+            for index, kind in enumerate(kinds)
+        ]
+        if "image/webp" in kinds:
+            extensions.add(_WEBP)
+            tree["extensionsRequired"] = [_WEBP]
+    if extensions:
+        tree["extensionsUsed"] = sorted(extensions)
     tree["buffers"] = [{"byteLength": len(buffer)}]
     text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode("ascii")
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(buffer))
     head += struct.pack("<I4s", len(text), b"JSON") + text
     return head + struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
+
+
+def _image_kind(image: bytes) -> str:
+    if image.startswith(b"\x89PNG"):
+        return "image/png"
+    return "image/webp" if image.startswith(b"RIFF") else "image/jpeg"
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

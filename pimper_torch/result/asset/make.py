@@ -7,6 +7,7 @@ from pimper_torch.ground.shapes import Vertices
 from pimper_torch.records import Mesh, Relighting, Textured
 from pimper_torch.result.asset.atlas import unwrapped
 from pimper_torch.result.asset.bake import baked
+from pimper_torch.result.asset.inpaint import inpainted
 from pimper_torch.runtime.stage import Stage
 
 # Texels along a median side of the surface's faces.
@@ -14,7 +15,7 @@ _TEXELS_PER_SIDE = 1.5
 
 
 def textured(full: Mesh, few: Mesh, reflectance: Vertices | None = None) -> Textured:
-    """Bake a surface onto few faces.
+    """Bake a surface onto few faces, without albedo that is too bright to be true.
 
     Args:
         full: The surface, on the CPU.
@@ -23,7 +24,8 @@ def textured(full: Mesh, few: Mesh, reflectance: Vertices | None = None) -> Text
     """
     full, few = (one.detach().to(torch.float32) for one in (full, few))
     side = float(side_lengths(full.vertices_world[full.faces]).median())
-    return baked(full, few, unwrapped(few, side / _TEXELS_PER_SIDE), reflectance)
+    full, doubt = inpainted(full)
+    return baked(full, few, unwrapped(few, side / _TEXELS_PER_SIDE), reflectance, doubt)
 
 
 class Texture(Stage):

@@ -117,7 +117,8 @@
       this.camera = new THREE.PerspectiveCamera(FOV_DEG, 1, 1, 10);
       this.world = new THREE.Scene();
       this.object = object;
-      this.object.position.set(0, 0, 0); // cameras are in the frame without the offset
+      const { scene_from_asset: back } = object.userData; // cameras are in the frame of the scene
+      if (back) object.geometry.applyMatrix4(new THREE.Matrix4().fromArray(back));
       object.geometry.computeBoundingSphere();
       ({ center: this.center, radius: this.radius } = object.geometry.boundingSphere);
       object.geometry.computeBoundingBox();

@@ -11,6 +11,7 @@ from typing import Any
 
 from pimper_torch.records import Silhouettes, SparseScene, Textured
 from pimper_torch.result.asset.bake import halved
+from pimper_torch.result.asset.placement import Placement
 from pimper_torch.result.asset.write import write_asset
 from pimper_torch.result.report.predictions import Prediction, view_entries
 from pimper_torch.result.report.vertex_layers import VertexLayer
@@ -42,7 +43,8 @@ def write_page(
 
     Args:
         headline: What went in and what came out, in a line.
-        asset: The surface as a binary glTF, in the frame of ``scene``.
+        asset: The surface as a binary glTF; its ``extras`` say where it is in ``scene``, otherwise
+            it is in that frame.
         layers: Of the asset's attributes; those that it lacks are not shown.
     """
     data = {
@@ -67,15 +69,15 @@ def write_page(
     Path(path).write_text(_PLACE.sub(part, _read("page.html")), encoding="utf-8")
 
 
-def asset_within(asset: Textured, path: Path) -> bytes:
+def asset_within(asset: Textured, path: Path, placement: Placement) -> bytes:
     """Read an asset's file, or make one with coarser textures where it is too large for a page."""
     # Of a page of 15 MB; text takes a third more than bytes.
     if path.stat().st_size <= 7_500_000 or min(asset.base_color.shape[:2]) < 2:
         return path.read_bytes()
     with TemporaryDirectory(prefix="pimper_page_") as folder:
         smaller, coarser = Path(folder) / path.name, halved(asset)
-        write_asset(coarser, smaller)
-        return asset_within(coarser, smaller)
+        write_asset(coarser, smaller, placement)
+        return asset_within(coarser, smaller, placement)
 
 
 def _read(name: str) -> str:

@@ -1,0 +1,47 @@
+"""Albedo where light does not determine the surface."""
+
+import torch
+
+from pimper_torch.ground.geometry.topology import face_edges, vertex_components
+from pimper_torch.ground.linalg.continuation import about_mean
+from pimper_torch.ground.shapes import PerVertex
+from pimper_torch.records import Mesh
+
+# Confidence of normals that are off by 24 degrees. A choice.
+_LEAST_CONFIDENCE = 0.1
+
+UNDETERMINED, INPAINTED = 0.5, 1.0
+"""Doubt about the albedo of a vertex, or of a texel; 0 where light determines it."""
+
+
+def inpainted(mesh: Mesh) -> tuple[Mesh, PerVertex]:
+    """Replace albedo that is too bright to be true by that of the neighbours.
+
+    Where few lights reach, normals are not determined, and neither is the shading that albedo was
+    divided by. A vertex is too bright there if it is brighter than 99 of 100 determined ones; so is
+    what surrounds it, as far as it is brighter than the continued albedo of the determined surface.
+
+    Returns:
+        The mesh, unchanged if nothing is too bright or no vertex has confidence, and the doubt.
+    """
+    albedo, confidence = mesh.albedo, mesh.confidence
+    if albedo is None or confidence is None:
+        return mesh, torch.zeros_like(mesh.vertices_world[:, 0])
+    finite = albedo.isfinite().all(dim=1)
+    sure = (confidence >= _LEAST_CONFIDENCE) & finite
+    doubt = torch.where(sure, 0.0, UNDETERMINED).to(albedo)
+    if not bool(sure.any()):
+        return mesh, doubt
+    edges, _ = face_edges(mesh.faces)
+    brightness = albedo.amax(dim=1)
+    usual = about_mean(albedo, sure, edges).amax(dim=1)
+    most = brightness[sure].kthvalue(max(1, round(0.99 * int(sure.sum())))).values
+    above = ~sure & (brightness > usual)
+    label = vertex_components(mesh.faces, above)
+    bright = above & torch.isin(label, label[above & (brightness > most)]) | ~finite
+    if not bool(bright.any()):
+        return mesh, doubt
+    return (
+        mesh.replace(albedo=about_mean(albedo, ~bright, edges)),
+        torch.where(bright, INPAINTED, doubt),
+    )
