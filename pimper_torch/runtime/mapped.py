@@ -121,7 +121,7 @@ def each(*rasters: Sequence[Tensor] | Tensor) -> Iterator[tuple[Tensor, ...]]:
 
 
 def _in_memory(folder: str) -> bool:
-    """Return whether files of a folder take memory; false where the system does not tell."""
+    """Return whether files of a folder take memory; false where the system does not say."""
     with suppress(OSError):
         lines = Path("/proc/mounts").read_text(encoding="utf-8").splitlines()
         kinds = {line.split()[1]: line.split()[2] for line in lines}

@@ -47,7 +47,7 @@ _MAX_CONCAVE_DEG = 40.0
 
 
 def contour_rays(silhouettes: Silhouettes, cameras: Cameras, per_view: int = 300) -> ContourRays:
-    r"""Cast rays through the silhouettes, and tell the surface's normal on each.
+    r"""Cast rays through the silhouettes, and find the surface's normal on each.
 
     A surface that ends in the picture is tangent there to the ray, and its contour to the
     silhouette: its normal is :math:`\pm r \times \dot r`, with :math:`r` the ray and
@@ -120,7 +120,7 @@ class _Line:
     closed: bool
 
     def shifted(self, values: Array, by: int) -> Array:
-        """Return what stands so many points further along; the end's beyond an open one's end."""
+        """Return the values a number of points further on; beyond an open line's end, its last."""
         at = np.arange(len(values)) + by
         at = at % len(values) if self.closed else at.clip(0, len(values) - 1)
         shifted: Array = values[at]
@@ -165,13 +165,13 @@ def _read(values: Array, points: Array) -> Array:
 
 
 # Cosine between the offset from the nearest point's disc and its normal, from which on a place
-# is below the surface: beside the border of what is known, none is.
+# is below the surface: next to the border of the known surface, no place is.
 _ALONG_NORMAL = 0.9
 
 # How far outside the visual hull a ray may touch the surface.
 _TOLERANCE_PX = 1.5
 
-# Points, itself included, to the last of which a point's disc reaches: those round it in a
+# Points, itself included, to the last of which a point's disc reaches: those around it in a
 # triangle mesh.
 _NEIGHBOURS = 7
 
@@ -204,7 +204,7 @@ def contour_points(
     known = len(points_world) > 0 and len(rays.view) > 0
     surface = _SignedDistance(points_world, normals_world) if known else None
     cost = _costs(rays, centers, depth, hull, _TOLERANCE_PX * pixel, surface)
-    # Places nearer to each other than that tell nothing of which surface a ray touches.
+    # Places nearer to each other than that do not show which surface a ray touches.
     clear = ~ambiguous(cost, 2.0 * pixel)
     (met,) = torch.nonzero(cost.isfinite().any(dim=1) & clear, as_tuple=True)
     best = depth[met].gather(1, cost[met].argmin(dim=1, keepdim=True))
@@ -226,7 +226,7 @@ def contour_points(
 class _SignedDistance:
     """Distance to the surface around some of its points, negative below it.
 
-    A point stands for a disc of its tangent plane that reaches to its neighbours.
+    A point represents a disc of its tangent plane that reaches to its neighbours.
     """
 
     def __init__(self, points: Points, normals: Points) -> None:
@@ -329,7 +329,7 @@ class Contours(Record):
 
     @property
     def confine(self) -> bool:
-        """Whether the object lies in a hull that silhouettes tell."""
+        """Whether silhouettes give a hull that the object is inside of."""
         return not isinstance(self.hull, Everywhere)
 
     def touching(self, points_world: Points, normals_world: Points) -> ContourPoints:

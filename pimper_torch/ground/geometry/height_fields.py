@@ -18,7 +18,7 @@ Origins = Float[Tensor, "patch 2"]
 PerRay = Float[Tensor, "patch ray"]
 
 # A neighbour that carries less of the blend than this may be invalid: a point that lies on
-# a row of samples must not miss because rounding put it a hair beside the row.
+# a row of samples must not miss because rounding put it a hair off the row.
 _NEGLIGIBLE_WEIGHT = 1e-4
 
 

@@ -1,6 +1,6 @@
 """The frame that a scene far from its origin is computed in: shifted, neither turned nor scaled.
 
-Georeferenced models stand at coordinates of 1e5 units and more, of which single precision keeps
+Georeferenced models have coordinates of 1e5 units and more, of which single precision keeps
 hundredths. A scene's own frame has its origin among what is photographed.
 """
 

@@ -68,7 +68,7 @@ class Hull(Record):
         return self.replace(distance=torch.minimum(self.distance, height))
 
     def holds(self, points_world: Vectors, tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
-        """Find points inside, or so little outside that silhouettes do not tell.
+        """Find points inside, or so little outside that silhouettes do not show it.
 
         Args:
             tolerance: Scene units outside that do not count, if they are more than that.
@@ -174,7 +174,7 @@ def visual_hull(
 
     A pixel that shows the object with a probability :math:`p` below a half counts
     :math:`1 - 2 p` against it; at a half, and outside its photograph, a view abstains. Of what
-    only such words leave inside, pieces that stand apart are left out. Time and memory grow with
+    only such words leave inside, separate pieces are left out. Time and memory grow with
     the voxels.
 
     Args:

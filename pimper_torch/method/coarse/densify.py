@@ -180,8 +180,8 @@ def sweep(matcher: Matcher, field: Map, offsets: Sequence[float]) -> tuple[Map, 
     """Find the best of some evenly spaced offsets of a field at every pixel.
 
     Returns:
-        Inverse depth, between the offsets by the parabola through the best and those beside
-        it, and the best score.
+        Inverse depth, between the offsets by the parabola through the best and its
+        neighbours, and the best score.
     """
     smallest = torch.finfo(field.dtype).tiny
     scores = matcher.scores(field, offsets)
@@ -343,7 +343,7 @@ def step_for_one_pixel(
 ) -> float:
     """Return the change of inverse depth that moves points by one pixel in the sources.
 
-    The median over points and sources: cameras round an object have about the same base.
+    The median over points and sources: cameras around an object have about the same base.
     """
     height, width = pairing.ray.shape[-2:]
     column = pixels[:, 0].long().clamp(0, width - 1)

@@ -19,7 +19,7 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import zeros
 from pimper_torch.runtime.parallel import side_by_side
 
-# Length of the mean of unit normals round a point, at least: that of normals which scatter by
+# Length of the mean of unit normals around a point, at least: that of normals which scatter by
 # 60 degrees.
 _MIN_AGREEMENT = 0.5
 

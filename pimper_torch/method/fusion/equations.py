@@ -121,11 +121,11 @@ def kept_slopes(
     transferred: PerVertex,
     variance: PerVertex,
 ) -> Equations:
-    """State that edges lie as they do on the surface that there is, where light tells nothing.
+    """State that edges keep the slopes of the present surface, where light determines none.
 
     Args:
         edges: Those without normals at both ends.
-        variance: Of its slopes, squared radians; no residual tells it, for they start at 0.
+        variance: Of its slopes, squared radians; no residual shows it, for they start at 0.
     """
     found = slopes(edges, flat, directions, shape, variance)
     return found.replace(
@@ -188,7 +188,7 @@ def swept_heights(
 
 
 def upright_heights(information: PerVertex, facing: PerVertex) -> VertexMask:
-    """Find vertices whose swept offsets tell heights."""
+    """Find vertices whose swept offsets determine heights."""
     return (information > 0) & (facing > MIN_FACING)
 
 

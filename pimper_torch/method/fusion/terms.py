@@ -59,11 +59,11 @@ class Term(nn.Module):
     One of your own overrides :meth:`equations`, and whatever else does not suit it.
 
     Attributes:
-        position: Whether it tells where the surface lies, so that the tilt that the normals of a
-            facet have in common can be told from it.
+        position: Whether it determines where the surface is, so that the tilt that the normals of a
+            facet have in common follows from it.
         loose: Whether what it states of a facet has an error in common, whose variance the other
-            terms tell (:meth:`evaluated`).
-        guessed: Whether it is a guess: it is evaluated by all terms that are none.
+            terms determine (:meth:`evaluated`).
+        guessed: Whether it is a guess: all terms that are not guesses evaluate it.
         residual: Whether it states what other terms leave open: its equations depend on
             ``problem.sloped``.
         tilted: Whether its normals have a tilt that those of a facet have in common: its equations
@@ -77,12 +77,12 @@ class Term(nn.Module):
     tilted: ClassVar[bool] = False
 
     def bound(self, problem: Problem, contours: Contours) -> "Term":
-        """Return the term beside what it looks for once, on the coarser subdivided mesh."""
+        """Return the term with what it looks up once, on the coarser subdivided mesh."""
         del problem, contours
         return self
 
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
-        """Find edges whose slope it tells: :class:`KeptSlopes` leaves them alone."""
+        """Find edges whose slope it determines: :class:`KeptSlopes` leaves them alone."""
         return torch.zeros_like(problem.lit)
 
     def equations(self, problem: Problem) -> list[Equations]:
@@ -93,7 +93,7 @@ class Term(nn.Module):
         """Return the term with the variance of its common errors, as other terms' heights show it.
 
         Args:
-            firm: Vertices whose positions other terms tell.
+            firm: Vertices whose positions other terms determine.
         """
         del problem, heights, firm
         return self
@@ -179,7 +179,7 @@ class PriorNormals(Term):
     the guesses of a facet have in common.
 
     Args:
-        variance: Of that tilt, squared radians; ``None`` where nothing tells it.
+        variance: Of that tilt, squared radians; ``None`` where nothing shows it.
     """
 
     loose, guessed = True, True
@@ -197,7 +197,7 @@ class PriorNormals(Term):
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
         """Find those edges, if guesses are nearer to the truth than slopes that were not measured.
 
-        A guess that is not yet evaluated stands beside these.
+        A guess that is not yet evaluated is used together with these.
         """
         unmeasured = UNMEASURED**2 * own_slope_variance(problem)
         better = self.variance is not None and bool(self.variance < unmeasured)
@@ -257,7 +257,7 @@ class CloudPoints(Term):
     position = True
 
     def bound(self, problem: Problem, contours: Contours) -> Term:
-        """Return the points beside the lines along which they are known."""
+        """Return the points with the lines along which they are known."""
         del contours
         cloud = problem.cloud
         return Passing(None if cloud is None else equations.cloud_points(cloud, problem.surface))
@@ -295,12 +295,12 @@ class Passing(Term):
 
 
 class KeptSlopes(Term):
-    """Where no other term tells slopes, the surface keeps its own.
+    """Where no other term determines slopes, the surface keeps its own.
 
     Where lit surface encloses it, its normals are continued: the shape there is what the facets
     started with, since no pass knew it. Elsewhere the shape is kept. Continued normals of a facet
     have a common error: together they count as much as one of them. So do kept slopes within a
-    window of the sweep, or they would outvote its heights. Where there are heights, these tell the
+    window of the sweep, or they would outvote its heights. Where there are heights, these show the
     variance of kept slopes; elsewhere no residual does. Potatoes under one light for all views, 24
     views of 800x600, have normals that are 7.9 degrees off, and 9.6 where each kept slope counts by
     itself. Across contours and folds heights cannot follow normals, and go on differing as they do.

@@ -19,7 +19,7 @@ def closed(mesh: Mesh) -> Closed:
 
     What was there stays as it is, but that the mesh is made a manifold first: where fans of
     faces meet in a vertex only, each gets its own copy. A cap is a disk of rings, each with half
-    the vertices of the one round it, so that it is as fine as its border outside and coarse
+    the vertices of the one around it, so that it is as fine as its border outside and coarse
     inside. It says where the surface ends, not where the object is: its vertices have no
     confidence, the mesh's extent as expected error, and the albedo of the border continued. Caps
     of deep or twisted borders may cross the surface or themselves.
@@ -72,7 +72,7 @@ def closed(mesh: Mesh) -> Closed:
 
 
 def _known(albedo: VertexValues) -> VertexValues:
-    """Assign vertices whose albedo no photograph tells the mean of the others'."""
+    """Assign vertices whose albedo no photograph shows the mean of the others'."""
     known = albedo.isfinite()
     mean = torch.where(known, albedo, 0).sum(dim=0) / known.sum(dim=0).clamp_min(1)
     return torch.where(known, albedo, mean)

@@ -209,7 +209,7 @@ class Factorize(Stage):
         if torch.is_grad_enabled() and problem.requires_grad:
             factors = differentiable(problem, factors)
         estimates = recomputed(refine_on_manifold, problem, factors)
-        views = rows.seen.shape[1]  # a view beyond them stands for known albedo
+        views = rows.seen.shape[1]  # a view beyond them represents known albedo
         lights, weight = factors.lights[:, :views], factors.weight[:, :views]
         anchor, given = problem.anchor[:, :views], problem.weight[:, :views]
         finite = lights.isfinite().flatten(1).all(dim=1)
@@ -294,7 +294,7 @@ class Factorize(Stage):
             prior=prior,
             manifold=cone,
             loss=LOSSES[config.loss](*([config.loss_scale] if config.loss_scale else [])),
-            stride=max(1, raster // 512),  # some 500 samples tell the residuals' deviation
+            stride=max(1, raster // 512),  # some 500 samples determine the residuals' deviation
         )
         for each in known:
             if each.albedo is not None and each.albedo_weight is not None:

@@ -24,7 +24,7 @@ from pimper_torch.runtime.stage import Stage
 # all face the camera to 0.98.
 _GUESS_GAIN = 0.95
 
-# Information of the surface's normals where guesses stand beside them: a choice, 5.4 degrees, as
+# Information of the surface's normals where there are guesses, too: a choice, 5.4 degrees, as
 # much as the weight of their prior says.
 _SURFACE_INFORMATION = 0.1 / RELATIVE_NOISE**2
 

@@ -2,9 +2,9 @@
 
 Turned over so that its underside shows, the object and what surrounds it are two rigid bodies: in a
 pair of photographs with one of each series, no epipolar geometry explains the matches of both. In a
-pair of one series one geometry does. Pairs of the first kind tell features of the object from those
-of the surroundings, and which photographs cannot be of one series; between series, only what is the
-object's ties photographs together.
+pair of one series one geometry does. Pairs of the first kind separate features of the object from
+those of the surroundings, and show which photographs cannot be of one series; between series, only
+the object's own features tie photographs together.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ from pimper_torch.runtime.ledger import leave_out
 # of those outside fit a second geometry by chance; in 24 pairs of a mug that was turned over 31 to
 # 341, and 0.84 to 1.00.
 _MIN_SECOND, _MIN_FRACTION = 30, 0.7
-# Matches beyond which a pair tells no more.
+# Matches beyond which a pair gives no more information.
 _ENOUGH = 50
 
 
@@ -146,7 +146,7 @@ def series_of(
 
     Correlation clustering: pairs in which one geometry explains features of both bodies attract,
     pairs that show two bodies repel, and pairs that match otherwise attract where nothing else
-    tells.
+    decides.
 
     Source: greedy additive edge contraction of Keuper et al., Efficient Decomposition of Image and
     Mesh Graphs by Lifted Multicuts, ICCV 2015.
@@ -243,7 +243,7 @@ def tie_series(database: Path, settings: ReconstructConfig) -> tuple[matching.Ve
 def series_in(
     model: SparseModel, names: Sequence[str], around: Sequence[matching.VerifiedPair]
 ) -> Int[Tensor, " view"]:
-    """Number the series of a model's views, by what they show round the object.
+    """Number the series of a model's views, by what they show around the object.
 
     In the object's frame, matches of the surroundings agree with the cameras within a series, and
     contradict them between two. Groups that nothing contradicts are joined by the points that they

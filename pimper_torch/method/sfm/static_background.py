@@ -1,10 +1,10 @@
-r"""Features of a room that is at rest before the camera while the object turns.
+r"""Features of a room that is at rest in front of the camera while the object turns.
 
-Where camera and room stand still and the object turns, as on a turntable, two motions fit the
+Where camera and room do not move and the object turns, as on a turntable, two motions fit the
 photographs: the object's, and none at all. A match whose features lie at the same pixel is *still*.
-A rigid scene has still matches, too: points at infinity before a camera that only shifts, or points
-near the axis of a turn. But there one epipolar geometry explains them together with the matches
-that move. No geometry explains a room at rest together with an object that turns.
+A rigid scene has still matches, too: points at infinity in front of a camera that only shifts, or
+points near the axis of a turn. But there one epipolar geometry explains them together with the
+matches that move. No geometry explains a room at rest together with an object that turns.
 
 A room that shifts, because the tripod was touched, is not found. A model that was registered on it
 is doubted, see :mod:`pimper_torch.method.sfm.doubt`.
@@ -175,7 +175,7 @@ def _split(
     """Return a pair's still matches, and those that clearly move."""
     first, second = matching.pixels_of(keypoints, pair, rows)
     length = (first - second).norm(dim=-1)
-    # Features at rest that were found less exactly are no evidence of motion.
+    # Features at rest that were found less exactly do not show motion.
     return rows[length < still_px], rows[length >= 4 * still_px]
 
 

@@ -1,10 +1,10 @@
 r"""Points found again in photographs, to a small fraction of a pixel, whatever the light.
 
-What a view shows round a point is the reference view's patch, moved along the point's tangent plane
-by a few numbers. Of the logarithm of the radiance, light that changes from view to view adds a
-constant and, over a patch, about a slope; both are projected out of patch and template alike, a
-common factor (contrast) is fitted. What remains is aligned by Gauss-Newton on the template's
-slopes, which are computed once for all views (inverse compositional).
+A view shows around a point the reference view's patch, moved along the point's tangent plane by a
+few numbers. To the logarithm of the radiance, light that changes from view to view adds a constant
+and, over a patch, about a slope; both are projected out of patch and template alike, and a common
+factor (contrast) is fitted. The rest is aligned by Gauss-Newton on the template's slopes, which are
+computed once for all views (inverse compositional).
 
 Source: Baker & Matthews, Lucas-Kanade 20 years on, IJCV 2004; that points of structure from motion
 deserve it, Lindenberger et al., Pixel-perfect structure-from-motion, ICCV 2021, with learned
@@ -293,7 +293,7 @@ def _templates(
     slopes = torch.stack([window.freed(right.flatten(1)), window.freed(down.flatten(1))], dim=-1)
     normal = slopes.mT @ slopes
     worst, best = torch.linalg.eigvalsh(normal).unbind(dim=1)
-    # Below, the patch is a stripe, and noise tells its place.
+    # Below, the patch is a stripe, and noise determines its place.
     told = (best > 1e-9) & (worst > 0.01 * best)
     safe = torch.where(told[:, None, None], normal, torch.eye(2).to(normal))
     return _Templates(

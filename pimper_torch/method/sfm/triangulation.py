@@ -40,9 +40,9 @@ def triangulate(
     """Triangulate what photographs show, with cameras held fixed.
 
     Features are found and matched as in structure from motion. What an epipolar geometry of its own
-    verifies tells whether the cameras belong to the photographs. Then features are matched anew
+    verifies shows whether the cameras belong to the photographs. Then features are matched anew
     along the cameras' epipolar lines, triangulated, and found again in every view by aligning
-    patches. On one thread where the order of sums tells, so that bits repeat.
+    patches. On one thread where the order of sums matters, so that bits repeat.
 
     Args:
         given: Cameras of the photographs, in their order. Points that they have are replaced where

@@ -147,7 +147,7 @@ class Sweep(Stage):
         costs = costs.movedim(1, -1)[weighed]
         guess: Float[Tensor, "sample hypothesis"] | None = None
         if priors is not None:
-            # Where several heights agree, the guess chooses; photographs tell where it is.
+            # Where several heights agree, the guess chooses; photographs show where it is.
             off = STEP * templates.spacing[:, None, None, None] * ladder.to(costs)
             off = off - priors.offset[..., None]
             guess = torch.log1p(0.5 * priors.offset_information[..., None] * off.square())[weighed]

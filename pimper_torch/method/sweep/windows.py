@@ -31,7 +31,7 @@ def window_mean(
 
 
 def _blur(size: int, radius: float) -> Float[Tensor, "size size"]:
-    """Return the symmetric matrix that sums over the window along an axis of so many samples."""
+    """Return the symmetric matrix that sums over the window along an axis of that many samples."""
     reach = max(1, round(2.5 * radius))
     steps = torch.arange(max(size, reach + 1))
     away = (steps[:size, None] - steps[:size]).abs()
