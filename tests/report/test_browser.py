@@ -1,5 +1,7 @@
 """The page in a browser: what it draws, under which light, and what it asks for."""
 
+import base64
+import re
 import shutil
 import time
 from io import BytesIO
@@ -16,7 +18,6 @@ from pimper_torch.result.asset.write import write_asset
 from pimper_torch.result.relighting.held_out import predict
 from pimper_torch.result.report.page import write_page
 from pimper_torch.result.report.predictions import predictions
-from pimper_torch.result.report.vertex_layers import surface_layers
 from pimper_torch.result.viz.maps import base_color, view_maps
 from tests.relighting.ball import SIDE, ball_mesh, photographed
 
@@ -25,15 +26,46 @@ sync_api = pytest.importorskip("playwright.sync_api")
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+LEFT_OUT = {"what": "points", "total": 90000, "reason": "without albedo", "names": []}
+VIEW = {"name": "a.png", "psnr_db": 31.0, "psnr_matte_db": None}
 SUMMARY = {
     "doubt": None,
-    "warnings": ["Two photographs are blurred."],
-    "seconds": 12.0,
+    "warnings": ["Lower `factorize.min_views`, or `--masks` and <b>bold</b>."],
+    "seconds": 150.4,
     "peak_memory_mb": 900.0,
-    "stages": [{"name": "warp", "seconds": 4.0, "peak_memory_mb": 500.0, "kept": False}],
-    "left_out": [],
-    "failures": [],
+    "peak_memory_stage": "warp",
+    "registered": 6,
+    "views": 7,
+    "triangles": 2999,
+    "vertices": 560140,
+    "simplified": {"vertices": 83045, "faces": 166000},
+    "stages": [
+        {"name": "warp", "seconds": 8.0, "peak_memory_mb": 500.0, "kept": False, "samples": 12345},
+        {"name": "fuse", "seconds": 4.0, "peak_memory_mb": 900.0, "kept": False, "missing": None},
+        {"name": "sweep", "seconds": 90.0, "peak_memory_mb": 800.0, "kept": True},
+    ],
+    "left_out": [
+        {**LEFT_OUT, "guard": "fuse.albedo", "count": 45000},
+        {**LEFT_OUT, "guard": "repair", "count": 0},
+    ],
+    "failures": [
+        {
+            "stage": "fuse",
+            "what": "patch",
+            "names": ["3", "5"],
+            "reason": "no light",
+            "done": "left",
+        }
+    ],
+    "relighting": {
+        "photographs": "held out",
+        "psnr_db": 31.0,
+        "psnr_matte_db": 29.0,
+        "views": [VIEW],
+        "materials": [{"vertices": 1.0, "metallic": 0.0, "roughness": 0.35, "specular": 1.2}],
+    },
 }
+LIGHT = [0.3, 0.1, -0.2, 0.4]
 GLOSSY = (0.0, 0.35, 1.0)  # metallic, roughness, specular
 
 
@@ -64,19 +96,23 @@ def shown(tmp_path_factory):
         reliable=torch.ones(views, dtype=torch.bool),
         source="found",
     )
-    write_page(
-        folder / "report.html",
-        title="ball",
-        headline="6 of 6 photographs",
-        asset=(folder / "asset.glb").read_bytes(),
-        scene=scene,
-        silhouettes=silhouettes,
-        reference=0,
-        predictions=predictions(mesh, scene, relighting),
-        layers=surface_layers(asset.mesh),
-        summary=SUMMARY,
-        settings="zeta: 0.5",
-    )
+    lights_world = torch.tensor([[torch.nan] * 4, *[LIGHT] * 5])
+    parts = {
+        "title": "ball",
+        "mesh": mesh,
+        "asset": (folder / "asset.glb").read_bytes(),
+        "surface": asset.mesh,
+        "scene": scene,
+        "silhouettes": silhouettes,
+        "reference": 0,
+        "predictions": predictions(mesh, scene, relighting),
+        "summary": SUMMARY,
+        "settings": {"zeta": 0.5, "fuse": {"terms": ["normals"]}},
+    }
+    write_page(folder / "report.html", **parts, lights_world=lights_world)
+    quiet = {**SUMMARY, "left_out": [], "failures": [], "warnings": [], "relighting": None}
+    parts["summary"] = quiet | {"simplified": None, "scale": {"unit": "mm"}}
+    write_page(folder / "plain.html", **parts)
     return folder / "report.html", mesh, scene, lights, materials
 
 
@@ -226,7 +262,7 @@ def test_the_surface_turns_under_the_pointer(opened):
 def test_layers_of_numbers_have_a_legend(opened):
     choose(opened, "expected error")
     assert opened.locator("#legend").is_visible()
-    assert "units or more" in opened.locator("#high").inner_text()
+    assert "% of the object's size or more" in opened.locator("#high").inner_text()
     low, high = canvas(opened).reshape(-1, 3).min(axis=0), canvas(opened).reshape(-1, 3).max(axis=0)
     assert (high - low).max() > 100
 
@@ -242,7 +278,7 @@ def test_a_click_on_a_camera_stands_behind_it(opened, shown):
     name = opened.locator("#thumbnails button[aria-pressed=true] span").inner_text()
     assert name == scene.views.names[0]
     assert "31.0 dB" in opened.locator("#hint").inner_text()
-    assert opened.locator("#pair").is_visible()
+    assert opened.locator("#compared").is_visible()
 
 
 def test_the_photograph_fades_in_over_the_surface(opened, shown):
@@ -255,23 +291,289 @@ def test_the_photograph_fades_in_over_the_surface(opened, shown):
     assert np.abs(drawn - wanted).mean() < 4
 
 
-def test_the_page_is_usable_on_a_phone(browser, shown):
+def pressed(page):
+    """Names of the photographs that are chosen."""
+    return page.locator("#thumbnails button[aria-pressed=true] span").all_inner_texts()
+
+
+def test_keys_and_buttons_step_through_photographs(opened, shown):
+    names = shown[2].views.names
+    press = opened.keyboard.press
+    found = []
+    for key in ("ArrowRight", "ArrowRight", "ArrowLeft", "ArrowLeft", "ArrowRight", "Escape"):
+        press(key)
+        found.append(pressed(opened))
+    assert found == [[names[at]] for at in (0, 1, 0, 5, 0)] + [[]]
+    opened.get_by_role("button", name="previous photograph").click()
+    assert pressed(opened) == [names[5]]
+    opened.get_by_role("button", name="next photograph").click()
+    assert pressed(opened) == [names[0]]
+    for control in ("#lamp", "#ambient"):  # have arrow keys of their own
+        opened.locator(control).focus()
+        press("ArrowRight")
+        assert pressed(opened) == [names[0]]
+    press("Alt+ArrowRight")  # the browser's
+    assert pressed(opened) == [names[0]]
+    opened.locator("#thumbnails button").first.focus()
+    press("ArrowRight")
+    assert opened.evaluate("document.activeElement.innerText") == names[1]
+
+
+def test_the_ring_of_the_focus_is_round_and_for_keys_alone(opened):
+    outline = "getComputedStyle(document.getElementById('lamp')).outlineStyle"
+    opened.locator("#lamp").click()
+    assert opened.evaluate("document.activeElement.id") == "lamp"
+    assert opened.evaluate(outline) == "none"
+    opened.keyboard.press("Tab")
+    opened.keyboard.press("Shift+Tab")
+    assert opened.evaluate("document.activeElement.id") == "lamp"
+    assert opened.evaluate(outline) == "solid"
+    radius = "getComputedStyle(document.getElementById('lamp')).borderRadius"
+    assert opened.evaluate(radius) == "50%"
+
+
+def test_photograph_prediction_and_difference_are_in_one_row_with_a_word_on_decibels(opened):
+    behind(opened, 1)
+    boxes = [one.bounding_box() for one in opened.locator("#figures figure").all()]
+    assert len(boxes) == 3
+    assert len({box["y"] for box in boxes}) == 1
+    assert boxes[0]["x"] < boxes[1]["x"] < boxes[2]["x"]
+    assert boxes[0]["y"] + boxes[0]["height"] <= 800  # in sight with the surface
+    words = opened.locator("#worth").inner_text()
+    assert words.startswith("31.0 dB (PSNR): the prediction is off by 7.2 of 255 levels")
+    assert words.endswith("number 1 of 6.")
+
+
+def linear(picture):
+    level = picture / 255
+    return np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+
+
+def first_order(scene, mesh, view, even, along):
+    """The irradiance of a first-order light at the pixels of a view."""
+    normals_cam = view_maps(mesh, scene.cameras, view).normals_cam
+    normals = normals_cam @ scene.cameras.cam_from_world[view, :3, :3]
+    return (even + normals @ torch.tensor(along)).clamp_min(0).numpy()
+
+
+def test_the_shape_is_grey_under_a_sky_that_is_brighter_above(opened, shown):
+    _, mesh, scene, _, _ = shown
+    choose(opened, "shape")
+    behind(opened, 1)
+    opened.get_by_label("lamp").uncheck()
+    inside = inner(scene, mesh, 1)
+    drawn = linear(photograph_of(canvas(opened)))
+    up = [0.0, 0.0, 1.0]  # of the ring of cameras
+    grey, ambient = linear(np.array(0xB8)), 0.4
+    wanted = grey * ambient * first_order(scene, mesh, 1, 1.0, [0.6 * one for one in up])
+    assert np.abs(drawn - wanted[..., None])[inside].mean() < 0.01
+    assert drawn[inside].max() > 2 * drawn[inside].min()  # no cut-out
+
+
+def test_hollows_of_the_shape_are_as_dark_as_they_see_little_sky(opened, shown, tmp_path):
+    _, mesh, scene, _, _ = shown
+    page = shown[0].read_text(encoding="utf-8")
+    open_to = re.search(r'"openness": "([^"]*)"', page)[1]
+    half = base64.b64encode(bytes([128]) * len(base64.b64decode(open_to))).decode()
+    (tmp_path / "half.html").write_text(page.replace(open_to, half), encoding="utf-8")
+    inside, found = inner(scene, mesh, 1), []
+    for path in (shown[0], tmp_path / "half.html"):
+        opening(opened, path)
+        choose(opened, "shape")
+        behind(opened, 1)
+        opened.get_by_label("lamp").uncheck()
+        found.append(linear(photograph_of(canvas(opened)))[inside].mean())
+    opened.asked[:] = opened.asked[:1]
+    assert found[1] / found[0] == pytest.approx(128 / 255, abs=0.01)
+
+
+def test_the_shape_has_the_same_lamp_from_every_photograph(opened):
+    bulb = opened.locator("#lamp .bulb")
+    places = []
+    for layer in ("shape", "lit"):
+        choose(opened, layer)
+        for view in (0, 3):
+            behind(opened, view)
+            canvas(opened)
+            places.append((bulb.get_attribute("cx"), bulb.get_attribute("cy")))
+    assert places[0] == places[1]
+    assert places[2] != places[3]
+
+
+def test_the_environment_is_the_first_order_light_of_the_photograph(opened, shown):
+    _, mesh, scene, _, _ = shown
+    behind(opened, 2)
+    opened.get_by_label("environment").check()
+    assert not opened.get_by_label("lamp").is_checked()
+    assert not opened.locator("#lamp").is_visible()
+    strength = LIGHT[0] + np.linalg.norm(LIGHT[1:])  # its brightest is 1
+    shading = first_order(scene, mesh, 2, LIGHT[0], LIGHT[1:]) / strength
+    colored = mesh.replace(albedo=base_color(mesh))
+    wanted = view_maps(colored, scene.cameras, 2).albedo.numpy() * shading[..., None]
+    inside = inner(scene, mesh, 2)
+    own = linear(photograph_of(canvas(opened)))
+    # The page's renderer takes from light of all sides what the surface mirrors of it.
+    assert np.abs(own - wanted)[inside].mean() < 0.02
+    behind(opened, 0)  # has none of its own: the mean
+    before = canvas(opened)
+    opened.get_by_label("lamp").check()  # beside it
+    assert (canvas(opened) - before).mean() > 2
+
+
+def test_two_clicks_measure_the_surface(opened, shown):
+    scene = shown[2]
+    behind(opened, 0)
+    choose(opened, "measure")
+    told = opened.locator("#measured")
+    assert told.inner_text() == "Click the first place on the surface."
+    stage = opened.locator("#canvas").bounding_box()
+    side = min(stage["width"], stage["height"])
+
+    def click(x, y):
+        """Click a place of the photograph, in pixels; return that of the ball."""
+        left = stage["x"] + (stage["width"] - side) / 2
+        top = stage["y"] + (stage["height"] - side) / 2
+        opened.mouse.click(left + x * side / SIDE, top + y * side / SIDE)
+        pose = scene.cameras.cam_from_world[0].double()
+        camera = scene.cameras.intrinsics[0].double()
+        ray = pose[:3, :3].mT @ torch.linalg.inv(camera) @ torch.tensor([x, y, 1.0]).double()
+        ray, eye = ray / ray.norm(), scene.cameras.centers_world[0].double()
+        along = -ray @ eye
+        return eye + (along - (along**2 - eye @ eye + 1).sqrt()) * ray
+
+    click(2.0, 2.0)  # beside the ball
+    assert told.inner_text() == "Click the first place on the surface."
+    first = click(30.0, 40.0)
+    assert told.inner_text() == "Click the second place on the surface."
+    second = click(52.0, 31.0)
+    wanted = 100 * float((first - second).norm()) / (2 * 3**0.5)
+    value, _, unit = told.inner_text().partition(" ")
+    assert float(value) == pytest.approx(wanted, rel=0.02)  # a click is a whole pixel
+    assert unit == "% of the object's size"
+    assert len(pressed(opened)) == 1  # no camera was clicked
+    click(30.0, 40.0)  # begins anew
+    assert told.inner_text() == "Click the second place on the surface."
+    choose(opened, "measure")
+    assert not told.is_visible()
+
+
+def ball_pixels(picture):
+    """Pixels of colour in the middle of the canvas."""
+    height, width = picture.shape[:2]
+    square = picture[height // 4 : -height // 4, (width - height // 2) // 2 :][:, : height // 2]
+    return int((square.max(axis=-1) - square.min(axis=-1) > 30).sum())
+
+
+def test_cameras_leave_the_surface_a_third_of_the_picture(opened):
+    choose(opened, "albedo")
+    height = opened.locator("#stage").bounding_box()["height"]
+    opened.get_by_label("cameras").check()
+    drawn = canvas(opened)
+    count = ball_pixels(drawn)
+    assert count > 0.9 * np.pi / 4 * (height / 3) ** 2
+    opened.get_by_label("cameras").uncheck()
+    assert np.abs(canvas(opened) - drawn).mean() > 2
+
+
+def test_the_viewer_fills_the_screen(opened):
+    choose(opened, "full screen")
+    full = "document.fullscreenElement && document.fullscreenElement.id"
+    opened.wait_for_function(full)
+    assert opened.evaluate(full) == "viewer"
+    box = opened.locator("#stage").bounding_box()
+    assert box["width"] > 0.95 * opened.evaluate("innerWidth")
+    assert box["height"] > 0.7 * opened.evaluate("innerHeight")
+    choose(opened, "full screen")
+    opened.wait_for_function("!document.fullscreenElement")
+
+
+def cells(page, title):
+    """Rows of the table of a section, in texts."""
+    section = page.locator("#sections > *", has_text=title).first
+    return [row.locator("td, th").all_text_contents() for row in section.locator("tr").all()]
+
+
+def test_head_and_tables_say_one_thing(opened):
+    assert opened.locator("#headline").inner_text() == (
+        "6 of 7 photographs, 2,999 facets, 83,045 vertices in mesh.ply (560,140 before "
+        "simplification), 150 s"
+    )
+    assert opened.get_by_text("150 s up to this page, 900 MB at most, in warp").is_visible()
+    assert cells(opened, "Stages")[1:] == [
+        ["warp", "8.0", "", "500", "samples 12,345"],
+        ["fuse", "4.0", "", "900", ""],
+        ["sweep", "kept", "", "800", ""],  # it took its time elsewhere
+    ]
+    bars = opened.locator("td.bar i").evaluate_all("(all) => all.map((one) => one.style.width)")
+    assert bars == ["100%", "50%", "0%"]
+    assert opened.locator("li").inner_text() == SUMMARY["warnings"][0].replace("`", "")
+    assert opened.locator("li code").all_inner_texts() == ["factorize.min_views", "--masks"]
+    assert cells(opened, "Left out")[1:] == [
+        ["Pass 1"],
+        ["fuse.albedo", "45,000", "90,000", "points", "without albedo"],
+    ]
+    assert opened.locator("details[open]").count() == 0
+    assert cells(opened, "Failed")[1:] == [["fuse", "patch 3, 5", "no light", "left"]]
+    assert cells(opened, "Settings")[1:] == [["zeta", "0.5"], ["fuse"], ["terms", '["normals"]']]
+    assert cells(opened, "Photographs predicted")[1:] == [
+        ["mean", "31.00", "29.00", ""],
+        ["a.png", "31.00", "", ""],
+    ]
+    predicted = opened.locator("details", has_text="Photographs predicted")
+    assert "held out of the run" in predicted.locator("p").text_content()
+    assert "roughness 0.35" in predicted.locator("p").text_content()
+
+
+def test_a_plain_result_has_no_section_without_a_message(opened, shown):
+    opening(opened, shown[0].with_name("plain.html"))
+    opened.asked[:] = opened.asked[:1]
+    titles = opened.locator("#sections h2, #sections summary").all_inner_texts()
+    assert titles == ["Warnings", "Stages", "Settings"]
+    assert "560,140 vertices, 150 s" in opened.locator("#headline").inner_text()
+    assert not opened.get_by_label("environment").is_visible()
+    choose(opened, "expected error")
+    assert opened.locator("#high").inner_text().endswith(" mm or more")
+
+
+@pytest.fixture
+def phone(browser, shown):
     context = browser.new_context(
         viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True
     )
     page = context.new_page()
     opening(page, shown[0])
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    for name in ("lit", "shape", "albedo", "normals", "whole surface"):
-        button = page.get_by_role("button", name=name, exact=True)
+    yield page
+    context.close()
+
+
+def test_the_page_is_usable_on_a_phone(phone):
+    for name in ("lit", "shape", "albedo", "normals", "whole surface", "measure", "full screen"):
+        button = phone.get_by_role("button", name=name, exact=True)
         box = button.bounding_box()
         assert box["x"] >= 0
         assert box["x"] + box["width"] <= 390
         assert box["height"] >= 32
-        button.tap()
-    page.locator("#thumbnails button").first.tap()
-    assert page.locator("#photo").is_visible()
-    context.close()
+    for details in phone.locator("details summary").all():
+        details.tap()
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_the_surface_stays_in_sight_of_a_phone(phone):
+    phone.locator("#thumbnails button").nth(1).evaluate("(one) => one.scrollIntoView()")
+    phone.locator("#thumbnails button").nth(1).tap()
+    assert phone.locator("#photo").is_visible()
+    stage, row = (phone.locator(one).bounding_box() for one in ("#stage", "#figures"))
+    assert stage["y"] >= 0
+    assert 0.3 * 844 < stage["height"] < 0.5 * 844
+    assert row["y"] >= stage["y"] + stage["height"]  # seen with it, not under it
+    assert row["y"] + row["height"] <= 844
+
+
+def test_figures_of_a_stage_are_below_it_on_a_phone(phone):
+    row = phone.locator("tr", has_text="samples 12,345")
+    name, figures = (row.locator(kind).bounding_box() for kind in ("td.name", "td.text"))
+    assert figures["y"] >= name["y"] + name["height"]
+    assert figures["x"] + figures["width"] <= 390
 
 
 def test_a_browser_without_webgl_still_shows_photographs_and_tables(browser, shown):

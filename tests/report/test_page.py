@@ -10,9 +10,11 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.records import Judged, Materials, Relighting, ViewLights
-from pimper_torch.result.report.page import section_entries, write_page
+from pimper_torch.records import Judged, Materials, Mesh, Relighting, ViewLights
+from pimper_torch.result.report.openness import openness
+from pimper_torch.result.report.page import left_out_by_pass, write_page
 from pimper_torch.result.report.predictions import (
     Prediction,
     jpeg,
@@ -22,42 +24,37 @@ from pimper_torch.result.report.predictions import (
     shrunk,
     view_entries,
 )
-from pimper_torch.result.report.vertex_layers import VertexLayer
+from pimper_torch.result.report.vertex_layers import (
+    VertexLayer,
+    length_layer,
+    length_unit,
+    surface_layers,
+)
 
 MATTE = (0.0, 1.0, 0.0)  # metallic, roughness, specular
 SUMMARY = {
+    "photographs": "/home/somebody/cup",
     "doubt": None,
     "warnings": ["two photographs are blurred; take them again"],
     "seconds": 12.0,
-    "peak_memory_mb": 900.0,
-    "peak_memory_stage": "fuse",
-    "stages": [
-        {"name": "warp", "seconds": 4.0, "peak_memory_mb": 500.0, "kept": False, "samples": 12345},
-        {"name": "fuse", "seconds": 8.0, "peak_memory_mb": 900.0, "kept": False},
-        {"name": "sweep", "seconds": 90.0, "peak_memory_mb": 800.0, "kept": True},
-    ],
-    "left_out": [
-        {"guard": "warp", "what": "pixels", "count": 2000, "total": 9000, "reason": "dark",
-         "names": ["a.png"]},
-        {"guard": "repair", "what": "points", "count": 0, "total": 10, "reason": "folds",
-         "names": []},
-    ],
+    "stages": [],
+    "left_out": [],
     "failures": [],
-}  # fmt: skip
+}
 
 
 def written(result, path, **changed):
     parts = {
         "title": "cup",
-        "headline": "3 of 3 photographs",
+        "mesh": result.mesh,
         "asset": b"glTF and so on",
+        "surface": result.mesh,
         "scene": result.scene,
         "silhouettes": result.silhouettes,
         "reference": 1,
         "predictions": [None] * result.scene.views.num_views,
-        "layers": [],
         "summary": SUMMARY,
-        "settings": "zeta: 0.5\n",
+        "settings": {"zeta": 0.5, "fuse": {"terms": ["normals", "points"], "max_hole": math.inf}},
     }
     write_page(path, **{**parts, **changed})
     return path.read_text(encoding="utf-8")
@@ -77,13 +74,19 @@ def test_a_page_holds_what_it_is_told_and_needs_nothing_else(reconstruction, tmp
     page = written(reconstruction, tmp_path / "report.html", layers=[layer])
     data = data_of(page)
     assert base64.b64decode(element(page, "asset")) == b"glTF and so on"
-    assert (data["title"], data["headline"], data["reference"]) == ("cup", "3 of 3 photographs", 1)
-    assert data["layers"][0]["attribute"] == "_support"
+    assert (data["title"], data["reference"]) == ("cup", 1)
+    assert data["layers"][-1]["about"] == "views"
+    assert len(base64.b64decode(data["openness"])) == len(reconstruction.mesh.vertices_world)
+    assert data["settings"] == {
+        "zeta": "0.5",
+        "fuse": {"terms": '["normals", "points"]', "max_hole": "Infinity"},
+    }
     assert [view["name"] for view in data["views"]] == list(reconstruction.scene.views.names)
     # Nothing is fetched: no address but data, and the browser is told to refuse others.
     template = page.replace(element(page, "data"), "")
     assert not re.search(r"<(?:script|link|img)[^>]+(?:src|href)=", template)
     assert "default-src 'none'" in page
+    assert "somebody" not in page  # nor does it say whose machine made it
     assert not re.search(r"\{(?:page|three)\.(?:css|js)\}|\{data\}|\{asset\}", page)
 
 
@@ -122,12 +125,18 @@ def test_a_prediction_comes_with_its_light(reconstruction):
         ambient=torch.tensor([[0.1]]),
         directed=torch.tensor([[0.5]]),
     )
-    told = Prediction(radiance=torch.full((1, 40, 60), 0.2), light=light, figure="30.0 dB")
-    first, second, _ = view_entries(
-        reconstruction.scene, reconstruction.silhouettes, [None, told, None]
+    told = Prediction(radiance=torch.full((1, 40, 60), 0.2), light=light, psnr_db=30.0)
+    lights_world = torch.tensor([[math.nan] * 4, [0.2, 0.1, 0.0, 0.3], [0.1, 0.0, 0.2, 0.0]])
+    first, second, third = view_entries(
+        reconstruction.scene,
+        reconstruction.silhouettes,
+        [None, told, told.replace(psnr_db=math.nan)],
+        lights_world,
     )
-    assert "prediction" not in first
-    assert second["figure"] == "30.0 dB"
+    assert not {"prediction", "psnr_db", "environment"} & set(first)
+    assert "psnr_db" not in third
+    assert second["environment"] == pytest.approx([0.2, 0.1, 0.0, 0.3])
+    assert second["psnr_db"] == 30.0
     assert second["light"]["closeness"] == 0.25
     assert second["light"]["directed"] == pytest.approx([0.5] * 3)
     assert second["light"]["direction"] == pytest.approx([0.0, 0.6, 0.8])
@@ -151,7 +160,8 @@ def test_predictions_are_of_every_photograph(reconstruction):
         lights=lights, materials=materials, judged=worth, matte=worth, held_out=False
     )
     found = predictions(mesh, scene, relighting)
-    assert [one.figure for one in found] == ["30.0 dB", "", ""]
+    assert found[0].psnr_db == pytest.approx(30.04)
+    assert all(math.isnan(one.psnr_db) for one in found[1:])
     first, second, third = (one.radiance.sum() for one in found)
     assert first > 0
     assert second > 1.5 * first
@@ -192,44 +202,86 @@ def test_an_outline_is_where_the_silhouette_ends():
     assert len(numbers) < 2 * math.pi * 20
 
 
-def sections_of(**changed):
-    entries = section_entries({**SUMMARY, **changed}, "zeta: 0.5\n")
-    return {one["title"]: one for one in entries}
+def left_out(guard, count, total=100, *, what="points", names=()):
+    return {"guard": guard, "what": what, "count": count, "total": total, "reason": "dark",
+            "names": list(names)}  # fmt: skip
 
 
-def test_sections_tell_stages_guards_and_warnings():
-    sections = sections_of()
-    assert sections["Warnings"]["items"] == SUMMARY["warnings"]
-    rows = sections["Stages"]["table"]["rows"]
-    assert [row[1] for row in rows] == ["4.0", "8.0", "kept"]
-    assert [row[2] for row in rows] == [0.5, 1.0, 0]  # a kept stage took its time elsewhere
-    assert rows[0][4] == "samples 12,345"
-    guards = sections["Left out, and by whom"]
-    assert guards["table"]["rows"] == [["warp", "2,000", "9,000", "pixels", "dark: a.png"]]
-    assert "repair" in guards["text"]
-    assert sections["Settings"]["code"] == "zeta: 0.5\n"
-    assert not {"Failed", "Photographs predicted from the surface"} & set(sections)
-    failure = {"stage": "fuse", "what": "patch", "names": ["3", "5"], "reason": "no light",
-               "done": "left out"}  # fmt: skip
-    sections = sections_of(doubt="cameras doubtful", failures=[failure])
-    assert sections["Warnings"]["items"][0] == "cameras doubtful"
-    assert sections["Failed"]["table"]["rows"] == [["fuse", "patch 3, 5", "no light", "left out"]]
-    assert sections_of(warnings=[])["Warnings"] == {"title": "Warnings", "text": "None."}
-
-
-def test_what_predictions_are_worth_is_told_with_the_materials():
-    views = [{"name": "a.png", "psnr_db": 31.0, "psnr_matte_db": None}]
-    material = {"vertices": 1.0, "metallic": 0.0, "roughness": 0.35, "specular": 1.2}
-    told = {"photographs": "held out", "psnr_db": 31.0, "psnr_matte_db": 29.0, "views": views,
-            "materials": [material]}  # fmt: skip
-    found = sections_of(relighting=told)["Photographs predicted from the surface"]
-    assert "held out" in found["text"]
-    assert "roughness 0.35" in found["text"]
-    assert [row[:3] for row in found["table"]["rows"]] == [
-        ["mean", "31.00", "29.00"],
-        ["a.png", "31.00", ""],
+def test_what_was_left_out_is_said_pass_by_pass_where_it_matters():
+    entries = [
+        left_out("sfm.missing", 1, what="photographs", names=["a.png"]),
+        left_out("coarse.hull", 5),  # a twentieth: hardly anything
+        left_out("warp", 99, what="pixels"),  # most views see most facets from behind
+        left_out("fuse.albedo", 6),
+        left_out("repair", 0),
+        left_out("fuse.albedo", 7),
+        left_out("repair", 30),
+        left_out("extract.borders", 50, what="faces"),
     ]
-    used = sections_of(relighting={**told, "photographs": "used"})
-    assert "made from" in used["Photographs predicted from the surface"]["text"]
-    unknown = sections_of(relighting={**told, "psnr_db": None})
-    assert "Photographs predicted from the surface" not in unknown
+    found = [
+        (one["heading"], [(entry["guard"], entry["count"]) for entry in one["entries"]])
+        for one in left_out_by_pass(entries)
+    ]
+    assert found == [
+        ("Cameras, silhouettes and coarse surface", [("sfm.missing", 1)]),
+        ("Pass 1", [("fuse.albedo", 6)]),
+        ("Pass 2", [("fuse.albedo", 7), ("repair", 30)]),
+        ("Mesh", [("extract.borders", 50)]),
+    ]
+    assert left_out_by_pass([left_out("repair", 0), left_out("fuse.albedo", 5)]) == []
+
+
+def test_lengths_are_in_the_known_unit_or_in_hundredths_of_the_diagonal():
+    corners = torch.tensor([[0.0, 0, 0], [3.0, 4.0, 12.0]])
+    box = Mesh(vertices_world=corners, faces=torch.zeros(0, 3, dtype=torch.long))
+    assert length_unit(box).factor == pytest.approx(100 / 13)
+    assert length_unit(box).name == "% of the object's size"
+    assert (length_unit(box, "mm").factor, length_unit(box, "mm").name) == (1.0, "mm")
+    layers = surface_layers(box.replace(expected_error=torch.tensor([0.26, 0.26])))
+    assert [layer.high_text for layer in layers] == ["2 % of the object's size or more"]
+
+
+@pytest.mark.parametrize(
+    ("values", "high"),
+    [
+        (list(range(101)), 100.0),  # quartiles 25 and 75: the fence would be at 150
+        ([*range(101), 1e6, 1e9], 77 + 1.5 * (77 - 25)),  # outliers are above the fence
+        ([3.0] * 9, 3.0),
+        ([math.nan, 2.0, math.inf], 2.0),
+        ([math.nan], 0.0),
+    ],
+)
+def test_few_outliers_do_not_take_the_colours_of_all(values, high):
+    layer = length_layer("_a", "a", "", torch.tensor(values), length_unit(SQUARE, "mm"))
+    assert layer.low == 0
+    assert layer.high == high
+    assert layer.high_text.endswith("mm or more")
+
+
+SQUARE = Mesh(
+    vertices_world=torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
+    faces=torch.tensor([[0, 1, 2], [0, 2, 3]]),
+)
+
+
+def test_a_ball_sees_all_of_its_sky():
+    vertices, faces = icosphere(3)
+    ball = Mesh(vertices_world=vertices, faces=faces, normals_world=vertices)
+    assert_close(openness(ball), torch.ones(len(vertices)))
+
+
+@pytest.mark.parametrize("depth", [0.5, 1.0, 2.0])
+def test_the_floor_of_a_pit_sees_the_sky_above_its_rim(depth):
+    """The middle of the floor of a round pit has the irradiance r^2 / (r^2 + h^2) of the sky."""
+    angle = torch.arange(180) * (2 * torch.pi / 180)
+    ring = torch.stack([angle.cos(), angle.sin(), torch.zeros(180)], dim=1)
+    middle = torch.tensor([[0.0, 0.0, 0.0]])
+    points = torch.cat([middle, ring, ring + torch.tensor([0.0, 0, depth])])
+    here, there = torch.arange(180), (torch.arange(180) + 1) % 180
+    floor = torch.stack([torch.zeros(180, dtype=torch.long), 1 + here, 1 + there], dim=1)
+    wall = torch.stack([1 + here, 1 + there, 181 + there], dim=1)
+    other = torch.stack([1 + here, 181 + there, 181 + here], dim=1)
+    upward = torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3)
+    pit = Mesh(vertices_world=points, faces=torch.cat([floor, wall, other]), normals_world=upward)
+    # A ray is a fiftieth of what the middle sees.
+    assert float(openness(pit)[0]) == pytest.approx(1 / (1 + depth**2), abs=0.04)

@@ -21,7 +21,8 @@ from pimper_torch.result.asset.write import write_asset
 from pimper_torch.result.relighting.held_out import Relight
 from pimper_torch.result.report.page import write_page
 from pimper_torch.result.report.predictions import predictions
-from pimper_torch.result.report.vertex_layers import length_layer, surface_layers
+from pimper_torch.result.report.vertex_layers import LengthUnit, length_layer
+from pimper_torch.runtime.config import read_mapping
 
 _DISTANCE, _ANGLE = "_DISTANCE_TO_TRUTH", "_NORMAL_ERROR_DEG"
 # Titles and units by the names of the asset's attributes.
@@ -50,7 +51,7 @@ def write_compared_page(
     asset = Texture()(found.mesh, few, relighting)
     errors = errors_of(asset.mesh.replace(normals_world=asset.normals), truth, truth_from_world)
     layers = [
-        length_layer(name.lower(), title, _ABOUT, errors[name], unit)
+        length_layer(name.lower(), title, _ABOUT, errors[name], LengthUnit(factor=1, name=unit))
         for name, (title, unit) in _LAYERS.items()
         if name in errors
     ]
@@ -60,15 +61,17 @@ def write_compared_page(
         write_page(
             path,
             title=f"{folder.absolute().name}, compared with the truth",
-            headline=f"{len(found.mesh.vertices_world):,} vertices",
+            mesh=found.mesh,
             asset=glb.read_bytes(),
+            surface=asset.mesh,
             scene=scene,
             silhouettes=found.silhouettes,
             reference=scene.views.names.index(found.reference),
             predictions=predictions(few, scene, relighting),
-            layers=[*surface_layers(asset.mesh), *layers],
             summary=found.summary,
-            settings=(folder / "config.yaml").read_text(encoding="utf-8"),
+            settings=read_mapping(folder / "config.yaml"),
+            lights_world=found.lights_world,
+            layers=layers,
         )
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from pimper_torch.doors.io.estimates import mask_path
+from pimper_torch.doors.io.estimates import mask_path, read_lights
 from pimper_torch.doors.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.doors.io.reports import (
     lights_report,
@@ -33,12 +33,11 @@ from pimper_torch.result.asset.usd import write_usdz
 from pimper_torch.result.asset.write import write_asset, write_asset_obj
 from pimper_torch.result.report.page import asset_within, write_page
 from pimper_torch.result.report.predictions import predictions
-from pimper_torch.result.report.vertex_layers import surface_layers
 from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
-from pimper_torch.result.viz.overview import draw_overview, headline
+from pimper_torch.result.viz.overview import draw_overview
 from pimper_torch.result.viz.tiles import array
 from pimper_torch.result.viz.turn import draw_turn, up_world
-from pimper_torch.runtime.config import to_yaml
+from pimper_torch.runtime.config import read_mapping, to_yaml
 from pimper_torch.runtime.mapped import each
 from pimper_torch.runtime.progress import part
 from pimper_torch.runtime.reporting import reported
@@ -142,15 +141,16 @@ def write_result(
                 write_page(
                     staging / "report.html",
                     title=folder.absolute().name,
-                    headline=headline(whole),
+                    mesh=ready.mesh,
                     asset=asset_within(asset, staging / "asset.glb", placement),
+                    surface=asset.mesh,
                     scene=whole.scene,
                     silhouettes=whole.silhouettes,
                     reference=whole.coarse.reference,
                     predictions=predictions(ready.few, whole.scene, relighting),
-                    layers=surface_layers(asset.mesh),
                     summary=summary,
-                    settings=(staging / "config.yaml").read_text(encoding="utf-8"),
+                    settings=read_mapping(staging / "config.yaml"),
+                    lights_world=read_lights(staging / "lights.json", whole.scene.views.names),
                 )
 
 

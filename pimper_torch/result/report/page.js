@@ -17,13 +17,27 @@
   };
   const vector = (values) => new THREE.Vector3(...values);
 
+  // What stands between backticks is code.
+  const prose = (text) => text.split("`").map((part, at) => at % 2 ? make("code", { text: part }) : part);
+  const thousands = (number) => number.toLocaleString("en");
+  const digits = (number, count) => String(Number(number.toPrecision(count)));
+
+  const { summary } = data;
+  const simpler = summary.simplified || summary.reduced;
   find("title").textContent = data.title;
-  find("headline").textContent = data.headline;
+  find("headline").textContent = [
+    `${summary.registered} of ${summary.views} photographs${summary.doubt ? " (cameras doubtful)" : ""}`,
+    `${thousands(summary.triangles)} facets`,
+    `${thousands((simpler || summary).vertices)} vertices`
+      + (simpler ? ` in mesh.ply (${thousands(summary.vertices)} before simplification)` : ""),
+    `${summary.seconds.toFixed(0)} s`,
+  ].join(", ");
 
   // ---- Photographs -------------------------------------------------------------------------
 
   const picture = (source, view, outlined) => {
     const box = make("div", { class: view.reliable ? "picture" : "picture doubted" });
+    box.style.setProperty("--shape", view.width / view.height);
     box.append(make("img", { src: source, alt: view.name, loading: "lazy" }));
     if (outlined && view.outline) {
       const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
@@ -45,13 +59,22 @@
     box.style.clipPath = "url(#inside)";
   };
   const thumbnails = data.views.map((view, index) => {
-    const title = view.figure ? `${view.name}: ${view.figure}` : view.name;
+    const title = "psnr_db" in view ? `${view.name}: ${view.psnr_db.toFixed(1)} dB` : view.name;
     const button = make("button", { type: "button", title, "aria-pressed": "false",
       on: () => select(index) });
     button.append(picture(view.photo, view, true), make("span", { text: view.name }));
     find("thumbnails").append(button);
     return button;
   });
+  // What a figure in decibels means: of levels, and among the other photographs.
+  const worth = (view) => {
+    if (!("psnr_db" in view)) return "";
+    const all = data.views.filter((one) => "psnr_db" in one);
+    const place = 1 + all.filter((one) => one.psnr_db > view.psnr_db).length;
+    const off = 255 * 10 ** (-view.psnr_db / 20);
+    return `${view.psnr_db.toFixed(1)} dB (PSNR): the prediction is off by ${digits(off, 2)} of 255 levels `
+      + `(root mean square); more decibels are better, and this is number ${place} of ${all.length}.`;
+  };
 
   const HINT = find("hint").textContent;
   let selected = -1;
@@ -59,11 +82,13 @@
     selected = selected === index ? -1 : index;
     thumbnails.forEach((button, at) => button.setAttribute("aria-pressed", String(at === selected)));
     const view = data.views[selected];
-    find("pair").hidden = find("fade").hidden = !view;
+    find("compared").hidden = !view;
+    document.body.classList.toggle("chosen", Boolean(view));
     find("hint").textContent = view ? thumbnails[selected].title : HINT;
     if (view) {
       find("photo").replaceChildren(picture(view.photo, view, true));
       find("predicted").hidden = find("different").hidden = !view.prediction;
+      find("worth").textContent = worth(view);
       if (view.prediction) {
         find("prediction").replaceChildren(picture(view.prediction, view, false));
         const both = picture(view.photo, view, false);
@@ -71,42 +96,106 @@
         find("difference").replaceChildren(both);
         clip(both, view);
       }
-      thumbnails[selected].scrollIntoView({ block: "nearest", inline: "nearest" });
     }
     scene?.stand(view);
   };
+  const step = (by) => {
+    const count = data.views.length;
+    const index = selected < 0 ? (by > 0 ? 0 : count - 1) : (selected + by + count) % count;
+    if (index === selected) return;
+    const strip = find("thumbnails"), thumbnail = thumbnails[index];
+    strip.scrollTo(thumbnail.offsetLeft - (strip.clientWidth - thumbnail.offsetWidth) / 2,
+      thumbnail.offsetTop - (strip.clientHeight - thumbnail.offsetHeight) / 2);
+    if (thumbnails.includes(document.activeElement)) thumbnail.focus({ preventScroll: true });
+    select(index);
+  };
+  find("previous").addEventListener("click", () => step(-1));
+  find("next").addEventListener("click", () => step(1));
+  document.addEventListener("keydown", (event) => {
+    if (event.altKey || event.ctrlKey || event.metaKey || event.target.closest("input, #lamp, .scroll")) return;
+    const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (by) event.preventDefault();
+    if (by) step(by);
+    else if (event.key === "Escape" && selected >= 0) select(selected);
+  });
 
   // ---- Tables ------------------------------------------------------------------------------
 
-  const cell = (value, column) => {
-    if (column.kind === "bar") {
-      const bar = make("i");
-      bar.style.width = `${100 * value}%`;
-      return make("td", { class: "bar" }, bar);
-    }
-    return make("td", { class: column.kind, text: value });
+  const cell = (value, kind) => {
+    if (kind !== "bar") return make("td", { class: kind }, ...prose(String(value)));
+    const bar = make("i");
+    bar.style.width = `${100 * value}%`;
+    return make("td", { class: kind }, bar);
   };
-  const table = ({ columns, rows }) => {
-    const head = make("tr", {}, ...columns.map((one) => make("th", { class: one.kind, text: one.title })));
-    const body = rows.map((row) => make("tr", {}, ...row.map((value, at) => cell(value, columns[at]))));
+  // Columns are pairs of title and kind; a row of one text is a heading.
+  const table = (columns, rows) => {
+    const head = make("tr", {}, ...columns.map(([text, kind]) => make("th", { class: kind, text })));
+    const body = rows.map((row) => Array.isArray(row)
+      ? make("tr", {}, ...row.map((value, at) => cell(value, columns[at][1])))
+      : make("tr", { class: "heading" }, make("th", { colspan: columns.length, text: row })));
     return make("div", { class: "scroll" }, make("table", {}, make("thead", {}, head), make("tbody", {}, ...body)));
   };
-  for (const section of data.sections) {
-    const parts = [];
-    if (section.text) parts.push(make("p", { class: "faint", text: section.text }));
-    if (section.items) parts.push(make("ul", {}, ...section.items.map((text) => make("li", { text }))));
-    if (section.table) parts.push(table(section.table));
-    if (section.code) parts.push(make("pre", { text: section.code }));
-    find("sections").append(section.folded
-      ? make("details", {}, make("summary", { text: section.title }), ...parts)
-      : make("section", {}, make("h2", { text: section.title }), ...parts));
+  const section = (title, ...parts) =>
+    find("sections").append(make("section", {}, make("h2", { text: title }), ...parts));
+  const folded = (title, ...parts) =>
+    find("sections").append(make("details", {}, make("summary", { text: title }), ...parts));
+  const faint = (text) => make("p", { class: "faint" }, ...prose(text));
+  const some = (names) => names.slice(0, 8).join(", ") + (names.length > 8 ? ` and ${names.length - 8} more` : "");
+
+  const warnings = [...(summary.doubt ? [summary.doubt] : []), ...(summary.warnings || [])];
+  section("Warnings", warnings.length
+    ? make("ul", {}, ...warnings.map((text) => make("li", {}, ...prose(text)))) : faint("None."));
+
+  const relit = summary.relighting;
+  if (relit && relit.psnr_db !== null) {
+    const decibels = (value) => value === null || value === undefined ? "" : value.toFixed(2);
+    const materials = relit.materials.map((one) => `${(100 * one.vertices).toFixed(0)} % metallic `
+      + `${digits(one.metallic, 2)}, roughness ${digits(one.roughness, 2)}, specular ${digits(one.specular, 2)}`);
+    const whose = relit.photographs === "held out" ? "held out of the run" : "that the surface was made from";
+    const textured = decibels(relit.psnr_textured_db);
+    folded("Photographs predicted from the surface",
+      faint(`Each under its own fitted light, of photographs ${whose}`
+        + `${textured && `; with the asset's textures ${textured} dB on average`}. Materials: ${materials.join("; ")}.`),
+      table([["photograph", "name"], ["PSNR with materials, dB", "number"], ["matte, dB", "number"], ["", "text"]],
+        [{ name: "mean", ...relit }, ...relit.views].map((one) =>
+          [one.name, decibels(one.psnr_db), decibels(one.psnr_matte_db), ""])));
   }
+
+  const longest = Math.max(...summary.stages.map((stage) => stage.kept ? 0 : stage.seconds)) || 1;
+  const figures = ({ name, seconds, peak_memory_mb, kept, ...rest }) => Object.entries(rest)
+    .filter(([, value]) => value !== null)
+    .map(([key, value]) => `${key.replaceAll("_", " ")} ${Number.isInteger(value) ? thousands(value) : digits(value, 4)}`)
+    .join(", ");
+  section("Stages",
+    faint(`${summary.seconds.toFixed(0)} s up to this page, ${(summary.peak_memory_mb || 0).toFixed(0)} MB at most`
+      + `${summary.peak_memory_stage ? `, in ${summary.peak_memory_stage}` : ""}`),
+    table([["stage", "name"], ["seconds", "number"], ["", "bar"], ["peak MB", "number"], ["figures", "text"]],
+      summary.stages.map((stage) => [stage.name, stage.kept ? "kept" : stage.seconds.toFixed(1),
+        stage.kept ? 0 : stage.seconds / longest, stage.peak_memory_mb.toFixed(0), figures(stage)])));
+
+  if (data.left_out.length) {
+    folded("Left out", faint("By guards, where it matters; `summary.json` has the rest."),
+      table([["guard", "name"], ["left out", "number"], ["of", "number"], ["", "name"], ["reason", "text"]],
+        data.left_out.flatMap(({ heading, entries }) => [heading, ...entries.map((one) =>
+          [one.guard, thousands(one.count), thousands(one.total), one.what,
+            one.reason + (one.names.length ? `: ${some(one.names)}` : "")])])));
+  }
+  if (summary.failures.length) {
+    section("Failed", table(["stage", "what", "reason", "done"].map((title) => [title, "text"]),
+      summary.failures.map((one) => [one.stage, `${one.what} ${some(one.names)}`, one.reason, one.done])));
+  }
+  folded("Settings", table([["setting", "name"], ["value", "text"]],
+    Object.entries(data.settings).flatMap(([name, value]) =>
+      typeof value === "string" ? [[name, value]] : [name, ...Object.entries(value)])));
 
   // ---- The surface -------------------------------------------------------------------------
 
   const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"];
   const [NEAR, FAR, FOV_DEG] = [0.01, 100, 30]; // planes in units of the scene's radius
+  const MARKED = 2.7; // how far cameras are drawn, in radii: with them the surface has a third of the picture
   const REMOTE = 1e-3; // the surface's radius over the distance of a light that is far
+  // Of spherical harmonics: coefficients that light a white matte surface by 1, and by 1 where it faces an axis.
+  const [EVEN, ALONG] = [Math.PI / 0.886227, Math.PI / (2 * 0.511664)];
   const OPENGL = new THREE.Matrix4().makeScale(1, -1, -1); // from x right, y down, z forward
 
   class Surface {
@@ -127,20 +216,47 @@
       this.up = vector(data.up);
       this.light = new THREE.PointLight();
       this.ambient = new THREE.AmbientLight();
+      this.probe = new THREE.LightProbe(); // what comes from all sides, unlike the ambient light by the normal
+      this.shade = { value: 1 }; // whether the surface hides the sky from itself
+      this.openSky(object.geometry);
       this.markers = new THREE.Group();
       this.lamps = new THREE.Group();
       this.markers.visible = this.lamps.visible = false;
-      this.world.add(object, this.light, this.ambient, this.markers, this.lamps);
+      this.world.add(object, this.light, this.ambient, this.probe, this.markers, this.lamps);
       this.lamp = { view: new THREE.Vector3(-0.45, 0.55, 0.7).normalize(), fitted: null };
       this.behind = null; // the photograph whose camera is stood behind
       this.layers = this.makeLayers();
       this.makeMarkers();
+      this.makeRuler();
       this.controls = new THREE.OrbitControls(this.camera, this.canvas);
-      this.controls.addEventListener("start", () => this.leave());
-      this.controls.addEventListener("change", () => this.draw());
+      let held = false; // a click alone stays behind the photograph's camera
+      this.controls.addEventListener("start", () => { held = true; });
+      this.controls.addEventListener("end", () => { held = false; });
+      this.controls.addEventListener("change", () => {
+        if (held) this.leave();
+        this.draw();
+      });
       this.listen();
       this.home();
       new ResizeObserver(() => this.resize()).observe(this.stage);
+    }
+
+    // How much of the sky each vertex sees.
+    openSky(geometry) {
+      const open = Float32Array.from(atob(data.openness), (one) => one.charCodeAt(0) / 255);
+      geometry.setAttribute("openness", new THREE.Float32BufferAttribute(open, 1));
+    }
+
+    // Let light from all sides reach a material only as far as its surroundings are open.
+    shaded(material) {
+      material.onBeforeCompile = (shader) => {
+        shader.uniforms.shade = this.shade;
+        shader.vertexShader = "attribute float openness; varying float vOpenness;\n" + shader.vertexShader
+          .replace("#include <begin_vertex>", "#include <begin_vertex>\nvOpenness = openness;");
+        shader.fragmentShader = "uniform float shade; varying float vOpenness;\n" + shader.fragmentShader
+          .replace("#include <aomap_fragment>", "reflectedLight.indirectDiffuse *= mix(1.0, vOpenness, shade);");
+      };
+      return material;
     }
 
     makeLayers() {
@@ -151,8 +267,8 @@
       const grey = new THREE.MeshPhysicalMaterial({ color: 0xb8b8b8, roughness: 1, normalMap, side });
       grey.specularIntensity = 0;
       const layers = [
-        { title: "lit", material },
-        { title: "shape", material: grey },
+        { title: "lit", material: this.shaded(material) },
+        { title: "shape", material: this.shaded(grey) },
         { title: "albedo", material: new THREE.MeshBasicMaterial({ map, side }), unlit: true },
         { title: "normals", material: new THREE.MeshNormalMaterial({ normalMap, side }), unlit: true },
       ];
@@ -186,8 +302,12 @@
       }
       this.object.material = material;
       find("legend").hidden = !layer.values;
-      find("lamp").style.display = layer.unlit ? "none" : "";
+      this.showLamp();
       this.draw();
+    }
+
+    showLamp() {
+      find("lamp").style.display = this.shown.unlit || !find("lit").checked ? "none" : "";
     }
 
     paint(layer) {
@@ -213,12 +333,15 @@
       for (const view of data.views) {
         view.worldFromCamera = new THREE.Matrix4().set(...view.pose).invert();
         view.place = new THREE.Vector3().applyMatrix4(view.worldFromCamera);
-        const size = 0.08 * view.place.distanceTo(this.center);
+        // Where it is drawn: on its line of sight, but no farther than the surface stays large.
+        const away = view.place.distanceTo(this.center), shown = Math.min(away, MARKED * this.radius);
+        view.marker = view.place.clone().sub(this.center).multiplyScalar(shown / away).add(this.center);
+        const size = 0.08 * shown;
         const [fx, fy] = view.focal, [cx, cy] = view.centre;
         const corners = [[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]].map(
           ([x, y]) => new THREE.Vector3((x - cx) / fx, (y - cy) / fy, 1).multiplyScalar(size)
-            .applyMatrix4(view.worldFromCamera));
-        corners.forEach((corner, at) => lines.push(view.place, corner, corner, corners[(at + 1) % 4]));
+            .applyMatrix4(view.worldFromCamera).sub(view.place).add(view.marker));
+        corners.forEach((corner, at) => lines.push(view.marker, corner, corner, corners[(at + 1) % 4]));
         if (view.light) {
           view.bulb = vector(view.light.direction).multiplyScalar(1.8 * this.radius).add(this.center);
           this.bulbs.push(view.bulb);
@@ -233,6 +356,45 @@
       this.lamps.add(this.ray);
     }
 
+    // Two points of the surface, and the line between them, drawn over it.
+    makeRuler() {
+      this.ends = [];
+      const look = { color: 0xffd24a, depthTest: false, transparent: true };
+      const geometry = new THREE.BufferGeometry();
+      this.ruler = new THREE.Group();
+      this.ruler.add(new THREE.LineSegments(geometry, new THREE.LineBasicMaterial(look)),
+        new THREE.Points(geometry, new THREE.PointsMaterial({ ...look, size: 9, sizeAttenuation: false })));
+      for (const one of this.ruler.children) one.frustumCulled = false;
+      this.world.add(this.ruler);
+      find("measure").addEventListener("click", () => this.mark(null));
+      this.measuring = false;
+    }
+
+    // Take an end of a length; without, begin or stop to measure.
+    mark(place) {
+      const stopped = place === null && this.measuring;
+      this.measuring = !stopped;
+      this.ends = place === null ? [] : [...this.ends.slice(0, this.ends.length % 2), place];
+      this.ruler.visible = this.ends.length > 0;
+      if (this.ruler.visible) this.ruler.children[0].geometry.setFromPoints([this.ends[0], this.ends.at(-1)]);
+      const { factor, name } = data.unit;
+      find("measured").textContent = this.ends.length < 2
+        ? `Click the ${this.ends.length ? "second" : "first"} place on the surface.`
+        : `${digits(factor * this.ends[0].distanceTo(this.ends[1]), 3)} ${name}`;
+      find("measured").hidden = stopped;
+      find("measure").setAttribute("aria-pressed", String(!stopped));
+      this.draw();
+    }
+
+    // The point of the surface under the pointer.
+    under(event) {
+      const box = this.canvas.getBoundingClientRect();
+      const caster = new THREE.Raycaster();
+      caster.setFromCamera(new THREE.Vector2(2 * (event.clientX - box.left) / box.width - 1,
+        1 - 2 * (event.clientY - box.top) / box.height), this.camera);
+      return caster.intersectObject(this.object)[0]?.point;
+    }
+
     listen() {
       for (const [box, group] of [["cameras", this.markers], ["lights", this.lamps]]) {
         find(box).addEventListener("change", (event) => {
@@ -242,6 +404,19 @@
       }
       find("detail").addEventListener("change", () => this.show(this.shown));
       find("ambient").addEventListener("input", () => { this.lamp.fitted = null; this.draw(); });
+      find("lit").addEventListener("change", () => { this.showLamp(); this.draw(); });
+      const environment = find("environment");
+      environment.parentElement.hidden = !data.views.some((view) => view.environment);
+      environment.addEventListener("change", () => {
+        find("lit").checked = !environment.checked; // it has the lamp's light in it
+        this.showLamp();
+        this.draw();
+      });
+      find("full").hidden = !document.fullscreenEnabled;
+      find("full").addEventListener("click", () => document.fullscreenElement
+        ? document.exitFullscreen() : find("viewer").requestFullscreen());
+      document.addEventListener("fullscreenchange", () =>
+        find("full").setAttribute("aria-pressed", String(Boolean(document.fullscreenElement))));
       find("home").addEventListener("click", () => { if (selected >= 0) select(selected); this.home(); });
       find("opacity").addEventListener("input", () => this.fade());
       const lamp = find("lamp");
@@ -262,7 +437,10 @@
       let down = null;
       this.canvas.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
       this.canvas.addEventListener("pointerup", (event) => {
-        if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 5) this.pick(event);
+        if (!down || Math.hypot(event.clientX - down[0], event.clientY - down[1]) >= 5) return;
+        const place = this.measuring && this.under(event);
+        if (place) this.mark(place);
+        else if (!this.measuring) this.pick(event);
       });
     }
 
@@ -275,9 +453,14 @@
       this.draw();
     }
 
+    // The shape has one light for all photographs: a lamp behind the camera would flatten it.
+    get plain() { return this.shown.title === "shape"; }
+
+    get fitted() { return this.plain ? null : this.lamp.fitted; }
+
     direction() {
-      if (!this.lamp.fitted) return this.lamp.view;
-      return vector(this.lamp.fitted.direction).transformDirection(this.camera.matrixWorldInverse);
+      if (!this.fitted) return this.lamp.view;
+      return vector(this.fitted.direction).transformDirection(this.camera.matrixWorldInverse);
     }
 
     pick(event) {
@@ -285,7 +468,7 @@
       const box = this.canvas.getBoundingClientRect();
       let [best, nearest] = [-1, 18];
       data.views.forEach((view, index) => {
-        const seen = view.place.clone().project(this.camera);
+        const seen = view.marker.clone().project(this.camera);
         const away = Math.hypot((seen.x + 1) * box.width / 2 - (event.clientX - box.left),
           (1 - seen.y) * box.height / 2 - (event.clientY - box.top));
         if (seen.z < 1 && away < nearest) [best, nearest] = [index, away];
@@ -296,7 +479,7 @@
     home() {
       const reference = data.views[data.reference];
       const towards = reference.place.clone().sub(this.center).normalize();
-      const shown = [...(this.markers.visible ? data.views.map((view) => view.place) : []),
+      const shown = [...(this.markers.visible ? data.views.map((view) => view.marker) : []),
         ...(this.lamps.visible ? this.bulbs : [])];
       const farthest = Math.max(this.radius, ...shown.map((place) => place.distanceTo(this.center)));
       this.reach = 1.08 * farthest / Math.sin((FOV_DEG * Math.PI) / 360);
@@ -314,6 +497,7 @@
         return this.leave(true);
       }
       this.behind = view;
+      find("fade").hidden = false;
       this.camera.matrixWorld.multiplyMatrices(view.worldFromCamera, OPENGL);
       this.camera.matrixWorld.decompose(this.camera.position, this.camera.quaternion, this.camera.scale);
       const depth = this.center.clone().applyMatrix4(new THREE.Matrix4().set(...view.pose)).z;
@@ -379,26 +563,43 @@
       });
     }
 
+    // First-order light from all sides: that of photographs, or of a sky that is brighter above.
+    surroundings() {
+      if (!find("environment").checked) {
+        const ambient = Number(find("ambient").value) * (this.plain ? 2 : 1);
+        return [ambient, this.up.clone().normalize().multiplyScalar(0.6 * ambient)];
+      }
+      const own = data.views[selected]?.environment;
+      const known = own ? [own] : data.views.flatMap((view) => view.environment ? [view.environment] : []);
+      const mean = [0, 1, 2, 3].map((at) => known.reduce((sum, one) => sum + one[at], 0) / known.length);
+      const along = vector(mean.slice(1));
+      const exposure = 1 / Math.max(mean[0] + along.length(), 1e-6); // a scale is free
+      return [exposure * mean[0], along.multiplyScalar(exposure)];
+    }
+
+    shineFromAllSides(even, along) {
+      const { coefficients } = this.probe.sh;
+      coefficients[0].setScalar(EVEN * even);
+      [along.y, along.z, along.x].forEach((one, at) => coefficients[at + 1].setScalar(ALONG * one));
+    }
+
     drawNow() {
       this.camera.updateMatrixWorld();
       const towards = this.direction();
-      const { fitted } = this.lamp;
+      const { fitted, plain } = this;
       const distance = this.middle.radius / Math.max(fitted?.closeness ?? 0, REMOTE);
       this.light.position.copy(towards).transformDirection(this.camera.matrixWorld)
         .multiplyScalar(distance).add(this.middle.center);
       // Radiance is albedo times light here; the renderer divides it by pi, and by the distance's
       // square.
-      this.light.intensity = Math.PI * distance ** 2;
-      if (fitted) {
-        this.light.color.setRGB(...fitted.directed);
-        this.ambient.color.setRGB(...fitted.ambient);
-        this.ambient.intensity = Math.PI;
-      } else {
-        const ambient = Number(find("ambient").value);
-        this.light.color.set(0xffffff);
-        this.ambient.color.set(0xffffff);
-        this.ambient.intensity = Math.PI * ambient;
-      }
+      const exact = fitted && !find("environment").checked;
+      this.light.intensity = find("lit").checked ? (plain ? 0.7 : 1) * Math.PI * distance ** 2 : 0;
+      this.light.color.setRGB(...(exact ? fitted.directed : [1, 1, 1]));
+      this.ambient.intensity = exact ? Math.PI : 0;
+      if (exact) this.ambient.color.setRGB(...fitted.ambient);
+      this.shade.value = exact ? 0 : 1;
+      this.probe.intensity = exact ? 0 : 1;
+      this.shineFromAllSides(...this.surroundings());
       const bulb = find("lamp").querySelector(".bulb");
       bulb.setAttribute("cx", towards.x);
       bulb.setAttribute("cy", -towards.y);

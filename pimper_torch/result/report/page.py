@@ -9,14 +9,19 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from pimper_torch.records import Silhouettes, SparseScene, Textured
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pimper_torch.records import LeftOut, Mesh, Silhouettes, SparseScene, Textured
 from pimper_torch.result.asset.bake import halved
 from pimper_torch.result.asset.placement import Placement
 from pimper_torch.result.asset.write import write_asset
+from pimper_torch.result.report.openness import openness
 from pimper_torch.result.report.predictions import Prediction, view_entries
-from pimper_torch.result.report.vertex_layers import VertexLayer
+from pimper_torch.result.report.vertex_layers import VertexLayer, length_unit, surface_layers
 from pimper_torch.result.viz.turn import up_world
-from pimper_torch.runtime.errors import some
+from pimper_torch.runtime.ledger import closing_line
 
 HEAD = "<title>pimper_torch report</title>"
 """Of every page, by which a former one is known."""
@@ -24,37 +29,53 @@ HEAD = "<title>pimper_torch report</title>"
 # Places of the template that its parts go into.
 _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
+# Of summary.json; paths on the machine of the run stay out of a page that is sent to others.
+_SHOWN = (
+    *("doubt", "warnings", "failures", "stages", "seconds", "peak_memory_mb", "peak_memory_stage"),
+    *("registered", "views", "triangles", "vertices", "simplified", "reduced", "relighting"),
+)
+
 
 def write_page(
     path: Path | str,
     *,
     title: str,
-    headline: str,
+    mesh: Mesh,
     asset: bytes,
+    surface: Mesh,
     scene: SparseScene,
     silhouettes: Silhouettes,
     reference: int,
     predictions: Sequence[Prediction | None],
-    layers: Sequence[VertexLayer],
     summary: Mapping[str, Any],
-    settings: str,
+    settings: Mapping[str, object],
+    lights_world: Float[Tensor, "view 4"] | None = None,
+    layers: Sequence[VertexLayer] = (),
 ) -> None:
     """Write a page that shows a result in a browser, without a server and offline.
 
     Args:
-        headline: What went in and what came out, in a line.
+        mesh: The result's, as it was written; it decides units, and ranges of colours.
         asset: The surface as a binary glTF; its ``extras`` say where it is in ``scene``, otherwise
             it is in that frame.
-        layers: Of the asset's attributes; those that it lacks are not shown.
+        summary: What ``summary.json`` holds; ``settings`` likewise of ``config.yaml``.
+        surface: The asset's mesh, with its vertices in the order of the file.
+        lights_world: First-order light of every view, up to a scale; NaN where it is unknown.
+        layers: More than those of ``mesh``; the page leaves out those that the asset lacks.
     """
+    unit = length_unit(mesh, (summary.get("scale") or {}).get("unit"))
+    shade = (255 * openness(surface)).round().to(torch.uint8).numpy().tobytes()
     data = {
         "title": title,
-        "headline": headline,
         "reference": reference,
         "up": up_world(scene.cameras).tolist(),
-        "views": view_entries(scene, silhouettes, predictions),
-        "layers": [asdict(layer) for layer in layers],
-        "sections": section_entries(summary, settings),
+        "unit": asdict(unit),
+        "openness": base64.b64encode(shade).decode("ascii"),
+        "views": view_entries(scene, silhouettes, predictions, lights_world),
+        "layers": [asdict(layer) for layer in (*surface_layers(mesh, unit), *layers)],
+        "summary": {name: summary.get(name) for name in _SHOWN},
+        "left_out": left_out_by_pass(summary["left_out"]),
+        "settings": _text(settings),
     }
     parts = {
         # No text can end the element that it stands in.
@@ -84,123 +105,34 @@ def _read(name: str) -> str:
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
-Json = dict[str, object]
-Summary = Mapping[str, Any]
+def _text(value: object) -> object:
+    """Write values of settings as YAML in one line; JSON has no infinite numbers."""
+    if isinstance(value, Mapping):
+        return {name: _text(inner) for name, inner in value.items()}
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-def section_entries(summary: Summary, settings: str) -> list[Json]:
-    """List the sections of a page, from what ``summary.json`` says."""
-    found = [
-        _warnings(summary),
-        _relighting(summary),
-        _stages(summary),
-        _left_out(summary),
-        _failures(summary),
-        {"title": "Settings", "folded": True, "code": settings},
-    ]
-    return [section for section in found if section is not None]
+# Of guards outside of passes, by their rooms.
+_HEADINGS = dict.fromkeys(
+    ("sfm", "silhouettes", "contours", "depth_points", "coarse", "triangulate"),
+    "Cameras, silhouettes and coarse surface",
+) | {"extract": "Mesh"}
 
 
-def _warnings(summary: Summary) -> Json:
-    messages = [*summary.get("warnings", ())]
-    if summary.get("doubt"):
-        messages.insert(0, summary["doubt"])
-    if not messages:
-        return {"title": "Warnings", "text": "None."}
-    return {"title": "Warnings", "items": messages}
+def left_out_by_pass(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """List what guards left out where it matters, as ``closing_line`` decides, pass by pass.
 
+    Args:
+        entries: ``left_out`` of ``summary.json``.
 
-def _relighting(summary: Summary) -> Json | None:
-    """Return the section on errors of predicted photographs, with materials and without."""
-    found = summary.get("relighting")
-    if not found or found["psnr_db"] is None:
-        return None
-    held_out = found["photographs"] == "held out"
-    rows = [
-        [one["name"], _decibels(one["psnr_db"]), _decibels(one["psnr_matte_db"]), ""]
-        for one in ({"name": "mean", **found}, *found["views"])
-    ]
-    columns = {"photograph": "name", "PSNR with materials, dB": "number", "matte, dB": "number"}
-    materials = "; ".join(
-        f"{100 * one['vertices']:.0f} % metallic {one['metallic']:.2g}, roughness "
-        f"{one['roughness']:.2g}, specular {one['specular']:.2g}"
-        for one in found["materials"]
-    )
-    whose = "held out of the run" if held_out else "that the surface was made from"
-    textured = _decibels(found.get("psnr_textured_db"))
-    whose += f"; with the asset's textures {textured} dB on average" if textured else ""
-    return {
-        "title": "Photographs predicted from the surface",
-        "folded": True,
-        "text": f"Each under its own fitted light, of photographs {whose}. Materials: {materials}.",
-        "table": _table(columns | {"": "text"}, rows),
-    }
-
-
-def _decibels(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
-
-
-def _stages(summary: Summary) -> Json:
-    stages = summary["stages"]
-    longest = max([stage["seconds"] for stage in stages if not stage["kept"]], default=0) or 1
-    columns = {"stage": "name", "seconds": "number", "": "bar", "peak MB": "number"}
-    rows = [
-        [
-            stage["name"],
-            "kept" if stage["kept"] else f"{stage['seconds']:.1f}",
-            0 if stage["kept"] else stage["seconds"] / longest,
-            f"{stage['peak_memory_mb']:.0f}",
-            _figures(stage),
-        ]
-        for stage in stages
-    ]
-    total = f"{summary['seconds']:.0f} s, {summary['peak_memory_mb'] or 0:.0f} MB at most"
-    if summary.get("peak_memory_stage"):
-        total += f", in {summary['peak_memory_stage']}"
-    return {"title": "Stages", "text": total, "table": _table(columns | {"figures": "text"}, rows)}
-
-
-def _figures(stage: Mapping[str, Any]) -> str:
-    aside = ("name", "seconds", "peak_memory_mb", "kept")
-    return ", ".join(
-        f"{name.replace('_', ' ')} {value:{',' if isinstance(value, int) else '.4g'}}"
-        for name, value in stage.items()
-        if name not in aside and value is not None
-    )
-
-
-def _left_out(summary: Summary) -> Json | None:
-    idle = [entry["guard"] for entry in summary["left_out"] if not entry["count"]]
-    columns = {"guard": "name", "left out": "number", "of": "number", "": "name", "reason": "text"}
-    rows = [
-        [
-            entry["guard"],
-            f"{entry['count']:,}",
-            f"{entry['total']:,}",
-            entry["what"],
-            entry["reason"] + (f": {some(entry['names'])}" if entry["names"] else ""),
-        ]
-        for entry in summary["left_out"]
-        if entry["count"]
-    ]
-    return {
-        "title": "Left out, and by whom",
-        "folded": True,
-        "text": f"Guards that left out nothing: {', '.join(dict.fromkeys(idle)) or 'none'}.",
-        "table": _table(columns, rows),
-    }
-
-
-def _failures(summary: Summary) -> Json | None:
-    rows: Sequence[Sequence[str]] = [
-        [one["stage"], f"{one['what']} {some(one['names'])}", one["reason"], one["done"]]
-        for one in summary["failures"]
-    ]
-    columns = dict.fromkeys(("stage", "what", "reason", "done"), "text")
-    return {"title": "Failed", "table": _table(columns, rows)} if rows else None
-
-
-def _table(kinds: Mapping[str, str], rows: Sequence[Sequence[object]]) -> Json:
-    columns = [{"title": title, "kind": kind} for title, kind in kinds.items()]
-    return {"columns": columns, "rows": rows}
+    Returns:
+        For every pass that has some, its ``heading`` and its ``entries``.
+    """
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    number = 1
+    for entry in entries:
+        room = entry["guard"].split(".")[0]
+        if closing_line([LeftOut(**{**entry, "names": tuple(entry["names"])})]):
+            found.setdefault(_HEADINGS.get(room, f"Pass {number}"), []).append(entry)
+        number += room == "repair"  # ends a pass
+    return [{"heading": heading, "entries": some} for heading, some in found.items()]

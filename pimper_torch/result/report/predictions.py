@@ -77,12 +77,12 @@ class Prediction(Record):
 
     Attributes:
         radiance: Linear, under the photograph's fitted light; zero off the surface.
-        figure: What the prediction is worth, in a few words.
+        psnr_db: NaN where the photograph was not judged.
     """
 
     radiance: Float[Tensor, "channel height width"]
     light: ViewLights
-    figure: str = ""
+    psnr_db: float = math.nan
 
 
 def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[Prediction]:
@@ -104,12 +104,9 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
             sizes_px=torch.tensor([sides]),
         )
         seen = predict(surface, camera, light, relighting.materials)
-        decibels = worth.get(scene.views.names[view], torch.nan)
-        return Prediction(
-            radiance=seen.nan_to_num(0).movedim(-1, 0),
-            light=light,
-            figure=f"{decibels:.1f} dB" if decibels == decibels else "",
-        )
+        radiance = seen.nan_to_num(0).movedim(-1, 0)
+        decibels = worth.get(scene.views.names[view], math.nan)
+        return Prediction(radiance=radiance, light=light, psnr_db=decibels)
 
     return list(side_by_side(one, range(scene.views.num_views), tracked=False))
 
@@ -118,12 +115,16 @@ Json = dict[str, object]
 
 
 def view_entries(
-    scene: SparseScene, silhouettes: Silhouettes, predictions: Sequence[Prediction | None]
+    scene: SparseScene,
+    silhouettes: Silhouettes,
+    predictions: Sequence[Prediction | None],
+    lights_world: Float[Tensor, "view 4"] | None = None,
 ) -> list[Json]:
     """List the photographs with their pinholes, pictures, silhouettes and lights.
 
     Args:
         predictions: One a view, ``None`` where there is none.
+        lights_world: First-order light of every view, up to a scale; NaN where it is unknown.
     """
     longest = longest_px(scene.views.num_views)
     cameras, entries = scene.cameras.to("cpu"), []
@@ -151,8 +152,11 @@ def view_entries(
                 "directed": light.directed[0].expand(3).tolist(),
                 "ambient": light.ambient[0].expand(3).tolist(),
             }
-            entry["figure"] = predicted.figure
+            if not math.isnan(predicted.psnr_db):
+                entry["psnr_db"] = predicted.psnr_db
             entry["prediction"] = jpeg(shrunk(predicted.radiance, longest))
+        if lights_world is not None and bool(lights_world[view].isfinite().all()):
+            entry["environment"] = lights_world[view].tolist()
         entries.append(entry)
         drop_pages()
     return entries

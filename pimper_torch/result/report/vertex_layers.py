@@ -7,6 +7,26 @@ from pimper_torch.records import Mesh
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LengthUnit:
+    """The unit in which people read lengths: ``factor`` of it are one unit of the scene."""
+
+    factor: float
+    name: str
+
+
+def length_unit(mesh: Mesh, known: str | None = None) -> LengthUnit:
+    """Return the unit of lengths of a result.
+
+    Args:
+        known: Name of the scene's unit; without, the diagonal of the mesh's bounding box is 100.
+    """
+    if known:
+        return LengthUnit(factor=1.0, name=known)
+    size = (mesh.vertices_world.amax(dim=0) - mesh.vertices_world.amin(dim=0)).norm()
+    return LengthUnit(factor=100 / float(size), name="% of the object's size")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class VertexLayer:
     """One number a vertex, shown in colours from ``low`` to ``high``.
 
@@ -18,46 +38,41 @@ class VertexLayer:
     attribute: str
     title: str
     about: str
-    low: float
-    high: float
-    low_text: str
+    low: float = 0.0
+    high: float = 1.0
+    low_text: str = "0"
     high_text: str
 
 
-def surface_layers(mesh: Mesh) -> list[VertexLayer]:
-    """Return the layers of what a result's surface says of itself."""
+def surface_layers(mesh: Mesh, unit: LengthUnit | None = None) -> list[VertexLayer]:
+    """Return the layers of a result's surface; the mesh as it is written decides their ranges."""
     layers = []
     if mesh.expected_error is not None:
         about = "Standard deviation of the surface along its normal, as the run expects it"
-        layers.append(length_layer("_expected_error", "expected error", about, mesh.expected_error))
+        unit, error = unit or length_unit(mesh), mesh.expected_error
+        layers.append(length_layer("_expected_error", "expected error", about, error, unit))
     if mesh.confidence is not None:
-        layers.append(
-            VertexLayer(
-                attribute="_support",
-                title="support",
-                about="Confidence of the normals: how many lights told them, and how well",
-                low=0.0,
-                high=1.0,
-                low_text="none",
-                high_text="full",
-            )
-        )
+        about = "Confidence of the normals: the number of lights that determine them, and how well"
+        texts = {"low_text": "none", "high_text": "full"}
+        layers.append(VertexLayer(attribute="_support", title="support", about=about, **texts))
     return layers
 
 
 def length_layer(
-    attribute: str, title: str, about: str, values: PerVertex, unit: str = "units"
+    attribute: str, title: str, about: str, values: PerVertex, unit: LengthUnit
 ) -> VertexLayer:
-    """Return a layer of lengths, from 0 to what nearly all are below."""
+    """Return a layer of lengths, from 0 to Tukey's upper fence: outliers share one colour.
+
+    The fence is the upper quartile and one and a half interquartile ranges; where no value is
+    above it, the range ends at the greatest value.
+
+    Source: Tukey, Exploratory Data Analysis, 1977.
+    """
     known = values[values.isfinite()]
-    rank = max(1, len(known) - len(known) // 50)  # a few would take all colours
-    high = float(known.kthvalue(rank).values) if len(known) else 0.0
-    return VertexLayer(
-        attribute=attribute,
-        title=title,
-        about=about,
-        low=0.0,
-        high=high,
-        low_text="0",
-        high_text=f"{high:.3g} {unit} or more",
-    )
+    high, count = 0.0, len(known)
+    if count:
+        ranks = (1 + (count - 1) // 4, count - (count - 1) // 4)
+        lower, upper = (float(known.kthvalue(rank).values) for rank in ranks)
+        high = min(float(known.max()), upper + 1.5 * (upper - lower))
+    text = f"{high * unit.factor:.2g} {unit.name} or more"
+    return VertexLayer(attribute=attribute, title=title, about=about, high=high, high_text=text)
