@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 # which draws the contact sheet of a result with it.
 ROOMS = [
     *("journal", "errors", "mapped", "config", "progress", "cores", "file_names"),
-    "user_cache",
+    *("user_cache", "scratch"),
     *("numpy_files", "shapes", "kernels", "radiometry", "records", "ledger", "failures"),
     *("parallel", "stage", "store", "geometry", "memory", "linalg", "camera_files", "sfm"),
     *("silhouettes", "coarse", "patches", "photometry", "sweep", "fusion", "paper", "meshing"),

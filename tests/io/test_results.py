@@ -222,9 +222,8 @@ def test_the_page_shows_the_surface_and_its_layers(reconstruction, tmp_path):
     assert data["layers"][0]["high"] == pytest.approx(0.002, rel=0.1)
     assert len(data["views"]) == 3
     assert all("prediction" in view and "light" in view for view in data["views"])
-    sections = {section["title"]: section for section in data["sections"]}
-    assert sections["Warnings"]["items"] == ["Two photographs are blurred."]
-    assert "zeta" in sections["Settings"]["code"]
+    assert data["summary"]["warnings"] == ["Two photographs are blurred."]
+    assert "zeta" in json.dumps(data["settings"])
     asset = base64.b64decode(re.search(r'id="asset">(.*?)</script>', page)[1])
     assert asset == (tmp_path / "cup" / "asset.glb").read_bytes()
 
