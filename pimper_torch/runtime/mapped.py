@@ -39,10 +39,8 @@ def zeros(
         OutputError: The disk has too little space.
     """
     size = prod(shape) * dtype.itemsize
-    large = size >= LARGE and torch.device(device).type == "cpu"
-    folders = (tempfile.gettempdir(), "/var/tmp") if large else ()
-    usable = (one for one in folders if os.access(one, os.W_OK) and not _in_memory(one))
-    if (folder := next(usable, None)) is None:
+    folder = _folder() if size >= LARGE and torch.device(device).type == "cpu" else None
+    if folder is None:
         return torch.zeros(list(shape), dtype=dtype, device=device)
     try:
         with tempfile.TemporaryFile(prefix="pimper_", dir=folder) as file:
@@ -118,6 +116,12 @@ def each(*rasters: Sequence[Tensor] | Tensor) -> Iterator[tuple[Tensor, ...]]:
     for views in zip(*rasters, strict=True):
         yield views
         drop_pages()
+
+
+def _folder() -> str | None:
+    """Return the first folder for temporary files that is on a disk."""
+    folders = (tempfile.gettempdir(), "/var/tmp")
+    return next((one for one in folders if os.access(one, os.W_OK) and not _in_memory(one)), None)
 
 
 def _in_memory(folder: str) -> bool:

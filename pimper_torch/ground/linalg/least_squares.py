@@ -18,10 +18,7 @@ def normal_equations(
     weights: Float[Tensor, " equation"],
     size: int,
 ) -> tuple[
-    Int[Tensor, " entry"],
-    Int[Tensor, " entry"],
-    Float[Tensor, " entry"],
-    Float[Tensor, " unknown"],
+    Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"], Float[Tensor, " unknown"]
 ]:
     r"""Return :math:`J^T W J` and :math:`J^T W t` of equations :math:`\sum_k c_k x_{u_k} = t`.
 

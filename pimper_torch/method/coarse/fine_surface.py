@@ -15,14 +15,8 @@ from pimper_torch.ground.geometry.poisson import poisson_surface
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.shapes import Faces, VertexMask, Vertices
-from pimper_torch.method.coarse import trim
+from pimper_torch.method.coarse import oriented, trim
 from pimper_torch.method.coarse.densify import factors
-from pimper_torch.method.coarse.oriented import (
-    matched_cloud,
-    no_points,
-    pixel_size_at,
-    thinned,
-)
 from pimper_torch.method.coarse.window_matching import level_of
 from pimper_torch.records import (
     Cameras,
@@ -95,18 +89,19 @@ def fine_surface(
     """
     part = cropped(scene, contours.silhouettes)
     centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
-    cloud, maps = no_points(centre), None
+    cloud, maps = oriented.no_points(centre), None
     if len(reliable) >= 16 or not contours.confine:
-        found, maps, pixel = matched_cloud(part, reliable, levels)
+        found, maps, pixel = oriented.matched_cloud(part, reliable, levels)
         near = contours.hull.depth_of(found.points_world) > -TOLERANCE_PX * pixel
         leave_out("coarse.matched", ~near, at=found.points_world)
         cloud = found.take(near)
         level = maps.level
     else:
         factor = factors(max(part.views.images.shape[-2:]), levels)[-1]
-        pixel, level = factor * pixel_size_at(centre, scene.cameras), level_of(part, factor)
+        pixel = factor * oriented.pixel_size_at(centre, scene.cameras)
+        level = level_of(part, factor)
     if more is not None:
-        cloud = OrientedPoints.cat([cloud, thinned(more, pixel)])
+        cloud = OrientedPoints.cat([cloud, oriented.thinned(more, pixel)])
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
     reach = REACH_PX * pixel
     counts = trim.view_counts(vertices, faces, level, maps, cloud.points_world, reach)

@@ -102,13 +102,8 @@ def _of_view(maps: DepthMaps, view: int, wanted: Mask) -> tuple[OrientedPoints, 
 
 def fitted_planes(
     inverse_depth: Map, valid: Mask, step: float
-) -> tuple[
-    Map,
-    Float[Tensor, "height width 2"],
-    Map,
-    Mask,
-]:
-    """Fit a plane to the inverse depths round every pixel; a plane's are affine in the pixel.
+) -> tuple[Map, Float[Tensor, "height width 2"], Map, Mask]:
+    """Fit a plane to the inverse depths around every pixel; a plane's are affine in the pixel.
 
     Args:
         step: Change of inverse depth that moves a pixel by one in the sources.

@@ -100,9 +100,8 @@ class CoarseSurface(Stage):
             vertices = vertices[used]
             pixel, support = fine.pixel, fine.support_of(vertices[faces])
         near = _ON_FACET_PX * pixel
-        return _with_points(scene, reliable, reference, vertices, faces, near).replace(
-            support=support
-        )
+        coarse = _with_points(scene, reliable, reference, vertices, faces, near)
+        return coarse.replace(support=support)
 
 
 @torch.no_grad()

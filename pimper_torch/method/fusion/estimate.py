@@ -229,10 +229,7 @@ def _system(
     factors: Sequence[Scalar],
     start: PerVertex,
     damping: PerVertex,
-) -> tuple[
-    tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]],
-    PerVertex,
-]:
+) -> tuple[tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]], PerVertex]:
     """Return rows, columns and values of the matrix, and the right-hand side."""
     everything = torch.arange(len(start), device=start.device)
     rows, cols, values = [everything], [everything], [damping.double()]

@@ -284,10 +284,7 @@ class LightModel:
     def _geometry(
         self, lights: Parameters
     ) -> tuple[
-        Float[Tensor, " view"],
-        Float[Tensor, "view 3"],
-        Float[Tensor, "sample view 3"],
-        Entries,
+        Float[Tensor, " view"], Float[Tensor, "view 3"], Float[Tensor, "sample view 3"], Entries
     ]:
         assert self.points is not None
         strength = lights[:, -4:-1].norm(dim=1)

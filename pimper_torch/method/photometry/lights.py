@@ -190,10 +190,7 @@ def _ratio(albedo: light_models.Albedo, other: light_models.Albedo) -> Scalar | 
 def _lights(
     name: str, samples: ImageSamples, normals: SampleVectors, points: SampleVectors, iterations: int
 ) -> tuple[
-    Float[Tensor, "view 9"],
-    Float[Tensor, "view 3"],
-    light_models.Albedo,
-    Float[Tensor, " view"],
+    Float[Tensor, "view 9"], Float[Tensor, "view 3"], light_models.Albedo, Float[Tensor, " view"]
 ]:
     """Return fitted harmonics, point lights, albedo, and closeness, in units of the points."""
     found, mixing = _fit(name, samples, normals, points, iterations)
