@@ -168,14 +168,11 @@ def test_a_mask_of_a_view_that_the_border_cuts_is_right(staged):
     assert overlap(silhouettes.masks[4, :, :120][None], staged.truth[4, :, :120][None]) > 0.85
 
 
-def test_masks_of_which_no_majority_agrees_are_believed_with_a_warning(staged):
+def test_masks_of_which_no_majority_agrees_are_refused(staged):
     masks = staged.truth.clone()
     masks[::2] = ~masks[::2]
-    scene = with_masks(staged.scene, masks)
-    with pytest.warns(PimperWarning, match="masks contradict one another, and no more than half"):
-        silhouettes = FindSilhouettes()(scene)
-    assert silhouettes.reliable.all()
-    assert masked(scene, silhouettes) is scene
+    with pytest.raises(InputError, match="masks contradict one another, and no more than half"):
+        FindSilhouettes()(with_masks(staged.scene, masks))
 
 
 def test_masks_are_asked_for_and_missing(staged):

@@ -6,9 +6,8 @@ from torch.nn.functional import interpolate
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
 from pimper_torch.method.silhouettes.cues import pointed_at, soft_masks_of
 from pimper_torch.method.silhouettes.find import FindSilhouettes
-from pimper_torch.method.silhouettes.parallax import working_pictures
 from pimper_torch.records import SilhouettePrior
-from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.silhouettes.conftest import SMALL, overlap
 from tests.silhouettes.shapes import HEIGHT, WIDTH, all_round, silhouettes_of
 
@@ -77,7 +76,7 @@ def test_log_odds_of_two_maps_of_a_view_add_up(staged):
     views, (first, second) = staged.scene.views, (0.8 * torch.ones(1, 9, 12), 0.3)
     first[0, 0, 0], second = 0.1, torch.full((1, 9, 12), second)
     views = views.replace(priors=(guessed(("04.png",), first), guessed(("04.png",), second)))
-    merged = soft_masks_of(views, working_pictures(views, staged.scene.cameras, 240))
+    merged = soft_masks_of(views, staged.scene.cameras.sizes_px)
     assert merged is not None
     assert merged.given.nonzero().tolist() == [[4]]
     odds = 0.8 / 0.2 * 0.3 / 0.7
@@ -89,11 +88,28 @@ def test_a_map_without_background_points_at_the_object(staged):
     pointing = torch.full((1, 180, 240), 0.5)
     pointing[0, 80:83, 100:103] = 1
     views = staged.scene.views.replace(priors=(guessed(("02.png",), pointing),))
-    merged = soft_masks_of(views, working_pictures(views, staged.scene.cameras, 240))
+    merged = soft_masks_of(views, staged.scene.cameras.sizes_px)
     assert merged is not None
     assert not merged.given.any()
     assert merged.seeds_px[2].mean(dim=0).tolist() == pytest.approx([101.5, 81.5])
     assert sum(len(pixels) for pixels in merged.seeds_px) == 9
+
+
+@pytest.mark.parametrize("place", [(100, 5), (5, 100)])
+def test_a_click_that_meets_nothing_is_refused_by_name(staged, place):
+    """One on the table, though a second one in the same photograph is on the ball."""
+    row, column = staged.truth[4].nonzero().float().mean(dim=0).long().tolist()
+    pointing = torch.full((1, 180, 240), 0.5)
+    pointing[0, row : row + 3, column : column + 3] = 1
+    prior = guessed(staged.scene.views.names, soft(staged.truth))
+    met = guessed(("04.png",), pointing)
+    found = FindSilhouettes(SMALL)(with_priors(staged.scene, prior, met))
+    assert overlap(found.masks, staged.truth).min() > 0.95
+    pointing = pointing.clone()
+    pointing[0, place[0] : place[0] + 3, place[1] : place[1] + 3] = 1
+    missed = guessed(("04.png",), pointing)
+    with pytest.raises(InputError, match=r"A click in 04\.png meets nothing"):
+        FindSilhouettes(SMALL)(with_priors(staged.scene, prior, missed))
 
 
 def test_the_component_that_a_click_meets_first_is_kept():

@@ -17,6 +17,7 @@ from pimper_torch.method.sfm.poses import with_poses
 from pimper_torch.method.sfm.sparse_scene import sound
 from pimper_torch.method.sfm.triangulation import FEW_OBSERVED, lacks_points
 from pimper_torch.method.sfm.undistort import with_undistorted_priors
+from pimper_torch.method.silhouettes.given import AS_THEY_ARE, right_reading
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -173,8 +174,29 @@ class Chain(Stage):
         """Return photographs with their cameras: those that come with them, or else find them.
 
         Views that cannot be used are left out; priors become those of undistorted views. A scene
-        without observed points gets some, unless a mesh stands in for them.
+        without observed points gets some, unless a mesh stands in for them. Masks that belong to
+        other photographs, or are turned or inverted, are read as cameras and points say, and
+        cameras found anew with them.
         """
+        scene = self._placed(run, views, sparse_model, mesh)
+        config = getattr(self.silhouettes, "config", None)
+        if getattr(config, "object", "auto") != "everything":
+            given = views if isinstance(views, Views) else views.views
+            reading = right_reading(scene, given)
+            if reading is not AS_THEY_ARE:
+                read = reading.of(given)
+                views = read if isinstance(views, Views) else views.replace(views=read)
+                scene = self._placed(run, views, sparse_model, mesh)
+        self._watched(scene)
+        return scene
+
+    def _placed(
+        self,
+        run: Running,
+        views: Views | SparseScene,
+        sparse_model: Path | str | None,
+        mesh: Mesh | None,
+    ) -> SparseScene:
         if isinstance(views, Views):
             views = run(self.reconstruct, views, sparse_model)
         elif sparse_model is not None:
@@ -188,9 +210,7 @@ class Chain(Stage):
             views = self.reconstruct.with_points(views)
         few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
         scene = with_poses(sound(run(depth_points, views) if few else views))
-        scene = with_undistorted_priors(scene)
-        self._watched(scene)
-        return scene
+        return with_undistorted_priors(scene)
 
     def _watched(self, found: "SparseScene | Step") -> None:
         if self.watch is not None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import reduce
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt, label
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
@@ -56,14 +56,22 @@ class SoftMasks(Record):
         return self.inside > 0.5
 
 
-def soft_masks_of(views: Views, pictures: parallax.WorkingPictures) -> SoftMasks | None:
+def points_at(inside: Map) -> bool:
+    """Return whether a map nowhere says that the object is not there, as maps of clicks."""
+    return float(inside.min()) > 0.5 - _SAYS_NOTHING
+
+
+def soft_masks_of(views: Views, sizes_px: Int[Tensor, "view 2"]) -> SoftMasks | None:
     """Merge the silhouettes that views carry as priors; ``None`` without any.
 
-    Log odds of several maps of one view add up. A map that nowhere says that the object is not
-    there points at it, as clicks do.
+    Log odds of several maps of one view add up.
+
+    Args:
+        sizes_px: Of the masks, as photographs are shrunk.
     """
-    odds, seeds = torch.zeros_like(pictures.grey), torch.zeros_like(pictures.grey, dtype=torch.bool)
-    given = torch.zeros(len(odds), dtype=torch.bool)
+    wide, high = sizes_px.amax(dim=0).tolist()
+    odds = torch.zeros(views.num_views, high, wide)
+    seeds, given = torch.zeros_like(odds) > 0, torch.zeros(len(odds), dtype=torch.bool)
     priors = [prior for prior in views.priors if isinstance(prior, SilhouettePrior)]
     for prior in priors:
         for name, size, full in zip(prior.names, prior.sizes_px, prior.inside, strict=True):
@@ -71,7 +79,7 @@ def soft_masks_of(views: Views, pictures: parallax.WorkingPictures) -> SoftMasks
                 continue
             view = views.names.index(name)
             inside = full[: size[1], : size[0]].detach().float().cpu()
-            wide, high = pictures.cameras.sizes_px[view].tolist()
+            wide, high = sizes_px[view].tolist()
             small = interpolate(
                 inside[None, None],
                 (high, wide),
@@ -79,7 +87,7 @@ def soft_masks_of(views: Views, pictures: parallax.WorkingPictures) -> SoftMasks
                 align_corners=False,
                 antialias=True,
             )
-            if float(inside.min()) > 0.5 - _SAYS_NOTHING:
+            if points_at(inside):
                 seeds[view, :high, :wide] |= small[0, 0] > 0.5 + _SAYS_NOTHING
             else:
                 # 8 bits hold no finer probabilities.
@@ -244,7 +252,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
         agreement=None,
         fixation=focus,
         box_world=torch.stack([centre - half, centre + half]) if region is None else region,
-        soft=soft_masks_of(scene.views, pictures),
+        soft=soft_masks_of(scene.views, cameras.sizes_px),
     )
     if not len(cues.background_from_view):
         rests = parallax.room_at_rest(pictures, cues.surrounded())

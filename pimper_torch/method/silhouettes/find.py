@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
+from scipy.ndimage import label
 from torch import Tensor
 
 from pimper_torch.ground.geometry.supporting_plane import PlaneSearch
@@ -11,17 +12,17 @@ from pimper_torch.ground.geometry.visual_hull import box_round, margins, visual_
 from pimper_torch.ground.shapes import ViewMask
 from pimper_torch.method.silhouettes.cues import Cues, cues_of
 from pimper_torch.method.silhouettes.cuts import NUM_VOXELS, Cuts, cut_in_iterations
+from pimper_torch.method.silhouettes.given import contradictory
 from pimper_torch.method.silhouettes.reliability import (
     MAX_EXPOSED,
     MIN_HELD,
     agreement_of,
-    contradictory,
     silhouettes_of,
 )
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.records.scene_parts import OneAPose, with_views
-from pimper_torch.runtime.errors import InputError, caution
+from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view
@@ -76,13 +77,11 @@ class FindSilhouettes(Stage):
         if not bool(doubted.any()):
             return silhouettes
         if torch.equal(doubted, silhouettes.reliable):
-            caution(
-                "The masks contradict one another, and no more than half of them agree: all are "
-                "believed. Look whether they show the same object in all photographs, and whether "
-                "the cameras are those of these.",
-                stacklevel=3,
+            raise InputError(
+                "The masks contradict one another, and no more than half of them agree. Look "
+                "whether they show the same object in all photographs, and whether the cameras are "
+                "those of these; or leave the masks out."
             )
-            return silhouettes
         _tell(doubted, scene.views.names, "its mask contradicts those of the others", _BY_HULL)
         others = silhouettes.replace(reliable=silhouettes.reliable & ~doubted)
         cameras, box = scene.cameras.to(torch.float32), box_round(others, scene.cameras)
@@ -118,6 +117,13 @@ class FindSilhouettes(Stage):
                 stacklevel=2,
             )
             return Silhouettes.everything(scene.views, _top(cues))
+        if missed := _missed(cues, cuts):
+            where = some([scene.views.names[view] for view in missed])
+            raise InputError(
+                f"A click in {where} meets nothing that the silhouettes have in common; needed: a "
+                "pixel that shows the object. Choose another by `--object-at`, or give masks that "
+                "hold it."
+            )
         _tell(cuts.doubted, scene.views.names, _UNLIKE, "It is cut as if it had come without")
         return _believed(silhouettes_of(cuts, scene.views), scene.views.names)
 
@@ -130,6 +136,20 @@ def _cut(cues: Cues) -> tuple[Cuts | None, str]:
     if cuts is None:
         return None, "the views' silhouettes have nothing in common"
     return cuts, _doubt(cuts)
+
+
+def _missed(cues: Cues, cuts: Cuts) -> list[int]:
+    """List the views in which something is pointed at that neither cut nor hull shows."""
+    missed = []
+    for view, pixels in enumerate(cues.soft.seeds_px if cues.soft else ()):
+        column, row = pixels.long().unbind(dim=1)
+        pointed = torch.zeros_like(cuts.masks[view])
+        pointed[row, column] = True
+        shown = cuts.masks[view] | (cuts.margins_px[view] > 0)
+        clicks, count = label(pointed.numpy(), structure=[[1] * 3] * 3)
+        if len(set(clicks[(pointed & shown).numpy()].tolist())) < count:
+            missed.append(view)
+    return missed
 
 
 def _top(cues: Cues) -> Float[Tensor, "plane 4"] | None:

@@ -1,0 +1,235 @@
+"""Masks that files hold otherwise than their photographs."""
+
+import warnings
+
+import pytest
+import torch
+from scenes import observing
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from pimper_torch.doors.io.decode import rotated
+from pimper_torch.ground.geometry.projection import project
+from pimper_torch.method.chains.chain_config import CoarseToFineConfig
+from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.method.silhouettes.given import AS_THEY_ARE, Reading, right_reading
+from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.records import Lens, SilhouettePrior, SparseScene, Views
+from pimper_torch.runtime.errors import InputError, PimperWarning
+from pimper_torch.runtime.stage import Stage
+from tests.silhouettes.shapes import FOCAL, HEIGHT, WIDTH, all_round, silhouettes_of
+
+# Three balls without any symmetry, and the radius on which points of the background are.
+CENTERS = torch.tensor([[-0.4, 0.0, 0.0], [0.6, 0.3, 0.2], [0.0, 0.2, 0.7]]).double()
+RADII, FAR, VIEWS = torch.tensor([0.5, 0.3, 0.2]).double(), 1.3, 20
+NAMES = tuple(f"{view:02d}.png" for view in range(VIEWS))
+
+
+def balls(points):
+    return ((points[..., None, :] - CENTERS).norm(dim=-1) - RADII).amin(dim=-1)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return silhouettes_of(balls, all_round()).masks
+
+
+@pytest.fixture(scope="module")
+def scene(truth):
+    """Points of the balls and around them; views observe what faces them, or is not before them."""
+    generator, cameras = torch.Generator().manual_seed(3), all_round()
+    outward = normalize(torch.randn(900, 3, generator=generator).double(), dim=1)
+    ball = torch.arange(600) % 3
+    points = CENTERS[ball] + RADII[ball, None] * outward[:600]
+    bare = balls(points) > -1e-6  # not inside another ball
+    points = torch.cat([points[bare], FAR * outward[600:]])
+    outward = torch.cat([outward[:600][bare], outward[600:]])
+    pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
+    column, row = pixels.long().unbind(dim=-1)
+    framed = (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
+    inside = truth[
+        torch.arange(VIEWS)[:, None], row.clamp(0, HEIGHT - 1), column.clamp(0, WIDTH - 1)
+    ]
+    away = cameras.centers_world[:, None] - points
+    faces = (normalize(away, dim=-1) * outward).sum(dim=-1) > 0.2
+    on_ball = torch.arange(len(points)) < len(points) - 300
+    # A ball may hide another one's points, which are inside all the same.
+    view, point = (framed & torch.where(on_ball, faces & inside, ~inside)).nonzero(as_tuple=True)
+    middle = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    lens = Lens(camera=1, model="PINHOLE", params=middle, width=WIDTH, height=HEIGHT)
+    views = Views(
+        images=torch.full((VIEWS, 3, HEIGHT, WIDTH), 0.2),
+        sizes_px=torch.tensor([[WIDTH, HEIGHT]] * VIEWS),
+        names=NAMES,
+        focals_px=torch.full((VIEWS,), torch.nan),
+        orientations=torch.tensor([1, 3] * (VIEWS // 2)),
+    )
+    return SparseScene(
+        views=views,
+        cameras=cameras,
+        points_world=points,
+        reprojection_errors_px=torch.zeros(len(points)),
+        observation_point=point,
+        observation_view=view,
+        observation_pixels=pixels[view, point],
+        lenses=(lens,) * VIEWS,
+    )
+
+
+def hard(views, masks):
+    return views.replace(masks=masks)
+
+
+def soft(views, masks):
+    """As a segmenter has them: never certain."""
+    inside = torch.where(masks, 0.9, 0.05)
+    prior = SilhouettePrior(names=views.names, sizes_px=views.sizes_px, inside=inside)
+    return views.replace(masks=None, priors=(prior,))
+
+
+def read(views, reading):
+    """Masks as a reading shows them."""
+    found = reading.of(views)
+    return found.priors[0].inside > 0.5 if found.masks is None else found.masks
+
+
+def order(*changed):
+    """Names in their order, but for some."""
+    return torch.tensor([dict(changed).get(view, view) for view in range(VIEWS)])
+
+
+@pytest.mark.parametrize("form", [hard, soft])
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (torch.logical_not, "inverted"),
+        (lambda masks: masks.flip(1, 2), "turned by a half turn"),
+        (lambda masks: masks.flip(2), "mirrored"),
+        (lambda masks: masks.flip(1), "mirrored upside down"),
+        (
+            lambda masks: torch.stack([masks, masks.flip(1, 2)], dim=1)[
+                torch.arange(VIEWS), torch.arange(VIEWS) % 2
+            ],
+            "of the pixels that files store, not turned by EXIF",
+        ),
+        (lambda masks: masks[order((3, 11), (11, 3))], r"exchanged between (03|11)\.png and"),
+        (
+            lambda masks: masks.roll(7, 0),
+            r"shifted by 7 in the list \(00\.png has that of 07\.png\)",
+        ),
+    ],
+)
+def test_masks_of_another_reading_are_read_as_cameras_and_points_say(
+    scene, truth, form, wrong, said
+):
+    views = form(scene.views, wrong(truth))
+    with pytest.warns(PimperWarning, match=f"if they are {said}.*, so they are read like that"):
+        reading = right_reading(scene.replace(views=views), views)
+    assert torch.equal(read(views, reading), truth)
+    if form is soft:  # as certain as they were
+        inside = reading.of(views).priors[0].inside
+        assert_close((inside - 0.5).abs().sum(), (views.priors[0].inside - 0.5).abs().sum())
+
+
+def test_right_masks_stay_as_they_are_and_drawn_ones_do_too(scene, truth):
+    """Masks a pixel too wide and too narrow in turns, and those of four photographs alone."""
+    wide = torch.nn.functional.max_pool2d(truth.float(), 3, 1, 1) > 0
+    narrow = torch.nn.functional.max_pool2d((~truth).float(), 3, 1, 1) == 0
+    drawn = torch.where((torch.arange(VIEWS) % 2 > 0)[:, None, None], wide, narrow)
+    few = soft(scene.views, truth).priors[0].take([1, 6, 9, 15])
+    for views in (
+        hard(scene.views, truth),
+        soft(scene.views, truth),
+        hard(scene.views, drawn),
+        scene.views.replace(priors=(few,)),
+        scene.views,
+    ):
+        assert right_reading(scene.replace(views=views), views) is AS_THEY_ARE
+
+
+def test_an_object_without_texture_is_found_in_inverted_masks_and_nothing_else_is_guessed(
+    scene, truth
+):
+    bare = observing(scene, scene.observation_point >= len(scene.points_world) - 300)
+    for wrong in (truth, truth.flip(1, 2)):
+        views = hard(scene.views, wrong)
+        with pytest.warns(PimperWarning, match="No point of the cloud is in the silhouettes"):
+            assert right_reading(bare.replace(views=views), views) is AS_THEY_ARE
+    views = soft(scene.views, ~truth)
+    with pytest.warns(PimperWarning, match="if they are inverted"):
+        assert right_reading(bare.replace(views=views), views).inverted
+
+
+def test_an_object_that_fills_its_photographs_is_not_taken_for_inverted(scene, truth):
+    """Its masks run along the borders; points inside are wrong by as much as a cloud may be."""
+    filling = hard(scene.views, torch.ones_like(truth))
+    filling.masks[:, :9, :9] = False
+    assert right_reading(scene.replace(views=filling), filling) is AS_THEY_ARE
+
+
+@pytest.mark.parametrize("form", [hard, soft])
+def test_masks_that_contradict_points_in_any_reading_are_refused(scene, truth, form):
+    moved = [mask.roll((17 * view % 61, 23 * view % 83), (0, 1)) for view, mask in enumerate(truth)]
+    views = form(scene.views, torch.stack(moved))
+    with pytest.raises(InputError, match=r"contradict [0-9]+% of the points in the median view"):
+        right_reading(scene.replace(views=views), views)
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+def test_a_turn_of_masks_is_that_of_photographs(turn):
+    masks = torch.rand(2, 5, 7, generator=torch.Generator().manual_seed(turn)) > 0.5
+    found = Reading(turns={"b": turn}).masks(dict(zip("ab", masks, strict=True)), torch.neg)
+    assert torch.equal(found["a"], masks[0])
+    assert torch.equal(found["b"], torch.from_numpy(rotated(masks[1].numpy(), turn)))
+
+
+def test_square_masks_may_be_turned_by_a_quarter(scene, truth):
+    """Photographs cropped to squares; their soft masks keep whatever size they have."""
+    cut = slice((WIDTH - HEIGHT) // 2, (WIDTH + HEIGHT) // 2)
+    sizes, cameras = torch.tensor([[HEIGHT, HEIGHT]] * VIEWS), scene.cameras
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[:, 0, 2] -= cut.start
+    upright = truth[:, :, cut]
+    views = scene.views.replace(images=scene.views.images[..., cut], sizes_px=sizes)
+    views = soft(views, upright.mT.flip(1))
+    square = scene.replace(
+        views=views, cameras=cameras.replace(intrinsics=intrinsics, sizes_px=sizes)
+    )
+    with pytest.warns(PimperWarning, match="turned by a quarter turn anticlockwise"):
+        reading = right_reading(square, views)
+    assert torch.equal(read(views, reading), upright)
+
+
+class Placed(Stage):
+    """Cameras that are there already, in the place of structure from motion."""
+
+    def __init__(self, scene):
+        super().__init__()
+        self.scene, self.asked = scene, []
+
+    def forward(self, views, sparse_model=None):
+        self.asked.append(views)
+        return self.scene.replace(views=views)
+
+
+def test_a_chain_finds_cameras_anew_with_the_masks_that_are_right(scene, truth):
+    stage, views = Placed(scene), hard(scene.views, truth.flip(1, 2))
+    chain = CoarseToFine(reconstruct=stage)
+    with pytest.warns(PimperWarning, match="half turn"):
+        placed = chain.placed(chain.running(), views, None)
+    assert torch.equal(stage.asked[0].masks, views.masks)
+    assert torch.equal(stage.asked[1].masks, truth)
+    assert torch.equal(placed.views.masks, truth)
+    with pytest.warns(PimperWarning, match="half turn"):
+        given = chain.placed(chain.running(), scene.replace(views=views), None)
+    assert torch.equal(given.views.masks, truth)
+    assert len(stage.asked) == 2
+
+
+def test_a_chain_that_takes_everything_does_not_look_at_masks(scene, truth):
+    config = CoarseToFineConfig(silhouettes=SilhouetteConfig(object="everything"))
+    chain, views = CoarseToFine(config), hard(scene.views, ~truth)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        placed = chain.placed(chain.running(), scene.replace(views=views), None)
+    assert torch.equal(placed.views.masks, ~truth)
