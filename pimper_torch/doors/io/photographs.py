@@ -60,8 +60,9 @@ def load_views(
     Args:
         masks: Folder with one mask for each photograph, of the same name whatever the
             suffix (``17.jpg``: ``17.png``, COLMAP's ``17.jpg.png``, or ``17_mask.png``), or of
-            one that differs in case, spaces or Unicode form. They lie as their photographs are
-            turned by EXIF, or as the files store them; where sizes do not tell, outlines do.
+            one that differs in case, spaces or Unicode form. They are turned as EXIF turns their
+            photographs; those of the pixels that files store are turned where sizes differ. A
+            run with cameras finds out where sizes are equal.
         mask_object: How masks show the object; ``auto`` looks at them.
         encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer, in linear light and

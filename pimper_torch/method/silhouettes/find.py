@@ -54,6 +54,9 @@ class FindSilhouettes(Stage):
             is found, with a :class:`~pimper_torch.runtime.errors.PimperWarning` that says why.
             Where the object was moved between series of photographs, each series is looked at by
             itself.
+
+        Raises:
+            InputError: No more than half of the masks agree, or a click meets nothing.
         """
         config, masks = self.config, scene.views.masks
         if config.object == "everything":
