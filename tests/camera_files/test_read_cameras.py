@@ -1,5 +1,6 @@
 """One rig in the words of every program: the cameras that `--sparse` takes are the same."""
 
+import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,6 +13,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_torch.doors.camera_files.read_cameras import read_cloud
+from pimper_torch.doors.exchange.nerfstudio import write_transforms
 from pimper_torch.method.sfm.existing import existing_model
 from pimper_torch.method.sfm.undistort import pinholes_for
 from pimper_torch.records import Cameras, Views
@@ -192,3 +195,41 @@ def test_two_cameras_of_one_photograph_are_refused(rig, tmp_path):
     path = rigs.saved(tmp_path, K=rig.intrinsics[0], cam_from_world=pose, names=["2.png"] * 3)
     with pytest.raises(InputError, match=r"2\.png may be any of 2\.png, 2\.png"):
         existing_model(rigs.views_of(), path)
+
+
+def test_the_cloud_that_a_file_names_comes_with_its_cameras(rig, tmp_path):
+    cloud = torch.randn(7, 3, generator=torch.Generator().manual_seed(71)).double()
+    write_transforms(rigs.views_of(), rig, tmp_path, points_world=cloud)
+    found = existing_model(rigs.views_of(), tmp_path / "transforms.json")
+    assert_close(found.points_world, cloud, rtol=0, atol=1e-6)
+    assert len(found.observation_point) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("../cloud.ply", "leads out of it"),
+        ("/etc/passwd", "leads out of it"),
+        ("broken.ply", "cannot be read as a PLY file"),
+    ],
+)
+def test_a_cloud_that_cannot_be_read_is_refused(rig, tmp_path, name, why):
+    path = rigs.of_transforms(rig, tmp_path)
+    (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
+    path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": name}))
+    with pytest.raises(InputError, match=why):
+        read_cloud(path)
+
+
+def test_a_cloud_that_is_not_there_is_left_out_with_a_warning(rig, tmp_path):
+    path = rigs.of_transforms(rig, tmp_path)
+    assert len(read_cloud(path)) == 0
+    path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "gone.ply"}))
+    with pytest.warns(PimperWarning, match=r"names the cloud gone\.ply, which is not there"):
+        assert len(read_cloud(path)) == 0
+
+
+def test_points_that_are_not_finite_are_left_out_of_a_cloud(rig, tmp_path):
+    cloud = torch.tensor([[1.0, 2, 3], [torch.nan, 0, 0], [4, 5, 6]]).double()
+    write_transforms(rigs.views_of(), rig, tmp_path, points_world=cloud)
+    assert read_cloud(tmp_path / "transforms.json").tolist() == [[1, 2, 3], [4, 5, 6]]

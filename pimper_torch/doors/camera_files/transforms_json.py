@@ -2,9 +2,12 @@
 
 import math
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 import torch
+import trimesh
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import (
@@ -15,8 +18,9 @@ from pimper_torch.doors.camera_files.posed_camera import (
     rigid_or_refuse,
 )
 from pimper_torch.ground.geometry.rigid import invert_rigid
+from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Lens
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.errors import InputError, caution
 
 KIND = "a transforms.json set"
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
@@ -68,6 +72,32 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
         if (size := both[0] or both[1])
     ]
     return number_lenses(cameras)
+
+
+def read_transforms_cloud(path: Path) -> Points:
+    """Read the points of the PLY file that is named as ``ply_file_path``, as nerfstudio does.
+
+    They are in the frame of the cameras. Those that are not finite are left out.
+
+    Returns:
+        Float64; none where no file is named, or where it is not there, of which a
+        :class:`~pimper_torch.runtime.errors.PimperWarning` warns.
+    """
+    name = DataSetPath(path, KIND).read_json().get("ply_file_path")
+    if not isinstance(name, str):
+        return torch.zeros(0, 3).double()
+    cloud = DataSetPath(DataSetPath(path.parent, KIND).inside(name), KIND)
+    if not cloud.path.is_file():
+        caution(f"{path}: names the cloud {name}, which is not there. It is left out.")
+        return torch.zeros(0, 3).double()
+    points = torch.from_numpy(cloud.read(_ply_points, "a PLY file"))
+    return points[points.isfinite().all(dim=1)]
+
+
+def _ply_points(path: Path) -> np.ndarray:
+    # Of bytes, so that nothing but the file itself is opened.
+    found = trimesh.load(BytesIO(path.read_bytes()), file_type="ply", process=False)
+    return np.array(found.vertices, dtype=np.float64).reshape(-1, 3)
 
 
 def _stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:

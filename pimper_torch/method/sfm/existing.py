@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from pimper_torch.doors.camera_files.read_cameras import read_cameras
+from pimper_torch.doors.camera_files.read_cameras import read_cameras, read_cloud
 from pimper_torch.ground.geometry.lens_models import rescale_lens
 from pimper_torch.method.sfm import colmap, lenses
 from pimper_torch.method.sfm.model import SparseModel, match_names
@@ -28,6 +28,9 @@ def existing_model(views: Views, path: Path) -> SparseModel:
             largest is read; or a file of cameras, see
             :func:`~pimper_torch.doors.camera_files.read_cameras.read_cameras`.
 
+    Returns:
+        With the cloud that a file of cameras names, which no view observes yet.
+
     Raises:
         ReconstructionError: There are cameras of fewer than 3 of the photographs.
         InputError: They do not belong to the photographs, or cannot be read.
@@ -43,7 +46,8 @@ def existing_model(views: Views, path: Path) -> SparseModel:
             "holds more of them, or leave it out to run structure from motion."
         )
     shown = taken(views, model)
-    return follow_pictures(model, shown, _quarter_turns(model, shown, where))
+    placed = follow_pictures(model, shown, _quarter_turns(model, shown, where))
+    return placed.replace(points_world=read_cloud(path)) if path.is_file() else placed
 
 
 def resize_fits(lens: Lens, width: int, height: int) -> bool:

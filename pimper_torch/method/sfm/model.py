@@ -61,6 +61,16 @@ class SparseModel(Record):
             observation_pixels=other.observation_pixels,
         )
 
+    def joined(self, other: "SparseModel") -> "SparseModel":
+        """Add points and observations of a model of the same views."""
+        shifted = other.observation_point + len(self.points_world)
+        return self.replace(
+            points_world=torch.cat([self.points_world, other.points_world]),
+            observation_point=torch.cat([self.observation_point, shifted]),
+            observation_view=torch.cat([self.observation_view, other.observation_view]),
+            observation_pixels=torch.cat([self.observation_pixels, other.observation_pixels]),
+        )
+
     def without(self, observations: Bool[Tensor, " observation"]) -> "SparseModel":
         """Leave observations out, and points that fewer than two views see then."""
         kept = self.replace(

@@ -71,6 +71,16 @@ def refine_tracks(
     return model
 
 
+def found_again(views: Views, model: SparseModel) -> SparseModel:
+    """Find the points in every view; observations by features, and points of two views, go.
+
+    Poses, lenses and places of points are as they were.
+    """
+    gray = views.replace(images=by_view(_gray, views.images.detach()))
+    renewed, aligned = _renewed(model, *_sighted(gray, model))
+    return renewed.without(~aligned)
+
+
 def _gray(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "1 height width"]:
     """Average colours; what is saturated in one stays so."""
     brightest = image.amax(dim=0, keepdim=True)

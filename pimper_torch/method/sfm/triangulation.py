@@ -11,6 +11,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
 from pimper_torch.ground.geometry.local_frame import local_origin, to_local
 from pimper_torch.method.sfm import epipolar, features, matching
+from pimper_torch.method.sfm.cloud import cloud_tracks
 from pimper_torch.method.sfm.colmap import model_of, observation_errors, reconstruction_of
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
@@ -46,7 +47,7 @@ def triangulate(
 
     Args:
         given: Cameras of the photographs, in their order. Points that they have are replaced where
-            more are found.
+            more are found. Points without observations are a cloud, which is looked for, too.
 
     Returns:
         Poses and lenses bit for bit as given. With the points as they were where no more are
@@ -65,10 +66,17 @@ def triangulate(
         verified = matching.verified_pairs(space)
         require_agreement(given, verified, settings.max_error_px, where)
         offset = local_origin(given.cam_from_world, given.points_world)
-        local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
+        local = given.replace(
+            cam_from_world=to_local(given.cam_from_world, offset),
+            points_world=given.points_world - given.points_world.new_tensor(offset),
+        )
         _match_along_lines(space, local, verified, settings)
         found = local.with_points(_triangulated(space, local, settings.seed))
     release_memory()
+    cloud = 0
+    if len(given.points_world) and not len(given.observation_point):
+        of_cloud = cloud_tracks(views, local)
+        cloud, found = len(of_cloud.points_world), found.joined(of_cloud)
     if len(found.points_world):
         found = refine_tracks(views, found, settings.track_iterations, cameras=False)
     points = found.points_world + found.points_world.new_tensor(offset)
@@ -76,9 +84,10 @@ def triangulate(
     if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
         _warn_of_no_points(len(found.points_world), where)
         return given
+    own = f", {cloud:,} of them found from the cloud that it names" if cloud else ""
     caution(
         f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
-        "were triangulated from the photographs with the cameras held fixed, observed "
+        f"were triangulated from the photographs with the cameras held fixed{own}, observed "
         f"{len(found.observation_point):,} times; median reprojection error "
         f"{float(observation_errors(found).median()):.2f} px.",
         stacklevel=3,
