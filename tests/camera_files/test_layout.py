@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from pimper_torch.doors.camera_files.layout import DataSetPath, file_in
+from pimper_bench.datasets.posed import file_in
+from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.numpy_files import read_npy, read_npz
 

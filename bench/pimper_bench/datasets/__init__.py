@@ -4,6 +4,7 @@ Where a folder is laid out otherwise, or a file is missing or damaged, a reader 
 :class:`~pimper_torch.runtime.errors.InputError`, which says what was expected and what was found.
 """
 
+from pimper_bench.datasets.colmap import write_colmap
 from pimper_bench.datasets.diligent import read_diligent_mv
 from pimper_bench.datasets.dtu_sets import read_dtu_mvs, read_dtu_points, read_dtu_protocol
 from pimper_bench.datasets.formats import (
@@ -16,7 +17,6 @@ from pimper_bench.datasets.formats import (
 from pimper_bench.datasets.idr import write_idr
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.datasets.sampling import one_light_per_position
-from pimper_torch.doors.exchange.colmap_workspace import write_colmap
 from pimper_torch.doors.exchange.nerfstudio import write_transforms
 
 __all__ = [

@@ -10,9 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
+from pimper_bench.datasets.posed import file_in, first_of
 from pimper_bench.datasets.sampling import LightOptions, Shot, read_shots
 from pimper_bench.truth import Capture, DtuProtocol, Truth
-from pimper_torch.doors.camera_files.layout import DataSetPath, file_in, first_of
+from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import decompose_projections
 from pimper_torch.doors.io.meshes import read_mesh
 

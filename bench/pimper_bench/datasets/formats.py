@@ -14,13 +14,15 @@ from pimper_bench.datasets.posed import (
     PosedOptions,
     PosedPhotograph,
     assemble,
+    file_in,
+    first_of,
     image_files,
     mask_finder,
 )
 from pimper_bench.truth import Capture
 from pimper_torch.doors.camera_files import transforms_json
 from pimper_torch.doors.camera_files.camera_arrays import read_camera_arrays
-from pimper_torch.doors.camera_files.layout import DataSetPath, file_in, first_of
+from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_refuse
 from pimper_torch.doors.camera_files.read_cameras import FORMATS, read_cameras
 from pimper_torch.doors.io.decode import read_header

@@ -205,3 +205,23 @@ def _intrinsics(one: PosedPhotograph, lens: Lens) -> Float[Tensor, "3 3"]:
             f"{K.tolist()}; needed: distortion of a real lens. Export the cameras again."
         )
     return K
+
+
+def first_of(candidates: Sequence[Path]) -> Path | None:
+    """Return the first path that exists."""
+    return next((path for path in candidates if path.exists()), None)
+
+
+def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
+    """Return a file, or the first one of these names that is in a folder.
+
+    Raises:
+        InputError: There is none.
+    """
+    given = Path(given)
+    if given.is_file():
+        return DataSetPath(given, kind)
+    path = first_of([given / name for name in names])
+    if path is None:
+        DataSetPath(given, kind).refuse(f"a file {' or '.join(names)}")
+    return DataSetPath(path, kind)

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, NoReturn, TypeVar
 
@@ -124,26 +124,6 @@ def contents(path: Path) -> str:
         names = sorted(inner.name for inner in path.iterdir())
         return some(names) if names else "an empty folder"
     return "a file" if path.exists() else "nothing there"
-
-
-def first_of(candidates: Sequence[Path]) -> Path | None:
-    """Return the first path that exists."""
-    return next((path for path in candidates if path.exists()), None)
-
-
-def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
-    """Return a file, or the first one of these names that is in a folder.
-
-    Raises:
-        InputError: There is none.
-    """
-    given = Path(given)
-    if given.is_file():
-        return DataSetPath(given, kind)
-    path = first_of([given / name for name in names])
-    if path is None:
-        DataSetPath(given, kind).refuse(f"a file {' or '.join(names)}")
-    return DataSetPath(path, kind)
 
 
 def _shown(value: object) -> str:

@@ -4,18 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from pimper_torch.doors.camera_files.camera_arrays import read_camera_arrays
 from pimper_torch.doors.camera_files.meshroom_sfm import read_meshroom_cameras
 from pimper_torch.doors.camera_files.metashape_xml import read_metashape_cameras
 from pimper_torch.doors.camera_files.posed_camera import PosedCamera, SizesOf
-from pimper_torch.doors.camera_files.transforms_json import (
-    has_frames,
-    read_transforms_cameras,
-    read_transforms_cloud,
-)
-from pimper_torch.ground.shapes import Points
+from pimper_torch.doors.camera_files.transforms_json import has_frames, read_transforms_cameras
 from pimper_torch.runtime.errors import InputError
 
 
@@ -30,7 +23,6 @@ class CameraFormat:
         read: Reads a file. It is handed the path, the photographs' names, for cameras that go by
             the order of these, and a function that looks up sizes, for cameras without any.
         owns: Whether a file with one of the suffixes is of this format; by default all are.
-        read_cloud: Reads the points that a file names; by default none.
     """
 
     name: str
@@ -38,7 +30,6 @@ class CameraFormat:
     suffixes: tuple[str, ...]
     read: Callable[[Path, Sequence[str], SizesOf], list[PosedCamera]]
     owns: Callable[[Path], bool] = lambda path: True
-    read_cloud: Callable[[Path], Points] = lambda path: torch.zeros(0, 3).double()
 
 
 FORMATS = [
@@ -48,7 +39,6 @@ FORMATS = [
         suffixes=(".json",),
         read=lambda path, _, sizes_of: read_transforms_cameras(path, sizes_of),
         owns=has_frames,
-        read_cloud=read_transforms_cloud,
     ),
     CameraFormat(
         name="cameras.xml",
@@ -77,23 +67,10 @@ def read_cameras(path: Path, photographs: Sequence[str], sizes_of: SizesOf) -> l
     Raises:
         InputError: The file is of no such format, or its reader refuses it.
     """
-    return _format_of(path).read(path, photographs, sizes_of)
-
-
-def read_cloud(path: Path) -> Points:
-    """Read the points that a file of cameras names, in the frame of its cameras; float64.
-
-    Raises:
-        InputError: The file is of no known format, or its points cannot be read.
-    """
-    return _format_of(path).read_cloud(path)
-
-
-def _format_of(path: Path) -> CameraFormat:
     suffix = path.suffix.lower()
     for each in FORMATS:
         if suffix in each.suffixes and each.owns(path):
-            return each
+            return each.read(path, photographs, sizes_of)
     known = ", ".join(f"{each.name} ({each.program})" for each in FORMATS)
     raise InputError(
         f"{path}: is no file of cameras; needed: the folder of a COLMAP model, or a file of one "

@@ -74,22 +74,28 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
     return number_lenses(cameras)
 
 
-def read_transforms_cloud(path: Path) -> Points:
+def read_cloud(path: Path) -> Points:
     """Read the points of the PLY file that is named as ``ply_file_path``, as nerfstudio does.
 
     They are in the frame of the cameras. Those that are not finite are left out.
+
+    Args:
+        path: A file of cameras, of this format or another one.
 
     Returns:
         Float64; none where no file is named, or where it is not there, of which a
         :class:`~pimper_torch.runtime.errors.PimperWarning` warns.
     """
+    nothing = torch.zeros(0, 3, dtype=torch.float64)
+    if path.suffix.lower() != ".json":
+        return nothing
     name = DataSetPath(path, KIND).read_json().get("ply_file_path")
     if not isinstance(name, str):
-        return torch.zeros(0, 3).double()
+        return nothing
     cloud = DataSetPath(DataSetPath(path.parent, KIND).inside(name), KIND)
     if not cloud.path.is_file():
         caution(f"{path}: names the cloud {name}, which is not there. It is left out.")
-        return torch.zeros(0, 3).double()
+        return nothing
     points = torch.from_numpy(cloud.read(_ply_points, "a PLY file"))
     return points[points.isfinite().all(dim=1)]
 

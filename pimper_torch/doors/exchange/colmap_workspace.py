@@ -1,4 +1,4 @@
-"""COLMAP's layouts: photographs beside a model, and the workspace of its dense stereo."""
+"""The workspace of COLMAP's dense stereo: photographs beside a model, with maps."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,48 +8,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.doors.exchange.picture_files import refuse_skew, write_pictures
+from pimper_torch.doors.exchange.picture_files import write_pictures
 from pimper_torch.doors.exchange.result import Result
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses, undistort_pixels
 from pimper_torch.ground.geometry.pixels import homogeneous
-from pimper_torch.ground.shapes import Points
 from pimper_torch.method.sfm.colmap import write_binary
-from pimper_torch.method.sfm.model import SparseModel, select_views
+from pimper_torch.method.sfm.model import select_views
 from pimper_torch.method.sfm.sparse_scene import model_of_scene, point_colors
-from pimper_torch.records import Cameras, SparseScene, Views
+from pimper_torch.records import Cameras, SparseScene
 from pimper_torch.result.viz.maps import view_maps
 from pimper_torch.runtime.progress import part, track
 
 _KINDS = ("depth_maps", "normal_maps", "consistency_graphs")
-
-
-def write_colmap(
-    views: Views, cameras: Cameras, folder: Path | str, *, points_world: Points | None = None
-) -> None:
-    """Write photographs, masks and pinholes as COLMAP reads them.
-
-    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with another
-    ``.png`` behind, ``sparse/0/`` the model, binary.
-
-    Args:
-        views: Undistorted.
-        points_world: A cloud to put in the model, without tracks and black.
-
-    Raises:
-        InputError: A camera has a skew, which COLMAP's pinhole cannot have.
-    """
-    folder = Path(folder)
-    refuse_skew(cameras, views.names, "a COLMAP model")
-    files = write_pictures(views, folder, ".png")
-    points = torch.zeros(0, 3) if points_world is None else points_world.detach().cpu()
-    model = SparseModel(
-        names=files,
-        lenses=pinhole_lenses(cameras),
-        cam_from_world=cameras.cam_from_world.detach().cpu().double(),
-        points_world=points.double(),
-    )
-    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
-    write_binary(model, colors, folder / "sparse" / "0")
 
 
 def write_workspace(result: Result, folder: Path) -> None:
@@ -57,9 +27,10 @@ def write_workspace(result: Result, folder: Path) -> None:
 
     The undistorter itself is not run: it would resample the photographs once more.
 
-    ``images/`` and ``masks/`` are as in :func:`write_colmap`, ``sparse/`` is the model with its
-    tracks. Depths are along the camera's z, normals in its frame (x right, y down, z forward),
-    both 0 where a view does not see the surface: ``stereo_fusion`` and the meshers run on them.
+    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with another
+    ``.png`` behind, ``sparse/`` the model with its tracks. Depths are along the camera's z, normals
+    in its frame (x right, y down, z forward), both 0 where a view does not see the surface:
+    ``stereo_fusion`` and the meshers run on them.
     """
     scene = result.scene
     with part(0, 2):

@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 from PIL import Image
 
-from pimper_torch.doors.camera_files.read_cameras import read_cameras, read_cloud
+from pimper_torch.doors.camera_files.read_cameras import read_cameras
+from pimper_torch.doors.camera_files.transforms_json import read_cloud
 from pimper_torch.ground.geometry.lens_models import rescale_lens
 from pimper_torch.method.sfm import colmap, lenses
 from pimper_torch.method.sfm.model import SparseModel, match_names
