@@ -6,8 +6,12 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.records import Mesh, Views
 from pimper_torch.result.viewer.show import add_found
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -15,6 +19,8 @@ DRAWN_IN_SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsa
 # A busy machine draws a first picture after half a minute.
 PATIENCE_SECONDS = 120.0
 LARGE = 2_000  # pixels
+LAYER, PHOTOGRAPH = 0, 1  # lists of the page, from above
+GROUND = 80 / 255  # the background is darker, and the surface brighter
 
 pytestmark = [
     pytest.mark.browser,
@@ -32,6 +38,86 @@ def page():
         )
         yield browser.new_page(viewport={"width": 640, "height": 400})
         browser.close()
+
+
+def colors(page):
+    """The picture left of the controls and below the browser's notices, 0 to 1."""
+    with Image.open(io.BytesIO(page.screenshot())) as picture:
+        return np.asarray(picture.convert("RGB"), dtype=float)[200:580, :500] / 255
+
+
+def violet(page):
+    """Fraction of the picture that shows photographs of :func:`close_cameras`."""
+    red, green, blue = colors(page).transpose(2, 0, 1)
+    return float(((red > 0.5) & (blue > 0.5) & (green < 0.4)).mean())
+
+
+def choose(page, control, option):
+    """Choose in a list of the page, by the mouse."""
+    page.locator("input.mantine-Select-input:visible").nth(control).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+@pytest.fixture
+def close_cameras(viewer):
+    """Violet photographs, the second between the first and the surface, close to a large ball."""
+    towards = torch.tensor([0.94, 0.0, 0.34])
+    eyes, up = torch.stack([3.2 * towards, 2.8 * towards]), torch.tensor([0.0, 0.0, 1.0])
+    cameras = pinholes(look_at(eyes, torch.zeros(3), up), 300.0, 400, 300)
+    images = torch.tensor([1.0, 0.0, 1.0])[None, :, None, None].expand(2, 3, 300, 400)
+    names = ("far.jpg", "near.jpg")
+    views = Views(
+        images=images, sizes_px=cameras.sizes_px, names=names, focals_px=torch.full((2,), 300.0)
+    )
+    viewer.add_cameras(names, cameras, torch.zeros(1, 3), 0, views)
+    vertices, faces = icosphere(4)
+    mesh = Mesh(vertices_world=1.5 * vertices.float(), faces=faces)
+    viewer.add_pass("ball", mesh.replace(confidence=torch.rand(len(vertices))))
+
+
+@pytest.mark.usefixtures("close_cameras")
+def test_no_photograph_covers_the_surface_unless_it_is_faded_in(viewer, page):
+    page.set_viewport_size({"width": 900, "height": 600})
+    page.goto(viewer.address)
+    until(page, lambda picture: (picture > GROUND).sum() > LARGE)
+    (client,) = viewer.server.get_clients().values()
+    home = np.array(client.camera.position)
+    page.wait_for_timeout(3000)
+    assert violet(page) == 0  # the first one's picture is at the eye
+    choose(page, PHOTOGRAPH, "far.jpg")
+    until(page, lambda _: not np.allclose(client.camera.position, home, atol=1e-3))
+    until(page, lambda _: violet(page) == 0)
+    plain = colors(page)
+    assert (plain.mean(axis=2) > GROUND).mean() > 0.5
+    choose(page, LAYER, "normals")
+    until(page, lambda _: np.abs(colors(page) - plain).mean() > 0.1)
+    viewer._fade.value = 1.0
+    until(page, lambda _: violet(page) > 0.5)
+    choose(page, PHOTOGRAPH, "none")
+    until(page, lambda _: np.allclose(client.camera.position, home, atol=1e-3))
+    until(page, lambda picture: violet(page) == 0 and (picture > GROUND).sum() > LARGE)
+
+
+@pytest.mark.usefixtures("close_cameras")
+def test_a_telephone_shows_the_whole_surface_above_the_controls(viewer, page):
+    page.set_viewport_size({"width": 390, "height": 760})
+    page.goto(viewer.address)
+
+    def bright():
+        with Image.open(io.BytesIO(page.screenshot())) as picture:
+            return np.asarray(picture.convert("L"), dtype=float)[180:520] / 255 > 0.3
+
+    until(page, lambda _: bright().sum() > 10 * LARGE)
+    page.wait_for_timeout(3000)
+    shown = bright()
+    assert not shown[:, [0, 1, -2, -1]].any()  # no side is cut off
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    choose(page, LAYER, "support")
+    bar = page.get_by_text("full", exact=True)
+    bar.wait_for(timeout=1000 * PATIENCE_SECONDS)
+    box = bar.bounding_box()
+    assert 0 <= box["x"] < box["x"] + box["width"] <= 390
+    assert 380 < box["y"] < 760
 
 
 def until(page, true):
@@ -53,7 +139,7 @@ def test_the_object_is_there_and_a_click_on_a_frustum_stands_there(viewer, page,
     page.on("console", lambda told: errors.append(told.text) if told.type == "error" else None)
     add_found(viewer, reconstruction)
     page.goto(viewer.address)
-    until(page, lambda picture: (picture < 0.99).sum() > LARGE)
+    until(page, lambda picture: (picture > GROUND).sum() > LARGE)
     (client,) = viewer.server.get_clients().values()
     name = reconstruction.scene.views.names[1]
     position = viewer._cameras[name][0][:3, 3].numpy()

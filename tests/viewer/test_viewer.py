@@ -1,4 +1,6 @@
+import json
 import math
+import re
 import socket
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -14,6 +16,7 @@ from pimper_torch.doors.exchange.result import Result
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh
+from pimper_torch.result.report.vertex_layers import surface_layers
 from pimper_torch.result.viewer import layers
 from pimper_torch.result.viewer import server as server_module
 from pimper_torch.result.viewer.frame import frame_of_cameras, frame_of_mesh
@@ -21,6 +24,7 @@ from pimper_torch.result.viewer.server import open_server, require_viser
 from pimper_torch.result.viewer.show import add_found, show
 from pimper_torch.result.viewer.viewer import NO_PHOTOGRAPH, Viewer
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
+from tests.viewer.test_frame import cameras_on_a_ring
 
 pytest.importorskip("viser")
 
@@ -57,12 +61,19 @@ def test_scene_holds_cameras_photographs_points_and_surface(page, reconstruction
 
 
 @pytest.fixture
-def camera(page, monkeypatch):
-    """The camera of an open page."""
-    camera = SimpleNamespace(up_direction=None)
-    client = SimpleNamespace(camera=camera, atomic=nullcontext)
+def client(page, monkeypatch):
+    """An open page, twice as wide as high."""
+    camera = SimpleNamespace(up_direction=None, aspect=2.0, wxyz=np.array([1.0, 0, 0, 0]))
+    lamp = SimpleNamespace(position=None)
+    scene = SimpleNamespace(get_handle_by_name={"/light": lamp}.get)
+    client = SimpleNamespace(camera=camera, scene=scene, atomic=nullcontext)
     monkeypatch.setattr(page.server, "get_clients", lambda: {0: client})
-    return camera
+    return client
+
+
+@pytest.fixture
+def camera(client):
+    return client.camera
 
 
 def test_frusta_and_pages_stand_where_the_cameras_do(page, camera, reconstruction):
@@ -101,9 +112,9 @@ def test_a_photograph_hides_the_frusta_and_none_shows_the_whole_surface(
     page, camera, reconstruction
 ):
     page.choose(reconstruction.scene.views.names[0])
-    assert not node(page, "/cameras").visible
+    assert not any(frustum.visible for frustum in page._frusta.values())
     page.choose(NO_PHOTOGRAPH)
-    assert node(page, "/cameras").visible
+    assert any(frustum.visible for frustum in page._frusta.values())
     vertices = transform(page._viewer_from_world, reconstruction.mesh.vertices_world.double())
     rays, eye = vertices - torch.as_tensor(camera.position), torch.as_tensor(camera.position)
     angles = torch.cosine_similarity(rays, -eye.double(), dim=1).acos()
@@ -132,15 +143,17 @@ def test_layers_are_those_that_the_newest_surface_has(viewer, ball):
     viewer.add_pass("ball", ball)
     names = ("lit", "shape", "albedo", "normals", "expected error", "support")
     assert viewer._layer.options == names
-    drawn, ranges = set(), []
+    drawn, ends = set(), []
     for name in names:
         viewer._layer.value = name
         drawn.add(node(viewer, "/surfaces/0: ball").glb_data)
         if viewer._bar.visible:
-            ranges.append(viewer._about.content.rpartition(", ")[2])
+            ends.append(re.findall("<span>(.*?)</span>", viewer._bar.content))
+            assert "rgb(68 1 84), " in viewer._bar.content  # viridis' first colour
     assert len(drawn) == len(names)
-    # All but a fiftieth of the vertices are within the range.
-    assert ranges == ["from 0 to 0.976 units or more.", "from none to full."]
+    layers_of_numbers = surface_layers(ball)
+    assert ends == [[layer.low_text, layer.high_text] for layer in layers_of_numbers]
+    assert layers_of_numbers[1].about in viewer._about.content
     viewer.add_pass("bare", Mesh(vertices_world=ball.vertices_world, faces=ball.faces))
     assert viewer._layer.options == ("lit", "shape", "normals")
     assert viewer._layer.value == "lit"
@@ -165,10 +178,69 @@ def test_what_layers_show(ball, monkeypatch):
     assert (np.diff(error.sum(axis=1)[outward[:, 2].argsort()]) > -1e-6).all()
 
 
-def test_the_light_is_where_the_sliders_are(viewer):
-    for azimuth, elevation, direction in [(90.0, 0.0, (0, 1, 0)), (90.0, 90.0, (0, 0, 1))]:
-        viewer._azimuth.value, viewer._elevation.value = azimuth, elevation
-        np.testing.assert_allclose(node(viewer, "/light").position, direction, atol=1e-9)
+def test_the_light_is_where_the_sliders_are_as_seen_from_the_eye(page, client):
+    """The eye looks along z, with y down; then it turns about y to look along x."""
+    lamp = client.scene.get_handle_by_name("/light")
+    for right, up, direction in [(0, 0, (0, 0, -1)), (0.6, 0, (0.6, 0, -0.8)), (0, 1, (0, -1, 0))]:
+        for slider, value in zip(page._light, (right, up), strict=True):
+            slider.value = value
+        page._turn_light(client)
+        np.testing.assert_allclose(lamp.position, direction, atol=1e-9)
+    page._light[1].value = 0
+    client.camera.wxyz = np.array([0.5**0.5, 0, 0.5**0.5, 0])
+    page._turn_light(client)
+    np.testing.assert_allclose(lamp.position, (-1, 0, 0), atol=1e-9)
+
+
+def test_frusta_between_the_eye_and_the_surface_are_hidden(viewer):
+    """A surface of radius 1 is seen from x, a little above; cameras on a ring look at it."""
+    cameras = cameras_on_a_ring(12, 3.0, 1.0)
+    names = [f"{number}.jpg" for number in range(12)]
+    vertices, faces = icosphere(2)
+    viewer.add_cameras(names, cameras, torch.zeros(1, 3), 0)
+    viewer.add_pass("ball", Mesh(vertices_world=vertices.float() / 2, faces=faces))
+    hidden = {name for name, frustum in viewer._frusta.items() if not frustum.visible}
+    assert not hidden  # the eye is nearer than the cameras
+    viewer._see_whole(1.2)  # and now farther: the first, towards which the eye is, covers it
+    assert {name for name, one in viewer._frusta.items() if not one.visible} == {"0.jpg"}
+
+
+def test_a_narrow_page_shows_the_whole_picture(page, client, reconstruction):
+    name = reconstruction.scene.views.names[0]
+    _, fov, aspect = page._cameras[name]
+    page.choose(name)
+    assert client.camera.fov == pytest.approx(fov)
+    client.camera.aspect = 0.5
+    page.choose(name)
+    across = 2 * math.atan(0.5 * math.tan(client.camera.fov / 2))
+    assert across == pytest.approx(2 * math.atan(aspect * math.tan(fov / 2)))
+
+
+def test_the_photograph_fades_in_where_its_pixels_are(page, client, reconstruction):
+    name = reconstruction.scene.views.names[1]
+    page._fade.value = 0.25
+    assert node(page, "/photograph") is None
+    page.choose(name)
+    glb = node(page, "/photograph").glb_data
+    tree = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    (material,) = tree["materials"]
+    assert material["alphaMode"] == "BLEND"
+    assert material["pbrMetallicRoughness"]["baseColorFactor"][3] == 0.25
+    corners, cameras = page._panes[name][1], reconstruction.cameras
+    back = torch.linalg.inv(page._viewer_from_world)
+    seen = (
+        transform(cameras.cam_from_world[1].double(), transform(back, torch.tensor(corners)))
+        @ cameras.intrinsics[1].double().mT
+    )
+    width, height = cameras.sizes_px[1].tolist()
+    wanted = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]]).double()
+    assert_close(seen[:, :2] / seen[:, 2:], wanted, atol=1e-6, rtol=0)
+    page._fade.value = 0.0
+    assert node(page, "/photograph") is None
+    page._fade.value = 1.0
+    page.choose(NO_PHOTOGRAPH)
+    assert node(page, "/photograph") is None
+    assert not page._fade.visible
 
 
 def test_a_cloud_is_no_surface(viewer, reconstruction):

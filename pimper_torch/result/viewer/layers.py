@@ -1,7 +1,11 @@
 """Layers: what the colours of a surface show."""
 
+from io import BytesIO
+
+import numpy as np
 from jaxtyping import Float
 from kornia.color import ColorMap
+from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -9,13 +13,14 @@ from pimper_torch.ground.geometry.rigid import rotate, transform
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
-from pimper_torch.result.report.vertex_layers import surface_layers
+from pimper_torch.result.report.vertex_layers import VertexLayer, surface_layers
 from pimper_torch.result.viz.maps import base_color, carried_normals, normal_colors
 
 LAYERS = ("lit", "shape", "albedo", "normals")
 """Of colours; those of numbers are the report's."""
 VIRIDIS: Float[Tensor, "256 3"] = ColorMap("viridis", 256).colors.T
 """sRGB of low numbers, dark violet, to high ones, bright yellow."""
+_UNLIT = MATTE | {"extensions": {"KHR_materials_unlit": {}}}
 
 
 def layers_of(mesh: Mesh) -> list[str]:
@@ -24,34 +29,60 @@ def layers_of(mesh: Mesh) -> list[str]:
     return colors + [layer.title for layer in surface_layers(mesh)]
 
 
-def painted(mesh: Mesh, name: str, viewer_from_world: Float[Tensor, "4 4"]) -> tuple[bytes, str]:
+def painted(
+    mesh: Mesh, name: str, viewer_from_world: Float[Tensor, "4 4"]
+) -> tuple[bytes, VertexLayer | None]:
     """Colour a surface by one of its layers.
 
     Args:
         viewer_from_world: A similarity. x of the viewer points to the reference camera, z up.
 
     Returns:
-        A GLB in the viewer's frame, and the range of a layer of numbers.
+        A GLB in the viewer's frame, and the layer if it is one of numbers.
     """
     if name == "shape":
         mesh = mesh.replace(normals_world=None, albedo=None)
     normals = normalize(rotate(viewer_from_world, carried_normals(mesh).double()), dim=1)
-    colors, legend = base_color(mesh).expand(-1, 3), ""
+    colors = base_color(mesh).expand(-1, 3)
     if name == "normals":
         right_down_ahead = normals[:, [1, 2, 0]] * normals.new_tensor([1.0, -1.0, -1.0])
         colors = linear_from_srgb(normal_colors(right_down_ahead))
-    for layer in surface_layers(mesh):
-        if layer.title == name:
-            values = mesh.confidence if layer.attribute == "_support" else mesh.expected_error
-            assert values is not None
-            shares = ((values - layer.low) / (layer.high - layer.low or 1)).nan_to_num(1)
-            colors = linear_from_srgb(VIRIDIS[(255 * shares.clamp(0, 1)).round().long()])
-            legend = f"{layer.about}, from {layer.low_text} to {layer.high_text}."
+    layer = next((one for one in surface_layers(mesh) if one.title == name), None)
+    if layer is not None:
+        values = mesh.confidence if layer.attribute == "_support" else mesh.expected_error
+        assert values is not None
+        shares = ((values - layer.low) / (layer.high - layer.low or 1)).nan_to_num(1)
+        colors = linear_from_srgb(VIRIDIS[(255 * shares.clamp(0, 1)).round().long()])
     attributes = {
         "POSITION": transform(viewer_from_world, mesh.vertices_world.double()).numpy(),
         "NORMAL": normals.numpy(),
         "COLOR_0": colors.float().numpy(),
     }
-    unlit = MATTE | {"extensions": {"KHR_materials_unlit": {}}}
-    material = MATTE if name in ("lit", "shape") else unlit
-    return gltf_of(attributes, mesh.faces.numpy(), material), legend
+    material = MATTE if name in ("lit", "shape") else _UNLIT
+    return gltf_of(attributes, mesh.faces.numpy(), material), layer
+
+
+def color_bar(layer: VertexLayer) -> str:
+    """Return HTML of a bar between the texts of a layer's lowest and highest number."""
+    stops = ", ".join(f"rgb({r} {g} {b})" for r, g, b in (255 * VIRIDIS[::51]).int().tolist())
+    return (
+        '<div style="display: flex; gap: 6px; align-items: center; padding: 2px 10px; '
+        f'font-size: 12px"><span>{layer.low_text}</span><i style="flex: 1; min-width: 60px; '
+        f'height: 10px; border-radius: 3px; background: linear-gradient(90deg, {stops})"></i>'
+        f"<span>{layer.high_text}</span></div>"
+    )
+
+
+def pane(picture: np.ndarray, corners: np.ndarray, opacity: float) -> bytes:
+    """Return a GLB of a photograph that things shine through.
+
+    Args:
+        picture: 8-bit sRGB.
+        corners: Upper left, and on clockwise.
+    """
+    file, corner = BytesIO(), np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    Image.fromarray(picture).save(file, "JPEG", quality=90)
+    surface = {"baseColorTexture": {"index": 0}, "baseColorFactor": [1.0, 1.0, 1.0, opacity]}
+    material = {**_UNLIT, "alphaMode": "BLEND", "pbrMetallicRoughness": surface}
+    attributes = {"POSITION": corners, "TEXCOORD_0": corner}
+    return gltf_of(attributes, np.array([[0, 1, 2], [0, 2, 3]]), material, [file.getvalue()])

@@ -1,4 +1,4 @@
-"""The page: what is in the scene, and the controls beside it."""
+"""The page: what is in the scene, and the controls next to it."""
 
 import math
 import threading
@@ -20,19 +20,22 @@ from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.result.report.predictions import shrunk
 from pimper_torch.result.viewer.frame import frame_of_cameras, frame_of_mesh
-from pimper_torch.result.viewer.layers import LAYERS, VIRIDIS, layers_of, painted
+from pimper_torch.result.viewer.layers import LAYERS, color_bar, layers_of, painted, pane
 from pimper_torch.result.viewer.server import HOST, PORT, open_server
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import each
 
 NO_PHOTOGRAPH = "none"
 # Of frusta: photographs are a third of a unit wide where cameras are three away, and two dozen of
-# them on a ring stand 0.8 apart.
+# them on a ring are 0.8 apart.
 _SCALE = 0.15
 _POINT_COLOR = (110, 140, 190)
-_AMBIENT = 0.15  # the share of light that comes from everywhere
-# Of light that falls straight on: three.js divides by pi what a matte surface reflects.
-_BRIGHTNESS = math.pi
+_PICTURE_PX = 480  # a choice: 200 photographs take 12 MB, and 120 MB of a graphics card
+# The report's light: three.js divides by pi what a matte surface reflects.
+_DIRECT, _AMBIENT = math.pi, 0.2 * math.pi
+_LIGHT_RIGHT_UP = (-0.45, 0.55)
+_ACCENT = (255, 210, 74)
+_GROUND_SRGB = ((74, 78, 87), (35, 38, 44))  # in the middle, and in the corners
 
 
 class Viewer:
@@ -48,32 +51,38 @@ class Viewer:
         self._lock = threading.RLock()  # a page's thread repaints what a run adds
         self._surfaces: list[str] = []
         self._newest: tuple[str, Mesh] | None = None
-        self._cameras: dict[str, tuple[Float[Tensor, "4 4"], float]] = {}
-        self._see_whole(1.0)
+        # Pose, vertical field of view, and width over height.
+        self._cameras: dict[str, tuple[Float[Tensor, "4 4"], float, float]] = {}
+        self._frusta: dict[str, Any] = {}
+        self._panes: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # photographs, and corners
         scene, gui = self.server.scene, self.server.gui
         scene.configure_default_lights(enabled=False)
         scene.configure_environment_map(hdri=None)
-        direct = _BRIGHTNESS * (1 - _AMBIENT)
-        self._light = scene.add_light_directional("/light", intensity=direct)
-        self._frusta = scene.add_frame("/cameras", show_axes=False)
-        scene.add_light_ambient("/ambient", intensity=_BRIGHTNESS * _AMBIENT)
-        gui.configure_theme(show_logo=False, show_share_button=False)
+        scene.add_light_ambient("/ambient", intensity=_AMBIENT)
+        scene.set_background_image(_ground(), format="png")
+        gui.configure_theme(
+            dark_mode=True, brand_color=_ACCENT, show_logo=False, show_share_button=False
+        )
         gui.main_panel.dock_right()
         self._layer = gui.add_dropdown("layer", LAYERS)
-        self._about = gui.add_markdown("No surface yet.")
-        self._bar = gui.add_image(VIRIDIS.expand(12, -1, -1).numpy(), visible=False)
+        self._bar = gui.add_html("", visible=False)
         self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
+        self._fade = gui.add_slider("fade to it", 0.0, 1.0, 0.05, 0.0, visible=False)
+        self._light = [
+            gui.add_slider(f"light from {name}", -1.0, 1.0, 0.05, start)
+            for name, start in zip(("right", "above"), _LIGHT_RIGHT_UP, strict=True)
+        ]
+        self._about = gui.add_markdown("No surface yet.")
+        self._see_whole(1.0)
+        self._layer.on_update(lambda _: self._paint())
         # Without a client it is `choose` itself that sets it.
         self._chosen.on_update(
             lambda event: self.choose(self._chosen.value) if event.client else None
         )
-        with gui.add_folder("light"):  # at first raking, from up on the reference camera's left
-            self._azimuth = gui.add_slider("azimuth", -180.0, 180.0, 1.0, -45.0)
-            self._elevation = gui.add_slider("elevation", -90.0, 90.0, 1.0, 40.0)
-        self._layer.on_update(lambda _: self._paint())
-        for slider in (self._azimuth, self._elevation):
-            slider.on_update(lambda _: self._turn_light())
-        self._turn_light()
+        self._fade.on_update(lambda _: self._lay_photograph())
+        for slider in self._light:
+            slider.on_update(lambda _: [self._turn_light(one) for one in self._clients()])
+        self.server.on_client_connect(self._welcome)
 
     def __enter__(self) -> "Viewer":
         return self
@@ -122,22 +131,30 @@ class Viewer:
         poses = frame @ invert_rigid(cameras.cam_from_world.detach().cpu().double())
         for view, (name, pose) in enumerate(zip(names, poses, strict=True)):
             width, height = cameras.sizes_px[view].tolist()
-            fov = 2 * math.atan(height / 2 / float(cameras.intrinsics[view, 1, 1]))
+            K = cameras.intrinsics[view].detach().cpu().double()
+            fov = 2 * math.atan(height / 2 / float(K[1, 1]))
             pose[:3, :3] = normalize(pose[:3, :3], dim=0)
-            self._cameras[name] = pose, fov
-            frustum = scene.add_camera_frustum(
+            self._cameras[name] = pose, fov, width / height
+            picture = None if pictures is None else pictures[view]
+            if picture is not None:
+                ends = torch.tensor([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]])
+                rays = _SCALE * ends.double() @ K.inverse().mT
+                self._panes[name] = picture, transform(pose, rays).numpy()
+            frustum = self._frusta[name] = scene.add_camera_frustum(
                 f"/cameras/{view:05d}",
                 fov,
                 width / height,
                 scale=_SCALE,
                 thickness=1.5,
                 thickness_units="screen",
-                image=None if pictures is None else pictures[view],
+                color=(143, 211, 255),
+                image=picture,
                 wxyz=SO3.from_matrix(pose[:3, :3].numpy()).wxyz,
                 position=pose[:3, 3].numpy(),
             )
             frustum.on_click(lambda _, name=name: self.choose(name))
         self._chosen.options = (NO_PHOTOGRAPH, *names)
+        self._show_frusta()
 
     def add_pass(self, name: str, mesh: Mesh) -> None:
         """Show a surface in place of those before, which the page's list of the scene brings back.
@@ -154,7 +171,7 @@ class Viewer:
         with self._lock:
             if self._viewer_from_world is None:
                 self._viewer_from_world = frame_of_mesh(mesh)
-            for before in ("/points", *self._surfaces):  # points lie on the surface
+            for before in ("/points", *self._surfaces):  # points are on the surface
                 if node := self.server.scene.get_handle_by_name(before):
                     node.visible = False
             self._surfaces.append(f"/surfaces/{len(self._surfaces)}: {name}")
@@ -165,39 +182,85 @@ class Viewer:
             self._paint()
 
     def choose(self, name: str) -> None:
-        """Stand, on every open page, where a photograph was taken, without frusta before the eye.
+        """Move, on every open page, to where a photograph was taken, and hide all frusta.
 
         Args:
-            name: Of the photograph; :data:`NO_PHOTOGRAPH` looks at the whole, with all frusta.
+            name: Of the photograph; :data:`NO_PHOTOGRAPH` looks at the whole surface, with the
+                frusta that do not cover it.
         """
         self._chosen.value = name
-        self._frusta.visible = name == NO_PHOTOGRAPH
-        for client in self.server.get_clients().values():
-            with client.atomic():
-                _put(client.camera, *self._cameras[name])
+        self._fade.visible = name in self._panes
+        self._show_frusta()
+        self._lay_photograph()
+        for client in self._clients():
+            self._stand(client)
+
+    def _clients(self) -> Sequence[Any]:
+        return list(self.server.get_clients().values())
+
+    def _welcome(self, client: Any) -> None:  # noqa: ANN401 - viser's
+        """Show a new page what the others see, in a light that follows its eye."""
+        client.scene.add_light_directional("/light", intensity=_DIRECT)
+        client.camera.on_update(lambda _: self._turn_light(client))
+        self._stand(client)
+        self._turn_light(client)
+
+    def _stand(self, client: Any) -> None:  # noqa: ANN401 - viser's
+        """Move a page to the chosen camera, whose whole picture fits into its window."""
+        pose, fov, aspect = self._cameras[self._chosen.value]
+        half = math.tan(fov / 2) * max(1.0, aspect / client.camera.aspect)
+        with client.atomic():
+            _put(client.camera, pose, 2 * math.atan(half))
+
+    def _turn_light(self, client: Any) -> None:  # noqa: ANN401 - viser's
+        """Let a page's light come from where the sliders are, as seen from its eye."""
+        from viser.transforms import SO3
+
+        right, up = (slider.value for slider in self._light)
+        towards = np.array([right, -up, -math.sqrt(max(0.0, 1 - right**2 - up**2))])
+        lamp = client.scene.get_handle_by_name("/light")
+        lamp.position = SO3(client.camera.wxyz).apply(towards)
+
+    def _lay_photograph(self) -> None:
+        """Lay the chosen photograph over the surface, as opaque as the slider is."""
+        if overlay := self.server.scene.get_handle_by_name("/photograph"):
+            overlay.remove()
+        if self._chosen.value in self._panes and self._fade.value:
+            glb = pane(*self._panes[self._chosen.value], self._fade.value)
+            self.server.scene.add_glb("/photograph", glb)
+
+    def _show_frusta(self) -> None:
+        """Hide all frusta from within a photograph; otherwise those in front of the surface."""
+        eye, radius = self._cameras[NO_PHOTOGRAPH][0][:3, 3], self._radius
+        away, size = float(eye.norm()), 2 * _SCALE
+        for name, frustum in self._frusta.items():
+            place = self._cameras[name][0][:3, 3]
+            along = float(place @ eye) / away
+            aside = float((place - along / away * eye).norm())
+            cone = radius * max(0.0, 1 - along / away)
+            covers = 0 < along < away + size and aside < cone + size
+            frustum.visible = self._chosen.value == NO_PHOTOGRAPH and not covers
 
     def _paint(self) -> None:
         with self._lock:
             if self._newest is None or self._viewer_from_world is None:
                 return
             name, mesh = self._newest
-            glb, legend = painted(mesh, self._layer.value, self._viewer_from_world)
+            glb, layer = painted(mesh, self._layer.value, self._viewer_from_world)
             self.server.scene.add_glb(self._surfaces[-1], glb)
-            self._about.content = f"**{name}**, {len(mesh.faces):,} faces. {legend}".rstrip()
-            self._bar.visible = bool(legend)
-
-    def _turn_light(self) -> None:
-        """Let the light come from where the sliders are; it shines on the origin."""
-        azimuth, elevation = np.radians((self._azimuth.value, self._elevation.value))
-        x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
-        self._light.position = x, y, np.sin(elevation)
+            about = "" if layer is None else f" {layer.about}."
+            self._about.content = f"**{name}**, {len(mesh.faces):,} faces.{about}"
+            self._bar.content = "" if layer is None else color_bar(layer)
+            self._bar.visible = layer is not None
 
     def _see_whole(self, radius: float) -> None:
         """Let pages without a photograph look down at all within a radius of the middle."""
         fov, up = math.radians(50), torch.tensor([0.0, 0.0, 1.0])
         eye = radius / math.sin(fov / 2) * torch.tensor([[0.94, 0.0, 0.34]])
-        whole = self._cameras[NO_PHOTOGRAPH] = invert_rigid(look_at(eye, 0 * up, up))[0], fov
-        _put(self.server.initial_camera, *whole)
+        pose = invert_rigid(look_at(eye, 0 * up, up))[0].double()
+        self._cameras[NO_PHOTOGRAPH], self._radius = (pose, fov, 1.0), radius
+        _put(self.server.initial_camera, pose, fov)
+        self._show_frusta()
 
 
 def _put(camera: Any, pose: Float[Tensor, "4 4"], fov: float) -> None:  # noqa: ANN401 - viser's
@@ -213,10 +276,16 @@ def _put(camera: Any, pose: Float[Tensor, "4 4"], fov: float) -> None:  # noqa: 
     setattr(camera, "up_direction" if hasattr(camera, "up_direction") else "up", up.numpy())
 
 
+def _ground() -> np.ndarray:
+    """Draw the background of the report."""
+    away = np.hypot(*np.mgrid[-1:1:128j, -1:1:128j])[..., None] / math.sqrt(2)
+    return ((1 - away) * _GROUND_SRGB[0] + away * _GROUND_SRGB[1]).round().astype(np.uint8)
+
+
 def small_pictures(views: Views) -> list[np.ndarray]:
     """Shrink photographs, without the padding of the raster, to 8-bit sRGB."""
     pictures = []
     for (image,), (width, height) in zip(each(views.images), views.sizes_px.tolist(), strict=True):
-        small = shrunk(image[:, :height, :width].detach().cpu().clamp(0, 1), 256)
+        small = shrunk(image[:, :height, :width].detach().cpu().clamp(0, 1), _PICTURE_PX)
         pictures.append(to_bytes(small.expand(3, -1, -1)).movedim(0, -1).contiguous().numpy())
     return pictures
