@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pimper_bench.metrics import camera_errors, similarity
 from pimper_bench.metrics.dtu_protocol import DtuFigures, dtu_figures
+from pimper_bench.metrics.frames import Frames
 from pimper_bench.metrics.in_view import ViewFigures, compare_along_rays
 from pimper_bench.metrics.surface_distances import (
     SurfaceComparison,
@@ -28,8 +29,8 @@ class EvaluateConfig:
 
     Attributes:
         alignment: Before measuring: `none`, `cameras` (similarity on the cameras both have),
-            `icp` (trimmed similarity between the surfaces, from the cameras on), or `auto`:
-            cameras if there are two on both sides, else none.
+            `icp` (trimmed similarity between the surfaces, from the cameras or a guess at units,
+            axes and a shift on), or `auto`: cameras if there are two on both sides, else none.
         views: Names of the photographs to compare normals, albedo and relative error in; the
             result's reference view unless given, or the middle one if it has none.
         thresholds_percent: For precision, recall and F-score, in per cent of the diagonal of
@@ -91,7 +92,7 @@ def evaluate(
 
     Raises:
         InputError: The alignment cannot be made, a view that was asked for is unknown, or
-            the surfaces have nothing to do with one another.
+            the surfaces are in different frames; see :class:`.Frames`.
     """
     config = config or EvaluateConfig()
     generator = torch.Generator().manual_seed(config.seed)
@@ -99,6 +100,10 @@ def evaluate(
         estimate, capture, config.alignment, config.trimmed_fraction, generator=generator
     )
     moved = similarity.transfer(estimate.mesh, alignment.truth_from_world)
+    if _knows_surface(capture):
+        pairs = similarity.paired_cameras(estimate, capture)
+        cameras = 0 if pairs is None else pairs[0].num_views
+        Frames(moved, true_surface(capture)).require_met(alignment.method, cameras)
     surface = surface or prepared_surface(capture, config)
     maps = maps or capture
     compared = (
@@ -119,11 +124,15 @@ def evaluate(
 
 def prepared_surface(capture: Capture, config: EvaluateConfig) -> TrueSurface | None:
     """Prepare the true surface for :func:`evaluate`; ``None`` if it is unknown."""
-    if capture.truth.mesh is None and capture.truth.points_world is None:
+    if not _knows_surface(capture):
         return None
     return TrueSurface(
         capture, seen_from=config.seen_from, samples=config.samples, seed=config.seed
     )
+
+
+def _knows_surface(capture: Capture) -> bool:
+    return capture.truth.mesh is not None or capture.truth.points_world is not None
 
 
 def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -> tuple[int, ...]:
@@ -160,16 +169,19 @@ def _lights(
 
 
 def camera_figures(estimate: Estimate, capture: Capture) -> camera_errors.CameraFigures | None:
-    """Compare the cameras of the views that both have; ``None`` for fewer than two."""
+    """Compare the cameras of the views that both have.
+
+    Returns:
+        ``None`` for fewer than two, or where they agree but for their rolls.
+    """
     pairs = similarity.paired_cameras(estimate, capture)
-    if pairs is None or pairs[0].num_views < 2:
+    if pairs is None or pairs[0].num_views < 2 or similarity.rolled_cameras(*pairs):
         return None
     ours, truth = pairs
-    known = capture.truth.mesh is not None or capture.truth.points_world is not None
     return camera_errors.compare_cameras(
         ours,
         truth,
         similarity.similarity_between_cameras(ours, truth),
         views=capture.views.num_views,
-        surface=true_surface(capture) if known else None,
+        surface=true_surface(capture) if _knows_surface(capture) else None,
     )

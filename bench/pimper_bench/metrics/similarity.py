@@ -14,13 +14,19 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_bench.metrics.frames import Frames
 from pimper_bench.metrics.surface_distances import sample_surface, true_surface, with_surroundings
 from pimper_bench.truth import Capture
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.records import Cameras, Estimate, Mesh, Record
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.errors import InputError, caution
+
+# Choices. Cameras agree up to the first two, and look the same way up to the last.
+_MOST_RESIDUAL = 0.1  # root mean square of the centres' distances, over that from their mean
+_MOST_TURNED_DEG = 45.0
+_MOST_OFF_DEG = 15.0
 
 
 def pair_views(
@@ -91,6 +97,50 @@ def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "
     length = _spread(source).sqrt() * _spread(target).sqrt()
     correlation = _outer(target, source) + length * (axes_true.mT @ axes).mean(dim=0)
     return _similarity(source, target, correlation).to(ours.cam_from_world)
+
+
+def rolled_cameras(ours: Cameras, truth: Cameras) -> tuple[Float[Tensor, "4 4"], str] | None:
+    """Find cameras that are where the true ones are, but turned about their own axes.
+
+    Returns:
+        The similarity on centres and optical axes alone, and a sentence on the difference; ``None``
+        where centres and rotations agree, or disagree in some other way.
+    """
+    source, target = ours.centers_world.double(), truth.centers_world.double()
+    axes = ours.cam_from_world[:, :3, :3].double()
+    axes_true = truth.cam_from_world[:, :3, :3].double()
+    length = _spread(source).sqrt() * _spread(target).sqrt()
+    outer = _outer(target, source)
+
+    def fitted(rows: slice, sign: float) -> tuple[Float[Tensor, "3 3"], float, Tensor]:
+        """Return a correlation, the centres' residual over their spread, and rotations left."""
+        pulled = (axes_true[:, rows].mT @ axes[:, rows]).mean(dim=0)
+        correlation = outer + sign * length * pulled
+        rotation = nearest_rotation(correlation)
+        common = float((rotation * outer).sum().clamp_min(0) / length)
+        return correlation, max(0, 1 - common) ** 0.5, axes_true @ rotation @ axes.mT
+
+    if not float(length):
+        return None
+    _, plain, turned = fitted(slice(0, 3), 1)
+    turned_deg = float(rotation_angles_deg(turned).median())
+    if plain <= _MOST_RESIDUAL and turned_deg <= _MOST_TURNED_DEG:
+        return None
+    for sign in (1, -1):
+        correlation, residual, turned = fitted(slice(2, 3), sign)
+        off = torch.rad2deg(torch.arccos((sign * turned[:, 2, 2]).clamp(-1, 1))).median()
+        rolls = torch.rad2deg(torch.atan2(turned[:, 1, 0], turned[:, 0, 0])).abs().median()
+        clear = residual <= max(_MOST_RESIDUAL, plain / 3) and float(off) <= _MOST_OFF_DEG
+        if clear and (sign < 0 or float(rolls) > _MOST_TURNED_DEG):
+            told = (
+                f"they are turned about their optical axes by {float(rolls):.0f} degrees "
+                "in the median. Has one photographs as EXIF turns them, and the other as stored?"
+                if sign > 0
+                else "they look the opposite way. Has one the axes of OpenGL (y up, z backwards)?"
+            )
+            found = _similarity(source, target, correlation).to(ours.cam_from_world)
+            return found, f"the cameras of result and truth agree in their places, but {told}"
+    return None
 
 
 def nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
@@ -190,12 +240,14 @@ def align_estimate(
     Args:
         method: ``none`` takes the frames for one and the same. ``cameras`` fits the
             estimate's cameras to the true ones of the same names. ``icp`` continues from
-            there, or from the identity, and fits the surfaces, see :func:`trimmed_icp`.
+            there, or from the identity, by a guess where the surfaces do not meet (see
+            :class:`.Frames`), and fits the surfaces, see :func:`trimmed_icp`.
             ``auto`` is ``cameras`` where there are two pairs of cameras at least, else ``none``.
         generator: On the CPU; draws the samples of ``icp``.
 
     Raises:
-        InputError: ``cameras`` without two pairs, or ``icp`` without a true surface.
+        InputError: ``cameras`` without two pairs, or with cameras that disagree by their rolls
+            (see :func:`rolled_cameras`), or ``icp`` without a true surface.
     """
     pairs = paired_cameras(estimate, capture)
     count = 0 if pairs is None else pairs[0].num_views
@@ -205,12 +257,27 @@ def align_estimate(
             "needed: two at least. Align by the surfaces (`icp`), or not at all (`none`)."
         )
     found, used = torch.eye(4).double(), 0
-    if pairs is not None and count >= 2 and method != "none":
-        found, used = similarity_between_cameras(*pairs).cpu().double(), count
+    if pairs is not None and count >= 2:
+        rolled = rolled_cameras(*pairs)
+        if rolled is not None and method in ("auto", "cameras"):
+            raise InputError(
+                f"{rolled[1]} `--alignment icp` begins without their rolls; `none` takes the "
+                "frames for the same."
+            )
+        if rolled is not None:
+            caution(f"{rolled[1]} Their figures are left out.")
+        if method != "none":
+            fitted = similarity_between_cameras(*pairs) if rolled is None else rolled[0]
+            found, used = fitted.cpu().double(), count
     known: dict[str, float | None] = {}
     description = f"similarity on {used} cameras" if used else "identity"
     if method == "icp":
         target = with_surroundings(true_surface(capture), capture.truth)
+        moved = transfer(estimate.mesh, found)
+        guess = Frames(moved, true_surface(capture)).guess()
+        if guess is not None:
+            found = guess.truth_from_world @ found
+            description += f", by a guess: {guess.told}"
         kind = "plane" if len(target.faces) else "point"
         description = (
             f"similarity ICP, point to {kind}, {100 * trimmed_fraction:g} % of the estimate "
