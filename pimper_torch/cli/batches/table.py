@@ -9,6 +9,7 @@ from dataclasses import asdict
 from html import escape
 from importlib import resources
 from pathlib import Path, PurePosixPath
+from string import Template
 
 from pimper_torch.cli.batches.objects import CSV, HTML
 from pimper_torch.cli.batches.task import Outcome
@@ -20,52 +21,6 @@ _COLUMNS = (
 )
 SIGNS = {CSV: "name,status,tries,seconds", HTML: "<!-- pimper batch -->"}
 """Text that tells our files: only what holds it is replaced."""
-
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-{sign}
-<style>
-{style}
-a {{ color: inherit; }}
-code {{ white-space: nowrap; }}
-td img {{
-  display: block; width: 240px; aspect-ratio: 16 / 10; object-fit: cover; object-position: top;
-  border-radius: 4px;
-}}
-td.name {{ font-weight: 600; white-space: normal; overflow-wrap: anywhere; }}
-.failed, .lost, .waiting {{ color: var(--bad); }}
-@media (max-width: 900px) {{
-  #sections tr {{ display: block; padding: 10px 0; }}
-  #sections tr:nth-child(n + 3) {{ border-top: 1px solid var(--line); }}
-  #sections tr:first-child, #objects td:empty {{ display: none; }}
-  td.text {{ display: block; }}
-  #objects td {{ display: inline-block; }}
-  #objects td[title]::before {{ content: attr(title) " "; color: var(--faint); }}
-  #objects td:first-child, td img {{ display: block; width: 100%; padding: 0; }}
-}}
-</style>
-</head>
-<body>
-<header><h1>{title}</h1><p>{counts}</p></header>
-<div id="sections">
-<section id="objects"><div class="scroll"><table>
-<tr><th></th><th>object</th><th>status</th><th class="number">photographs</th>
-<th class="number">vertices</th><th class="number">faces</th><th class="number">time</th>
-<th class="number">memory</th></tr>
-{rows}
-</table></div></section>
-<section{hidden}><h2>Without a result</h2><div class="scroll"><table>
-<tr><th>reason</th><th>objects</th></tr>
-{reasons}
-</table></div></section>
-</div>
-</body>
-</html>
-"""
 
 
 def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]) -> None:
@@ -96,10 +51,12 @@ def _has_result(row: Mapping[str, object]) -> bool:
 
 
 def _page(rows: Sequence[Mapping[str, object]], out: Path) -> str:
-    style = resources.files("pimper_torch") / "result" / "report" / "page.css"
+    package = resources.files("pimper_torch")
+    style = package / "result" / "report" / "page.css"
+    page = Template((package / "cli" / "batches" / "table.html").read_text(encoding="utf-8"))
     statuses = [str(row["status"]) for row in rows]
     reasons = _reasons(rows, out)
-    return _PAGE.format(
+    return page.substitute(
         title=f"{sum(map(_has_result, rows))} of {len(rows)} objects",
         counts=", ".join(f"{statuses.count(one)} {one}" for one in dict.fromkeys(statuses)),
         style=style.read_text(encoding="utf-8"),
