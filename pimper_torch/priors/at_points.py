@@ -1,5 +1,6 @@
 """Values of guessed maps where views observe points of the cloud."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -58,6 +59,48 @@ def places(
     column_row = (pixels / scene.cameras.sizes_px[view] * sizes).nan_to_num(-1).long()
     column_row = torch.minimum(column_row.clamp_min(0), sizes - 1)
     return torch.cat([maps[:, None], column_row.flip(-1)], dim=1), inside.all(dim=-1) & (maps >= 0)
+
+
+def layouts(prior: MapPrior, scene: SparseScene) -> Iterator[tuple[str, Int[Tensor, " map"]]]:
+    """List how maps may be turned against their photographs, as numbers of EXIF."""
+    tags, count = scene.views.orientations, len(prior.names)
+    if tags is not None:
+        own = tags[[scene.views.names.index(name) for name in prior.names]]
+        if bool((own != 1).any()):
+            yield "of the pixels that files store, before EXIF turns these", own
+    yield "mirrored left to right", torch.full((count,), 2)
+    yield "mirrored top to bottom", torch.full((count,), 4)
+
+
+def turned(
+    place: Int[Tensor, "pixel 3"], prior: MapPrior, orientations: Int[Tensor, " map"]
+) -> Int[Tensor, "pixel 3"]:
+    """Return where maps that are to be turned as EXIF says have what belongs to a place."""
+    tag, last = orientations.to(place)[place[:, 0]], prior.sizes_px[place[:, 0]].to(place) - 1
+    mirrored, flipped = _flips(tag)
+    row = torch.where(flipped, last[:, 1] - place[:, 1], place[:, 1])
+    column = torch.where(mirrored, last[:, 0] - place[:, 2], place[:, 2])
+    across = tag >= 5  # of square maps: others are refused where they are read
+    found = torch.where(across, column, row), torch.where(across, row, column)
+    return torch.stack([place[:, 0], found[0].minimum(last[:, 1]), found[1].minimum(last[:, 0])], 1)
+
+
+def turned_vectors(
+    vectors: Float[Tensor, "map height width 3"], orientations: Int[Tensor, " map"]
+) -> Float[Tensor, "map height width 3"]:
+    """Turn vectors, in axes x right, y down, like the pixels of maps that EXIF turns."""
+    tag = orientations.to(vectors.device)[:, None, None, None]
+    mirrored, flipped = _flips(tag)
+    found = torch.where(tag >= 5, vectors[..., [1, 0, 2]], vectors)
+    signs = [1 - 2 * mirrored.to(vectors), 1 - 2 * flipped.to(vectors)]
+    return found * torch.cat([*signs, torch.ones_like(signs[0])], dim=-1)
+
+
+def _flips(
+    tag: Int[Tensor, "*place"],
+) -> tuple[Bool[Tensor, "*place"], Bool[Tensor, "*place"]]:
+    """Return whether EXIF exchanges left and right, and top and bottom, after rows and columns."""
+    return (tag % 4 == 2) | (tag % 4 == 3), (tag == 3) | (tag == 4) | (tag >= 7)
 
 
 def means_by(

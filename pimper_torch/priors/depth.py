@@ -4,15 +4,16 @@ A reading says how values ``d`` of a map belong to depth ``t`` of the points tha
 observes: ``t = a d + b`` with ``a`` above 0, where ``t`` is depth, distance, or one over either.
 """
 
+import math
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.priors.at_points import AtPoints, at_points, means_by
+from pimper_torch.priors.at_points import AtPoints, at_points, layouts, means_by, turned
 from pimper_torch.priors.choice import surely_better
 from pimper_torch.records import DepthPrior, SparseScene
 from pimper_torch.runtime.errors import InputError, caution, some
@@ -35,6 +36,8 @@ _OURS = (False, "axis", "scene")
 # median error must grow for a stated gauge to be wrong; relative depth of a relief that estimators
 # are too coarse for; relative depth that clouds are good to at best.
 _FEWEST, _STEPS, _WORSE, _FLAT, _ROUGH = 8, 20, 2.0, 0.03, 3e-4
+# By how much the median error must fall for maps to be refused as turned: a choice.
+_TURNED = 1.2
 
 
 def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
@@ -49,8 +52,8 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
         prior: Of undistorted photographs. Depth that is so already is believed as it is.
 
     Raises:
-        InputError: Another reading than the stated one fits far better, none is better than no
-            depth at all, or nothing tells.
+        InputError: Another reading than the stated one fits far better, maps fit far better
+            mirrored or as EXIF turns them, none is better than no depth at all, or nothing tells.
     """
     where = f"The depth of {len(prior.names)} photographs ({some(prior.names, most=1)})"
     lines, errors, seen = _compared(prior.detach(), scene)
@@ -66,6 +69,8 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
 
     if not told and (prior.inverse, prior.along, prior.gauge) == _OURS:
         return prior
+    if what := _better_turned(prior.detach(), scene):
+        raise InputError(f"{where} is {what}: the cloud shows it. Turn maps like the photographs.")
     helps = told and surely_better(worth[best, -1], worth[-1, -1])
     if medians[-1, -1] > _FLAT and not helps:
         raise InputError(
@@ -169,14 +174,56 @@ def _compared(
     pairs = [*((values, truth) for truth in truths), (torch.zeros_like(values), axis)]
     lines = values.new_full((len(pairs), len(_GAUGES), len(prior.names), 2), torch.nan)
     lines[:, 0] = lines.new_tensor([1.0, 0.0])
-    for one in torch.unique(seen.place[:, 0]).tolist():
-        here = seen.place[:, 0] == one
-        for reading, (given, truth) in enumerate(pairs):
-            lines[reading, 1, one] = _line(given[here], truth[here], offset=False)
-            lines[reading, 2, one] = _line(given[here], truth[here], offset=True)
+    for reading, pair in enumerate(pairs):
+        for gauge, offset in ((1, False), (2, True)):
+            lines[reading, gauge] = _lines(*pair, seen.place[:, 0], len(prior.names), offset)
     own = lines[:, :, seen.place[:, 0]]
     given, truth = (torch.stack(part)[:, None] for part in zip(*pairs, strict=True))
     return lines, (own[..., 0] * given + own[..., 1] - truth).abs() / truth, seen
+
+
+@torch.no_grad()
+def _better_turned(prior: DepthPrior, scene: SparseScene) -> str:
+    """State how maps fit the cloud surely better if they are turned, up to factor and offset."""
+    seen = at_points(prior, torch.ones_like(prior.depth, dtype=torch.bool), scene)
+    maps, axis = seen.place[:, 0], seen.depth.double()
+
+    def errors(tags: Int[Tensor, " map"]) -> tuple[float, Float[Tensor, " observation"]]:
+        place = turned(seen.place, prior, tags).unbind(dim=-1)
+        values, known = prior.depth[place].double(), prior.variance[place].isfinite()
+        fits = []
+        for truth in (axis, 1 / axis):
+            lines = _lines(values[known], truth[known], maps[known], len(prior.names), True)[maps]
+            error = (lines[:, 0] * values + lines[:, 1] - truth).abs() / truth
+            error = torch.where(known & error.isfinite(), error, torch.inf)
+            told = error[error.isfinite()]
+            fits.append((float(told.median()) if len(told) else math.inf, error))
+        return min(fits, key=lambda one: one[0])
+
+    plain, found = errors(torch.ones(len(prior.names), dtype=torch.long)), ""
+    for what, tags in layouts(prior, scene):
+        one = errors(tags)
+        size = max(min(plain[0], one[0]), _ROUGH)
+        worth = [means_by(size / (size + error), seen.point) for _, error in (one, plain)]
+        if one[0] < plain[0] / _TURNED and surely_better(*worth):
+            plain, found = one, what
+    return found
+
+
+def _lines(
+    values: Float[Tensor, " observation"],
+    truth: Float[Tensor, " observation"],
+    maps: Int[Tensor, " observation"],
+    count: int,
+    offset: bool,
+) -> Float[Tensor, "map 2"]:
+    """Fit :func:`_line` to each of ``count`` maps; NaN where too few points tell it."""
+    lines = values.new_full((count, 2), torch.nan)
+    for one in torch.unique(maps).tolist():
+        here = maps == one
+        if int(here.sum()) >= _FEWEST:
+            lines[one] = _line(values[here], truth[here], offset=offset)
+    return lines
 
 
 def _line(

@@ -6,16 +6,26 @@ reading of the normals is worth, of a point of the cloud, 1 less twice the mean 
 or -1 where they face away; of a place on an outline, the cosine between normal and outward.
 """
 
+from collections.abc import Mapping
 from itertools import product
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.contours import contour_rays
 from pimper_torch.ground.shapes import Points
-from pimper_torch.priors.at_points import at_points, means_by, places
+from pimper_torch.priors.at_points import (
+    AtPoints,
+    at_points,
+    layouts,
+    means_by,
+    places,
+    turned,
+    turned_vectors,
+)
 from pimper_torch.priors.choice import surely_better
 from pimper_torch.records import NormalPrior, Silhouettes, SparseScene
 from pimper_torch.records.priors import AXES
@@ -33,8 +43,8 @@ _READINGS: dict[str, tuple[int, ...] | None] = {
 }
 for signs in product((1, -1), repeat=3):
     if signs not in _NAMED:
-        turned = " and ".join(axis for sign, axis in zip(signs, "xyz", strict=True) if sign < 0)
-        _READINGS[f"camera normals in axes of OpenCV but for {turned}, turned round"] = signs
+        odd = " and ".join(axis for sign, axis in zip(signs, "xyz", strict=True) if sign < 0)
+        _READINGS[f"camera normals in axes of OpenCV but for {odd}, turned round"] = signs
 _MEANINGS = list(_READINGS)
 
 # Choices. Points whose neighbours are looked at: as many as keep these apart by more than their
@@ -44,6 +54,39 @@ _POINTS, _NEIGHBOURS, _RIM, _INSIDE = 600, 8, 64, 2.0
 # of 160x120) have 0.66 to 0.83, with 30 degrees of noise 0.31 to 0.70; world normals of another
 # world 0.10 at most.
 _LEAST = 0.2
+# How much more maps must be worth, turned or with channels exchanged, than as they are: a choice.
+# Of the same scenes without noise and with 25 degrees, maps of the object alone included, mirrored,
+# half turned and exchanged ones are found so, but for those of a jar that is its own mirror image.
+_MORE = 0.05
+_BGR = "red and blue exchanged, as OpenCV writes pictures"
+
+
+class _Samples(NamedTuple):
+    """Where the scene tells normals: points of the cloud in views, and places inside outlines.
+
+    Attributes:
+        seen: Observations of the points.
+        ways: To the neighbours of each observation's point.
+        rays: To it.
+        poses: Rotations of the observing cameras.
+        rim: Map, row and column of each place inside an outline.
+        outward: Normals there, world.
+        rim_poses: Rotations of its cameras.
+    """
+
+    seen: AtPoints
+    ways: Float[Tensor, "observation neighbour 3"]
+    rays: Float[Tensor, "observation 3"]
+    poses: Float[Tensor, "observation 3 3"]
+    rim: Int[Tensor, "rim 3"]
+    outward: Float[Tensor, "rim 3"]
+    rim_poses: Float[Tensor, "rim 3 3"]
+
+    def where(self, known: Bool[Tensor, "map height width"]) -> "_Samples":
+        """Keep those at which maps say something."""
+        here, rim = known[self.seen.place.unbind(dim=-1)], known[self.rim.unbind(dim=-1)]
+        of_points = self.seen.take(here), self.ways[here], self.rays[here], self.poses[here]
+        return _Samples(*of_points, self.rim[rim], self.outward[rim], self.rim_poses[rim])
 
 
 def settled_normals(
@@ -51,17 +94,22 @@ def settled_normals(
 ) -> NormalPrior:
     """Turn normals to our axes of the camera, or leave them in the world.
 
-    Axes that are left open are found, which is told in a warning.
+    Axes that are left open are found, and exchanged red and blue are exchanged back: a warning
+    says so.
 
     Args:
         prior: Of undistorted photographs.
         silhouettes: Where they are known; without, the cloud alone tells.
 
     Raises:
-        InputError: Other axes than the stated ones fit far better, or nothing tells which do.
+        InputError: Other axes than the stated ones fit far better, maps fit far better mirrored or
+            as EXIF turns them, or nothing tells which axes do.
     """
     where = f"The normals of {len(prior.names)} photographs ({some(prior.names, most=1)})"
-    worth, of_other_world = _worth(prior.detach(), scene, silhouettes)
+    bare = prior.detach()
+    every = _samples(bare, scene, silhouettes)
+    at = every.where(bare.variance.isfinite())
+    worth = _worth(bare, at)
     means = worth.mean(dim=1) if worth.shape[1] else worth.new_zeros(len(_READINGS))
     best = int(means.argmax())
 
@@ -71,10 +119,15 @@ def settled_normals(
     def refused(found: str, needed: str) -> InputError:
         return InputError(f"{where} {found}. Cloud, outlines and cameras show it. {needed}")
 
-    if of_other_world and means[best] < _LEAST:
+    if _of_other_world(bare, at) and means[best] < _LEAST:
         found = "fit in no axes, yet agree between views as they stand: they are world normals of "
         needed = "Give camera normals, or the cameras of that world with `--sparse`."
         raise refused(f"{found}another world", needed)
+    if what := _better_otherwise(bare, every, best, dict(layouts(bare, scene))):
+        if what != _BGR:
+            raise refused(f"are {what}", "Turn maps and vectors like the photographs.")
+        caution(f"{where} have {_BGR}; they are exchanged back.", stacklevel=4)
+        return settled_normals(prior.replace(normals=prior.normals.flip(-1)), scene, silhouettes)
     index = int(means[: _WORLD + 1].argmax())
     if prior.axes:
         index = _WORLD if prior.frame == "world" else list(AXES).index(prior.axes)
@@ -117,29 +170,76 @@ def _read(
     return torch.stack(found)
 
 
+def _better_otherwise(
+    prior: NormalPrior, at: _Samples, best: int, turns: Mapping[str, Int[Tensor, " map"]]
+) -> str:
+    """State how maps fit surely better than as they are, turned or with channels exchanged.
+
+    Args:
+        best: The reading of the maps as they are.
+        turns: Ways of turning maps, as numbers of EXIF.
+    """
+    others = [(_BGR, _worth(prior.replace(normals=prior.normals.flip(-1)), at))]
+    for what, tags in turns.items():
+        # A network saw the picture as it lay, or vectors were turned and pixels were not.
+        seen = prior.replace(normals=turned_vectors(prior.normals, tags))
+        others += [(what, _worth(one, at, tags)) for one in (seen, prior)]
+    if not others[0][1].shape[1]:
+        return ""
+    fits = [(what, one[one.mean(dim=1).argmax()]) for what, one in others]
+    what, fit = max(fits, key=lambda one: float(one[1].mean()))
+    plain, share = _worth(prior, at)[best], float((fit != 0).float().mean())
+    least = max(_LEAST * share, float(plain.mean()) + _MORE * share)
+    return what if float(fit.mean()) > least and surely_better(fit, plain) else ""
+
+
+@torch.no_grad()
+def _samples(prior: NormalPrior, scene: SparseScene, silhouettes: Silhouettes | None) -> _Samples:
+    points, everywhere = scene.points_world, torch.ones_like(prior.variance, dtype=torch.bool)
+    seen, ways = at_points(prior, everywhere, scene), _ways(points)
+    seen = seen.take(ways[seen.point].isfinite().flatten(1).all(dim=1))
+    rotations = scene.cameras.cam_from_world[:, :3, :3]
+    rays = points[seen.point] - scene.cameras.centers_world[seen.view]
+    rim, outward, view = seen.place[:0], rays[:0], seen.view[:0]
+    if silhouettes is not None:  # where these are everything, they have no outlines
+        found = contour_rays(silhouettes, scene.cameras, _RIM)
+        turned_out = (rotations[found.view] @ found.normals_world[..., None])[:, :2, 0]
+        pixels = found.pixels - _INSIDE * normalize(turned_out, dim=-1)
+        rim, within = places(prior, scene, found.view, pixels)
+        rim, outward, view = rim[within], found.normals_world[within], found.view[within]
+    poses = rotations[seen.view]
+    return _Samples(seen, ways[seen.point], rays, poses, rim, outward, rotations[view])
+
+
 @torch.no_grad()
 def _worth(
-    prior: NormalPrior, scene: SparseScene, silhouettes: Silhouettes | None
-) -> tuple[Float[Tensor, "reading sample"], bool]:
-    """Return what readings are worth at points and outlines.
+    prior: NormalPrior, at: _Samples, layout: Int[Tensor, " map"] | None = None
+) -> Float[Tensor, "reading sample"]:
+    """Return what readings are worth at points and outlines, of maps turned as EXIF says.
 
-    And whether normals agree between views as they stand, and better than most readings do.
+    0 where maps say nothing.
     """
-    known, points = prior.variance.isfinite(), scene.points_world
-    seen, ways = at_points(prior, known, scene), _ways(points)
-    seen = seen.take(ways[seen.point].isfinite().flatten(1).all(dim=1))
-    poses = scene.cameras.cam_from_world[seen.view, :3, :3]
-    found = _read(prior.normals[seen.place.unbind(dim=-1)].to(points), poses)
-    flat = 1 - 2 * (found[:, :, None] * ways[seen.point]).sum(dim=-1).abs().mean(dim=-1)
-    rays = points[seen.point] - scene.cameras.centers_world[seen.view]
-    worth = means_by(torch.where((found * rays).sum(dim=-1) < 0, flat, -1), seen.point)
-    agree = means_by(found.movedim(-1, 1), seen.point).norm(dim=1).mean(dim=-1)
+    place, rim = at.seen.place, at.rim
+    if layout is not None:
+        place, rim = turned(place, prior, layout), turned(rim, prior, layout)
+    known = prior.variance.isfinite()
+    found = _read(prior.normals[place.unbind(dim=-1)].to(at.ways), at.poses)
+    flat = 1 - 2 * (found[:, :, None] * at.ways).sum(dim=-1).abs().mean(dim=-1)
+    faces = (found * at.rays).sum(dim=-1) < 0
+    worth = torch.where(known[place.unbind(dim=-1)], torch.where(faces, flat, -1), 0)
+    rims = _read(prior.normals[rim.unbind(dim=-1)].to(at.ways), at.rim_poses)
+    along = torch.where(known[rim.unbind(dim=-1)], (rims * at.outward).sum(dim=-1), 0)
+    return torch.cat([means_by(worth, at.seen.point), along], dim=1)
+
+
+@torch.no_grad()
+def _of_other_world(prior: NormalPrior, at: _Samples) -> bool:
+    """Return whether normals agree between views as they stand, and better than most readings."""
+    found = _read(prior.normals[at.seen.place.unbind(dim=-1)].to(at.ways), at.poses)
+    agree = means_by(found.movedim(-1, 1), at.seen.point).norm(dim=1).mean(dim=-1)
     world, second = agree[_WORLD], agree.sort().values[-2]
     # A mean of length 0.9: normals are within 25 degrees of it.
-    of_other_world = bool(world > max(float(second), 0.9))
-    if silhouettes is not None:  # where these are everything, they have no outlines
-        worth = torch.cat([worth, _at_outlines(prior, known, scene, silhouettes)], dim=1)
-    return worth, of_other_world
+    return bool(world > max(float(second), 0.9))
 
 
 def _ways(points: Points) -> Float[Tensor, "point neighbour 3"]:
@@ -152,16 +252,3 @@ def _ways(points: Points) -> Float[Tensor, "point neighbour 3"]:
     nearest = torch.cdist(cloud, cloud).topk(_NEIGHBOURS + 1, largest=False).indices[:, 1:]
     ways[some_of] = normalize(cloud[nearest] - cloud[:, None], dim=-1)
     return ways
-
-
-def _at_outlines(
-    prior: NormalPrior, known: Tensor, scene: SparseScene, silhouettes: Silhouettes
-) -> Float[Tensor, "reading sample"]:
-    """Return what readings are worth just inside the outlines."""
-    rays = contour_rays(silhouettes, scene.cameras, _RIM)
-    rotation = scene.cameras.cam_from_world[rays.view, :3, :3]
-    outward = normalize((rotation @ rays.normals_world[..., None])[:, :2, 0], dim=-1)
-    place, within = places(prior, scene, rays.view, rays.pixels - _INSIDE * outward)
-    within &= known[place.unbind(dim=-1)]
-    normals = prior.normals[place[within].unbind(dim=-1)].to(rotation)
-    return (_read(normals, rotation[within]) * rays.normals_world[within]).sum(dim=-1)

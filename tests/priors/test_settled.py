@@ -4,7 +4,9 @@ from scenes import observing, without_points
 from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
+from pimper_torch.doors.io.decode import rotated
 from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.priors.at_points import turned, turned_vectors
 from pimper_torch.priors.settled import settled
 from pimper_torch.records import DepthPrior, NormalPrior
 from pimper_torch.records.priors import AXES
@@ -92,6 +94,60 @@ def test_normals_that_mean_something_else_are_refused_by_name(
         normals = rendered.camera * torch.tensor(AXES[given][0] if given in AXES else given)
     with pytest.raises(InputError, match=what):
         settle(scene, of_normals(scene, noisy(normals, 10.0), **stated), silhouettes)
+
+
+@pytest.mark.parametrize("outlines", [False, True])
+@pytest.mark.parametrize("stated", [None, "opengl"])
+@pytest.mark.parametrize("axes", AXES)
+def test_exchanged_channels_are_exchanged_back_and_told(rendered, axes, stated, outlines):
+    scene, silhouettes = rendered.scene, rendered.silhouettes if outlines else None
+    camera = noisy(rendered.camera, 20.0)
+    written = (camera * torch.tensor(AXES[axes][0])).flip(-1)  # as OpenCV writes RGB
+    if stated not in (None, axes):
+        with (
+            pytest.warns(PimperWarning, match="exchanged"),
+            pytest.raises(InputError, match="given"),
+        ):
+            settle(scene, of_normals(scene, written, axes=stated), silhouettes)
+        return
+    with pytest.warns(PimperWarning) as told:
+        found = settle(scene, of_normals(scene, written, axes=stated), silhouettes)
+    assert "have red and blue exchanged, as OpenCV writes" in str(told[0].message)
+    assert len(told) == 1 + (stated is None)
+    known = found.variance.isfinite()
+    assert_close(found.normals[known], camera[known])
+
+
+def stored(maps, tags):
+    """Return maps as they are before EXIF turns them by half a turn, or mirrors them."""
+    flips = {1: (), 2: (1,), 3: (0, 1), 4: (0,)}
+    return torch.stack([one.flip(flips[tag]) for one, tag in zip(maps, tags, strict=True)])
+
+
+TURNED = {
+    "mirrored left to right": ([2] * 12, False),
+    "mirrored top to bottom": ([4] * 12, False),
+    "of the pixels that files store, before EXIF turns these": ([3, 1, 3] * 4, True),
+}
+
+
+@pytest.mark.parametrize("outlines", [False, True])
+@pytest.mark.parametrize("alone", [False, True])  # of the object, without its table
+@pytest.mark.parametrize("what", TURNED)
+def test_normals_that_are_turned_are_refused_with_the_reason(rendered, what, alone, outlines):
+    tags, in_files = TURNED[what]
+    scene, silhouettes = rendered.scene, rendered.silhouettes if outlines else None
+    camera = noisy(rendered.camera, 20.0)
+    if alone:
+        camera = camera * (rendered.silhouettes.inside > 0.5)[..., None]
+    signs = torch.tensor([[1 - 2 * (tag in (2, 3)), 1 - 2 * (tag in (3, 4)), 1] for tag in tags])
+    found_by_network = stored(camera, tags) * signs[:, None, None]  # of the picture as it lay
+    if in_files:
+        scene = scene.replace(views=scene.views.replace(orientations=torch.tensor(tags)))
+    for given in (stored(camera, tags), found_by_network):
+        for axes in (None, "opencv"):
+            with pytest.raises(InputError, match=f"are {what}. Cloud.* Turn maps and vectors"):
+                settle(scene, of_normals(scene, given, axes=axes), silhouettes)
 
 
 def test_stated_axes_that_fit_are_believed_without_a_word(rendered):
@@ -237,6 +293,44 @@ def test_depth_that_means_something_else_is_refused_by_name(rendered, kind, stat
     given = DEPTHS[kind][0](rendered.depth, lengths_of_rays(rendered.scene))
     with pytest.raises(InputError, match=what):
         settle(rendered.scene, of_depth(rendered.scene, given, **stated))
+
+
+@pytest.mark.parametrize("kind", ["metres", "disparity"])
+@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize("what", TURNED)
+def test_depth_that_is_turned_is_refused_with_the_reason(rendered, what, alone, kind):
+    tags, in_files = TURNED[what]
+    scene = rendered.scene
+    given = DEPTHS[kind][0](rendered.depth, lengths_of_rays(scene))
+    if alone:
+        given = torch.where(rendered.silhouettes.inside > 0.5, given, torch.nan)
+    if in_files:
+        scene = scene.replace(views=scene.views.replace(orientations=torch.tensor(tags)))
+    for inverse in (None, kind == "disparity"):
+        with pytest.raises(InputError, match=f"The depth of .* is {what}: the cloud shows it"):
+            settle(scene, of_depth(scene, stored(given, tags), inverse=inverse))
+
+
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_places_in_maps_that_are_to_be_turned_are_those_that_turning_them_moves_there(
+    rendered, tag
+):
+    width = 5 if tag < 5 else 4
+    maps = torch.arange(2 * 4 * width).reshape(2, 4, width)
+    upright = torch.stack([torch.from_numpy(rotated(one.numpy(), tag)) for one in maps])
+    prior = of_normals(rendered.scene, rendered.camera).take([0, 1])
+    prior = prior.replace(sizes_px=torch.tensor([[width, 4]] * 2))
+    place = torch.cartesian_prod(torch.arange(2), torch.arange(4), torch.arange(width))
+    found = turned(place, prior, torch.tensor([tag, tag]))
+    assert torch.equal(maps[found.unbind(dim=1)], upright[place.unbind(dim=1)])
+    # Vectors are those of the pixels: what a step to the right, or down, becomes.
+    corners = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 1, 0]])
+    row, column = (
+        torch.stack([(upright[0] == maps[tuple(one)]).nonzero()[0] for one in corners])
+    ).T
+    steps = torch.stack([column[1:] - column[0], row[1:] - row[0]], dim=1).float()
+    vectors = torch.eye(3)[None, None, :2]
+    assert torch.equal(turned_vectors(vectors, torch.tensor([tag]))[0, 0, :, :2], steps)
 
 
 @pytest.mark.parametrize("inverse", [None, False, True])
