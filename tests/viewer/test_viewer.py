@@ -256,7 +256,9 @@ def test_show_takes_what_chains_and_folders_return(reconstruction):
     read = Result(
         mesh=reconstruction.mesh,
         scene=scene,
+        names=scene.views.names,
         cameras=scene.cameras,
+        offset_world=scene.offset_world,
         silhouettes=reconstruction.silhouettes,
         lights_world=None,
         reference=scene.views.names[1],
