@@ -11,7 +11,6 @@ import tyro
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.result.viewer.server import HOST, PORT, require_viser
-from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,9 +33,6 @@ class _Job:
     photos: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     port: int = PORT
     host: str = HOST
-
-    def __post_init__(self) -> None:
-        require(0 <= self.port <= 65_535, "port", self.port, "0 to 65535")
 
 
 def run(job: _Job, output: Output) -> None:

@@ -61,13 +61,13 @@ def choose(page, control, option):
 @pytest.fixture
 def close_cameras(viewer):
     """Violet photographs, the second between the first and the surface, close to a large ball."""
-    towards = torch.tensor([0.94, 0.0, 0.34])
-    eyes, up = torch.stack([3.2 * towards, 2.8 * towards]), torch.tensor([0.0, 0.0, 1.0])
+    towards, up = torch.tensor([0.94, 0.0, 0.34]), torch.tensor([0.0, 0.0, 1.0])
+    eyes = torch.stack([3.2 * towards, 2.8 * towards, torch.tensor([0.0, 2.8, 1.0])])
     cameras = pinholes(look_at(eyes, torch.zeros(3), up), 300.0, 400, 300)
-    images = torch.tensor([1.0, 0.0, 1.0])[None, :, None, None].expand(2, 3, 300, 400)
-    names = ("far.jpg", "near.jpg")
+    images = torch.tensor([1.0, 0.0, 1.0])[None, :, None, None].expand(3, 3, 300, 400)
+    names = ("far.jpg", "near.jpg", "aside.jpg")
     views = Views(
-        images=images, sizes_px=cameras.sizes_px, names=names, focals_px=torch.full((2,), 300.0)
+        images=images, sizes_px=cameras.sizes_px, names=names, focals_px=torch.full((3,), 300.0)
     )
     viewer.add_cameras(names, cameras, torch.zeros(1, 3), 0, views)
     vertices, faces = icosphere(4)
@@ -83,7 +83,7 @@ def test_no_photograph_covers_the_surface_unless_it_is_faded_in(viewer, page):
     (client,) = viewer.server.get_clients().values()
     home = np.array(client.camera.position)
     page.wait_for_timeout(3000)
-    assert violet(page) == 0  # the first one's picture is at the eye
+    assert violet(page) == 0
     choose(page, PHOTOGRAPH, "far.jpg")
     until(page, lambda _: not np.allclose(client.camera.position, home, atol=1e-3))
     until(page, lambda _: violet(page) == 0)

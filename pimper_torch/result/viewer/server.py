@@ -28,14 +28,9 @@ def require_viser() -> None:
 
 
 def open_server(host: str = HOST, port: int = PORT) -> "ViserServer":
-    """Open a server; where the port is taken, on the next free one.
+    """Open a server; see :func:`~pimper_torch.result.viewer.show.show`.
 
-    Args:
-        host: An address of this machine. A warning tells where others reach it.
-        port: 0 takes any free one.
-
-    Raises:
-        ConfigError: viser is missing, or there is no such address or port.
+    A warning says where others reach it.
     """
     require_viser()
     require(0 <= port <= 65_535, "port", port, "0 to 65535")

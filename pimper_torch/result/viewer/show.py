@@ -1,5 +1,6 @@
 """Results in a browser or a notebook, from Python."""
 
+from contextlib import ExitStack
 from pathlib import Path
 
 from pimper_torch.doors.exchange.result import Result, read_result
@@ -53,12 +54,12 @@ def add_found(
         viewer.add_pass(f"pass at {found.scale:g} of the photographs", found.surface.mesh)
     elif isinstance(found, Mesh):
         viewer.add_pass("surface", found)
-    elif isinstance(found, Reconstruction):
-        add_found(viewer, found.scene, found.coarse.reference)
-        viewer.add_pass(COARSE, found.coarse.mesh)
-        viewer.add_pass(RESULT, found.mesh)
     else:
-        add_found(viewer, found.scene, found.scene.views.names.index(found.reference))
+        if isinstance(found, Reconstruction):
+            add_found(viewer, found.scene, found.coarse.reference)
+            viewer.add_pass(COARSE, found.coarse.mesh)
+        else:
+            add_found(viewer, found.scene, found.scene.views.names.index(found.reference))
         viewer.add_pass(RESULT, found.mesh)
 
 
@@ -67,10 +68,9 @@ def show(
 ) -> Viewer:
     """Open a surface, with cameras, photographs and points where it has some, in the viewer.
 
-    Needs viser, the extra ``view``. As the last line of a notebook's cell it shows the page there;
-    elsewhere :attr:`~pimper_torch.result.viewer.viewer.Viewer.address` opens in a browser. The page
-    lives as long as the process: scripts end with
-    :meth:`~pimper_torch.result.viewer.viewer.Viewer.wait`.
+    As the last line of a notebook's cell it shows the page there; elsewhere
+    :attr:`~pimper_torch.result.viewer.viewer.Viewer.address` opens in a browser. The page lives as
+    long as the process: scripts end with :meth:`~pimper_torch.result.viewer.viewer.Viewer.wait`.
 
     Args:
         result: What a chain or :func:`~pimper_torch.doors.exchange.result.read_result` returned, a
@@ -79,15 +79,14 @@ def show(
         port: The next free one is taken where another program has it; 0 takes any.
 
     Raises:
-        PimperError: viser is missing, no such host or port, or the folder holds no surface.
+        PimperError: viser, the extra ``view``, is missing, there is no such host or port, or the
+            folder holds no surface.
     """
-    viewer = Viewer(host, port)
-    try:
+    with ExitStack() as undo:
+        viewer = undo.enter_context(Viewer(host, port))
         if isinstance(result, Path | str):
             add_folder(viewer, result)
         else:
             add_found(viewer, result)
-    except BaseException:
-        viewer.stop()
-        raise
+        undo.pop_all()
     return viewer

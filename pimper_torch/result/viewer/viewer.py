@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import cosine_similarity, normalize
 
 from pimper_torch.ground.geometry.pinholes import look_at
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
@@ -33,9 +33,6 @@ _POINT_COLOR = (110, 140, 190)
 _PICTURE_PX = 480  # a choice: 200 photographs take 12 MB, and 120 MB of a graphics card
 # The report's light: three.js divides by pi what a matte surface reflects.
 _DIRECT, _AMBIENT = math.pi, 0.2 * math.pi
-_LIGHT_RIGHT_UP = (-0.45, 0.55)
-_ACCENT = (255, 210, 74)
-_GROUND_SRGB = ((74, 78, 87), (35, 38, 44))  # in the middle, and in the corners
 
 
 class Viewer:
@@ -61,7 +58,7 @@ class Viewer:
         scene.add_light_ambient("/ambient", intensity=_AMBIENT)
         scene.set_background_image(_ground(), format="png")
         gui.configure_theme(
-            dark_mode=True, brand_color=_ACCENT, show_logo=False, show_share_button=False
+            dark_mode=True, brand_color=(255, 210, 74), show_logo=False, show_share_button=False
         )
         gui.main_panel.dock_right()
         self._layer = gui.add_dropdown("layer", LAYERS)
@@ -69,8 +66,8 @@ class Viewer:
         self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
         self._fade = gui.add_slider("fade to it", 0.0, 1.0, 0.05, 0.0, visible=False)
         self._light = [
-            gui.add_slider(f"light from {name}", -1.0, 1.0, 0.05, start)
-            for name, start in zip(("right", "above"), _LIGHT_RIGHT_UP, strict=True)
+            gui.add_slider("light from right", -1.0, 1.0, 0.05, -0.45),
+            gui.add_slider("light from above", -1.0, 1.0, 0.05, 0.55),
         ]
         self._about = gui.add_markdown("No surface yet.")
         self._see_whole(1.0)
@@ -127,15 +124,14 @@ class Viewer:
         frame = self._viewer_from_world = frame_of_cameras(cameras, reference)
         points = transform(frame, points_world.detach().cpu().double()).float().numpy()
         scene.add_point_cloud("/points", points, _POINT_COLOR, point_size=0.004)
-        pictures = None if views is None else small_pictures(views)
+        pictures = [None] * len(names) if views is None else small_pictures(views)
         poses = frame @ invert_rigid(cameras.cam_from_world.detach().cpu().double())
-        for view, (name, pose) in enumerate(zip(names, poses, strict=True)):
+        for view, (name, pose, picture) in enumerate(zip(names, poses, pictures, strict=True)):
             width, height = cameras.sizes_px[view].tolist()
             K = cameras.intrinsics[view].detach().cpu().double()
             fov = 2 * math.atan(height / 2 / float(K[1, 1]))
             pose[:3, :3] = normalize(pose[:3, :3], dim=0)
             self._cameras[name] = pose, fov, width / height
-            picture = None if pictures is None else pictures[view]
             if picture is not None:
                 ends = torch.tensor([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]])
                 rays = _SCALE * ends.double() @ K.inverse().mT
@@ -231,15 +227,13 @@ class Viewer:
 
     def _show_frusta(self) -> None:
         """Hide all frusta from within a photograph; otherwise those in front of the surface."""
-        eye, radius = self._cameras[NO_PHOTOGRAPH][0][:3, 3], self._radius
-        away, size = float(eye.norm()), 2 * _SCALE
+        (home, fov, _), size = self._cameras[NO_PHOTOGRAPH], 2 * _SCALE
         for name, frustum in self._frusta.items():
-            place = self._cameras[name][0][:3, 3]
-            along = float(place @ eye) / away
-            aside = float((place - along / away * eye).norm())
-            cone = radius * max(0.0, 1 - along / away)
-            covers = 0 < along < away + size and aside < cone + size
-            frustum.visible = self._chosen.value == NO_PHOTOGRAPH and not covers
+            away = self._cameras[name][0][:3, 3] - home[:3, 3]
+            angle = cosine_similarity(away, home[:3, 2], dim=0).clamp(-1, 1).acos()
+            near = away.norm() < home[:3, 3].norm()
+            covers = near & (angle < fov / 2 + torch.atan(size / away.norm()))
+            frustum.visible = self._chosen.value == NO_PHOTOGRAPH and not bool(covers)
 
     def _paint(self) -> None:
         with self._lock:
@@ -258,7 +252,7 @@ class Viewer:
         fov, up = math.radians(50), torch.tensor([0.0, 0.0, 1.0])
         eye = radius / math.sin(fov / 2) * torch.tensor([[0.94, 0.0, 0.34]])
         pose = invert_rigid(look_at(eye, 0 * up, up))[0].double()
-        self._cameras[NO_PHOTOGRAPH], self._radius = (pose, fov, 1.0), radius
+        self._cameras[NO_PHOTOGRAPH] = pose, fov, 1.0
         _put(self.server.initial_camera, pose, fov)
         self._show_frusta()
 
@@ -277,9 +271,9 @@ def _put(camera: Any, pose: Float[Tensor, "4 4"], fov: float) -> None:  # noqa: 
 
 
 def _ground() -> np.ndarray:
-    """Draw the background of the report."""
+    """Draw the background of the report: darker towards the corners."""
     away = np.hypot(*np.mgrid[-1:1:128j, -1:1:128j])[..., None] / math.sqrt(2)
-    return ((1 - away) * _GROUND_SRGB[0] + away * _GROUND_SRGB[1]).round().astype(np.uint8)
+    return ((1 - away) * (74, 78, 87) + away * (35, 38, 44)).round().astype(np.uint8)
 
 
 def small_pictures(views: Views) -> list[np.ndarray]:
