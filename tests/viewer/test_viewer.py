@@ -135,7 +135,7 @@ def ball():
         normals_world=-vertices,
         albedo=0.5 + 0.4 * vertices,
         confidence=known,
-        expected_error=known,
+        expected_error=known.square(),
     )
 
 
@@ -152,8 +152,11 @@ def test_layers_are_those_that_the_newest_surface_has(viewer, ball):
             assert "rgb(68 1 84), " in viewer._bar.content  # viridis' first colour
     assert len(drawn) == len(names)
     layers_of_numbers = surface_layers(ball)
+    assert layers_of_numbers[0].high_text.endswith("% of the object's size or more")
+    viewer.unit, viewer._layer.value = "mm", "expected error"
+    assert "<span>1 mm or more</span>" in viewer._bar.content
     assert ends == [[layer.low_text, layer.high_text] for layer in layers_of_numbers]
-    assert layers_of_numbers[1].about in viewer._about.content
+    assert layers_of_numbers[0].about in viewer._about.content
     viewer.add_pass("bare", Mesh(vertices_world=ball.vertices_world, faces=ball.faces))
     assert viewer._layer.options == ("lit", "shape", "normals")
     assert viewer._layer.value == "lit"
@@ -184,11 +187,11 @@ def test_the_light_is_where_the_sliders_are_as_seen_from_the_eye(page, client):
     for right, up, direction in [(0, 0, (0, 0, -1)), (0.6, 0, (0.6, 0, -0.8)), (0, 1, (0, -1, 0))]:
         for slider, value in zip(page._light, (right, up), strict=True):
             slider.value = value
-        page._turn_light(client)
+        page._turn_lights()
         np.testing.assert_allclose(lamp.position, direction, atol=1e-9)
     page._light[1].value = 0
     client.camera.wxyz = np.array([0.5**0.5, 0, 0.5**0.5, 0])
-    page._turn_light(client)
+    page._turn_lights()
     np.testing.assert_allclose(lamp.position, (-1, 0, 0), atol=1e-9)
 
 

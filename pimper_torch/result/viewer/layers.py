@@ -13,7 +13,7 @@ from pimper_torch.ground.geometry.rigid import rotate, transform
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
-from pimper_torch.result.report.vertex_layers import VertexLayer, surface_layers
+from pimper_torch.result.report.vertex_layers import VertexLayer, length_unit, surface_layers
 from pimper_torch.result.viz.maps import base_color, carried_normals, normal_colors
 
 LAYERS = ("lit", "shape", "albedo", "normals")
@@ -30,12 +30,13 @@ def layers_of(mesh: Mesh) -> list[str]:
 
 
 def painted(
-    mesh: Mesh, name: str, viewer_from_world: Float[Tensor, "4 4"]
+    mesh: Mesh, name: str, viewer_from_world: Float[Tensor, "4 4"], unit: str | None = None
 ) -> tuple[bytes, VertexLayer | None]:
     """Colour a surface by one of its layers.
 
     Args:
         viewer_from_world: A similarity. x of the viewer points to the reference camera, z up.
+        unit: Of the mesh, if its size is known.
 
     Returns:
         A GLB in the viewer's frame, and the layer if it is one of numbers.
@@ -47,7 +48,9 @@ def painted(
     if name == "normals":
         right_down_ahead = normals[:, [1, 2, 0]] * normals.new_tensor([1.0, -1.0, -1.0])
         colors = linear_from_srgb(normal_colors(right_down_ahead))
-    layer = next((one for one in surface_layers(mesh) if one.title == name), None)
+    layer = next(
+        (one for one in surface_layers(mesh, length_unit(mesh, unit)) if one.title == name), None
+    )
     if layer is not None:
         values = mesh.confidence if layer.attribute == "_support" else mesh.expected_error
         assert values is not None

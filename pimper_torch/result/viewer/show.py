@@ -40,6 +40,8 @@ def add_folder(viewer: Viewer, path: Path | str, photographs: Path | str | None 
             viewer.add_cameras(names, estimate.cameras, points, place)
         viewer.add_pass(RESULT, estimate.mesh)
     else:
+        scale = result.summary.get("scale")
+        viewer.unit = str(scale["unit"]) if isinstance(scale, dict) else None
         add_found(viewer, result)
 
 

@@ -40,7 +40,10 @@ class Viewer:
 
     Attributes:
         server: viser's own, for whatever else is to be shown.
+        unit: Of lengths, where the size is known; otherwise they are shares of the object's size.
     """
+
+    unit: str | None = None
 
     def __init__(self, host: str = HOST, port: int = PORT) -> None:
         self.server = open_server(host, port)
@@ -78,7 +81,7 @@ class Viewer:
         )
         self._fade.on_update(lambda _: self._lay_photograph())
         for slider in self._light:
-            slider.on_update(lambda _: [self._turn_light(one) for one in self._clients()])
+            slider.on_update(lambda _: self._turn_lights())
         self.server.on_client_connect(self._welcome)
 
     def __enter__(self) -> "Viewer":
@@ -188,18 +191,15 @@ class Viewer:
         self._fade.visible = name in self._panes
         self._show_frusta()
         self._lay_photograph()
-        for client in self._clients():
+        for client in self.server.get_clients().values():
             self._stand(client)
-
-    def _clients(self) -> Sequence[Any]:
-        return list(self.server.get_clients().values())
 
     def _welcome(self, client: Any) -> None:  # noqa: ANN401 - viser's
         """Show a new page what the others see, in a light that follows its eye."""
         client.scene.add_light_directional("/light", intensity=_DIRECT)
-        client.camera.on_update(lambda _: self._turn_light(client))
+        client.camera.on_update(lambda _: self._turn_lights())
         self._stand(client)
-        self._turn_light(client)
+        self._turn_lights()
 
     def _stand(self, client: Any) -> None:  # noqa: ANN401 - viser's
         """Move a page to the chosen camera, whose whole picture fits into its window."""
@@ -208,14 +208,15 @@ class Viewer:
         with client.atomic():
             _put(client.camera, pose, 2 * math.atan(half))
 
-    def _turn_light(self, client: Any) -> None:  # noqa: ANN401 - viser's
-        """Let a page's light come from where the sliders are, as seen from its eye."""
+    def _turn_lights(self) -> None:
+        """Let the light of every page come from where the sliders are, as seen from its eye."""
         from viser.transforms import SO3
 
         right, up = (slider.value for slider in self._light)
         towards = np.array([right, -up, -math.sqrt(max(0.0, 1 - right**2 - up**2))])
-        lamp = client.scene.get_handle_by_name("/light")
-        lamp.position = SO3(client.camera.wxyz).apply(towards)
+        for client in self.server.get_clients().values():
+            if lamp := client.scene.get_handle_by_name("/light"):
+                lamp.position = SO3(client.camera.wxyz).apply(towards)
 
     def _lay_photograph(self) -> None:
         """Lay the chosen photograph over the surface, as opaque as the slider is."""
@@ -240,7 +241,7 @@ class Viewer:
             if self._newest is None or self._viewer_from_world is None:
                 return
             name, mesh = self._newest
-            glb, layer = painted(mesh, self._layer.value, self._viewer_from_world)
+            glb, layer = painted(mesh, self._layer.value, self._viewer_from_world, self.unit)
             self.server.scene.add_glb(self._surfaces[-1], glb)
             about = "" if layer is None else f" {layer.about}."
             self._about.content = f"**{name}**, {len(mesh.faces):,} faces.{about}"
@@ -250,7 +251,7 @@ class Viewer:
     def _see_whole(self, radius: float) -> None:
         """Let pages without a photograph look down at all within a radius of the middle."""
         fov, up = math.radians(50), torch.tensor([0.0, 0.0, 1.0])
-        eye = radius / math.sin(fov / 2) * torch.tensor([[0.94, 0.0, 0.34]])
+        eye = 1.08 * radius / math.sin(fov / 2) * torch.tensor([[0.94, 0.0, 0.34]])
         pose = invert_rigid(look_at(eye, 0 * up, up))[0].double()
         self._cameras[NO_PHOTOGRAPH] = pose, fov, 1.0
         _put(self.server.initial_camera, pose, fov)
