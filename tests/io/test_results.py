@@ -27,6 +27,7 @@ from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.records import Mesh
 from pimper_torch.result.asset.finish import written_channels
 from pimper_torch.result.asset.mesh_files import MeshFiles
+from pimper_torch.result.report.vertex_layers import surface_layers
 from pimper_torch.result.viz.maps import albedo_scale
 from pimper_torch.runtime.errors import OutputError
 from pimper_torch.runtime.progress import listening
@@ -222,8 +223,13 @@ def test_the_page_shows_the_surface_and_its_layers(reconstruction, tmp_path):
     assert data["layers"][0]["high"] == pytest.approx(0.002, rel=0.1)
     assert len(data["views"]) == 3
     assert all("prediction" in view and "light" in view for view in data["views"])
+    # `pimper view` reads the file, and has the same colours.
+    layer, _ = surface_layers(read_mesh(tmp_path / "cup" / "mesh.ply"))
+    assert data["layers"][0]["high"] == layer.high
+    lights = json.loads((tmp_path / "cup" / "lights.json").read_text())["views"]
+    assert [view.get("environment") for view in data["views"]] == [one["light"] for one in lights]
     assert data["summary"]["warnings"] == ["Two photographs are blurred."]
-    assert "zeta" in json.dumps(data["settings"])
+    assert "zeta" in data["settings"]
     asset = base64.b64decode(re.search(r'id="asset">(.*?)</script>', page)[1])
     assert asset == (tmp_path / "cup" / "asset.glb").read_bytes()
 

@@ -140,6 +140,7 @@ def ball():
 
 
 def test_layers_are_those_that_the_newest_surface_has(viewer, ball):
+    ball = ball.replace(expected_error=ball.expected_error**2)  # unlike its confidence
     viewer.add_pass("ball", ball)
     names = ("lit", "shape", "albedo", "normals", "expected error", "support")
     assert viewer._layer.options == names

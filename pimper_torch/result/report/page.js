@@ -18,7 +18,7 @@
   const vector = (values) => new THREE.Vector3(...values);
 
   // What stands between backticks is code.
-  const prose = (text) => text.split("`").map((part, at) => at % 2 ? make("code", { text: part }) : part);
+  const prose = (text) => text.split(/`([^`]+)`/).map((part, at) => at % 2 ? make("code", { text: part }) : part);
   const thousands = (number) => number.toLocaleString("en");
   const digits = (number, count) => String(Number(number.toPrecision(count)));
 
@@ -122,7 +122,8 @@
   // ---- Tables ------------------------------------------------------------------------------
 
   const cell = (value, kind) => {
-    if (kind !== "bar") return make("td", { class: kind }, ...prose(String(value)));
+    if (kind === "text") return make("td", { class: kind }, ...prose(value));
+    if (kind !== "bar") return make("td", { class: kind, text: value });
     const bar = make("i");
     bar.style.width = `${100 * value}%`;
     return make("td", { class: kind }, bar);

@@ -53,8 +53,15 @@ def surface_layers(mesh: Mesh, unit: LengthUnit | None = None) -> list[VertexLay
         layers.append(length_layer("_expected_error", "expected error", about, error, unit))
     if mesh.confidence is not None:
         about = "Confidence of the normals: the number of lights that determine them, and how well"
-        texts = {"low_text": "none", "high_text": "full"}
-        layers.append(VertexLayer(attribute="_support", title="support", about=about, **texts))
+        layers.append(
+            VertexLayer(
+                attribute="_support",
+                title="support",
+                about=about,
+                low_text="none",
+                high_text="full",
+            )
+        )
     return layers
 
 
