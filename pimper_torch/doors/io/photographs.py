@@ -22,6 +22,7 @@ from pimper_torch.doors.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.doors.io.responses import tell_cautions
 from pimper_torch.ground.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.ground.shapes import Map, Mask, Masks
+from pimper_torch.method.silhouettes.given import around_and_inside
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.file_names import match_files
@@ -235,16 +236,7 @@ def _read_masks(
 
 def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: Path | str | None) -> bool:
     """Return whether masks show the object dark, by all of them together; a warning says so."""
-    if not opacities:
-        return False
-    border, centre = [], []
-    for (opacity,) in each(opacities):
-        high, wide = opacity.shape
-        border += [opacity[0].mean(), opacity[-1].mean()]
-        border += [opacity[:, 0].mean(), opacity[:, -1].mean()]
-        inner = opacity[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
-        centre.append(inner.mean())
-    around, inside = float(torch.stack(border).mean()), float(torch.stack(centre).mean())
+    around, inside = around_and_inside(opacities) if opacities else (0.0, 0.0)
     # An object that fills its photographs is bright in the centre, too.
     dark = inside < 0.75 < around
     if dark:

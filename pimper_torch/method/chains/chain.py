@@ -170,33 +170,17 @@ class Chain(Stage):
         views: Views | SparseScene,
         sparse_model: Path | str | None,
         mesh: Mesh | None = None,
+        *,
+        checked: bool = False,
     ) -> SparseScene:
         """Return photographs with their cameras: those that come with them, or else find them.
 
         Views that cannot be used are left out; priors become those of undistorted views. A scene
         without observed points gets some, unless a mesh stands in for them. Masks that belong to
         other photographs, or are turned or inverted, are read as cameras and points say, and
-        cameras found anew with them.
+        cameras are found anew with them, unless they are ``checked``.
         """
-        scene = self._placed(run, views, sparse_model, mesh)
-        config = getattr(self.silhouettes, "config", None)
-        if getattr(config, "object", "auto") != "everything":
-            given = views if isinstance(views, Views) else views.views
-            reading = right_reading(scene, given)
-            if reading is not AS_THEY_ARE:
-                read = reading.of(given)
-                views = read if isinstance(views, Views) else views.replace(views=read)
-                scene = self._placed(run, views, sparse_model, mesh)
-        self._watched(scene)
-        return scene
-
-    def _placed(
-        self,
-        run: Running,
-        views: Views | SparseScene,
-        sparse_model: Path | str | None,
-        mesh: Mesh | None,
-    ) -> SparseScene:
+        asked = views
         if isinstance(views, Views):
             views = run(self.reconstruct, views, sparse_model)
         elif sparse_model is not None:
@@ -210,7 +194,17 @@ class Chain(Stage):
             views = self.reconstruct.with_points(views)
         few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
         scene = with_poses(sound(run(depth_points, views) if few else views))
-        return with_undistorted_priors(scene)
+        scene = with_undistorted_priors(scene)
+        config = getattr(self.silhouettes, "config", None)
+        if not checked and getattr(config, "object", "auto") != "everything":
+            given = asked if isinstance(asked, Views) else asked.views
+            reading = right_reading(scene, given)
+            if reading is not AS_THEY_ARE:
+                read = reading.of(given)
+                asked = read if isinstance(asked, Views) else asked.replace(views=read)
+                return self.placed(run, asked, sparse_model, mesh, checked=True)
+        self._watched(scene)
+        return scene
 
     def _watched(self, found: "SparseScene | Step") -> None:
         if self.watch is not None:

@@ -76,7 +76,7 @@ class FindSilhouettes(Stage):
 
     def _agreeing(self, silhouettes: Silhouettes, scene: SparseScene) -> Silhouettes:
         """Replace masks that clearly contradict the others by what the hull of these shows."""
-        doubted = contradictory(silhouettes, scene.cameras)
+        doubted = contradictory(scene).to(silhouettes.reliable.device)
         if not bool(doubted.any()):
             return silhouettes
         if torch.equal(doubted, silhouettes.reliable):

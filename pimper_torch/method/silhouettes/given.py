@@ -15,22 +15,23 @@ from operator import itemgetter
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d
+from torch.nn.functional import grid_sample
 
 from pimper_torch.ground.geometry.opencv import shrunk, signed_distance
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, scale_intrinsics
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.supporting_plane import well_tracked
 from pimper_torch.ground.geometry.visual_hull import box_round
-from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, ViewMask
+from pimper_torch.ground.shapes import Map, Maps, Mask, ViewMask
 from pimper_torch.method.silhouettes.cues import points_at, soft_masks_of
 from pimper_torch.records import Cameras, SilhouettePrior, Silhouettes, SparseScene, Views
 from pimper_torch.runtime.errors import InputError, caution
-from pimper_torch.runtime.mapped import by_view, zeros
+from pimper_torch.runtime.mapped import by_view, each, zeros
 from pimper_torch.runtime.parallel import side_by_side
 
-# Longer side of the masks that are compared, and how many of the points: choices.
-_SMALL_PX, _POINTS = 160, 4000
+# Longer side of the masks that are compared, how many of the points, and places on the rays through
+# their pixels: choices.
+_SMALL_PX, _POINTS, _PLACES = 320, 4000, 64
 _FEWEST = 50  # pairs of points and views; fewer are no evidence
 # Of what the files contradict, what another reading may at most; what it may at most in any case;
 # what is nothing to mend. Mug, jar and potatoes, 4 to 16 views of 320x240, cameras given and found,
@@ -38,9 +39,8 @@ _FEWEST = 50  # pairs of points and views; fewer are no evidence
 # 0.005 and more, but for masks that are nearly alike.
 _CLEARLY, _MOST, _LEAST = 1 / 3, 0.05, 0.0025
 _REFUSED = 0.5  # of the points in the masks of the median view: more than half; a choice
-# Masks that may be exchanged, readings whose pixels are looked at, views and pixels of these:
-# choices.
-_SUSPECTS, _TRIED, _VIEWS, _FEW_PIXELS = 4, 4, 40, 40
+# Masks that may be exchanged, readings whose pixels are looked at, and views of these: choices.
+_SUSPECTS, _TRIED, _VIEWS = 4, 4, 40
 
 _TURNS = {
     2: "mirrored",
@@ -169,6 +169,17 @@ def right_reading(scene: SparseScene, given: Views) -> Reading:
     return AS_THEY_ARE
 
 
+def around_and_inside(maps: Sequence[Map]) -> tuple[float, float]:
+    """Return the fractions above zero along the borders of maps, and in their middle halves."""
+    around, inside = [], []
+    for (one,) in each(maps):
+        high, wide = one.shape
+        around += [side.gt(0).float().mean() for side in (one[0], one[-1], one[:, 0], one[:, -1])]
+        middle = one[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
+        inside.append(middle.gt(0).float().mean())
+    return float(torch.stack(around).mean()), float(torch.stack(inside).mean())
+
+
 def _share(pairs: Int[Tensor, "view 2"], reading: Reading) -> float:
     """Return the fraction of pairs that contradict; 1 where hardly any point is in the masks.
 
@@ -199,51 +210,38 @@ class _Evidence:
 
     @classmethod
     def of(cls, scene: SparseScene) -> "_Evidence | None":
-        """Gather it; ``None`` where fewer than three masks show anything, or points are few."""
+        """Gather it; ``None`` where fewer than three masks show anything."""
         views, cameras = scene.views, scene.cameras.to("cpu", torch.float32)
         factor = min(1.0, _SMALL_PX / max(views.images.shape[-2:]))
         sizes = (factor * cameras.sizes_px).round().long().clamp_min(1)
-        soft = soft_masks_of(views, sizes) if views.masks is None else None
-        masks = views.masks if soft is None else soft.masks
         borders = {}
-        for view, (wide, high) in enumerate(sizes.tolist()):
-            if masks is None or (soft is not None and not bool(soft.given[view])):
-                continue
-            width, height = (wide, high) if soft is not None else views.sizes_px[view].tolist()
-            whole = masks[view, :height, :width].detach().cpu().float()
-            mask = shrunk(whole[None], wide, high)[0] > 0.5
-            if bool(mask.any()):
-                borders[view] = signed_distance(mask)
-        chosen, tracked = list(borders), well_tracked(scene).cpu().nonzero()[:, 0]
-        if len(chosen) < 3 or len(tracked) < _FEWEST:
+        if views.masks is not None:
+            sized = zip(views.masks, views.sizes_px.tolist(), sizes.tolist(), strict=True)
+            for name, (mask, (width, height), size) in zip(views.names, sized, strict=True):
+                # A single pixel is a mask, too.
+                small = shrunk(mask[None, :height, :width].cpu().float(), *size)[0] > 0
+                if bool(small.any()):
+                    borders[name] = signed_distance(small)
+        elif soft := soft_masks_of(views, sizes):
+            for view in (soft.given & soft.masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist():
+                wide, high = sizes[view].tolist()
+                borders[views.names[view]] = signed_distance(soft.masks[view, :high, :wide])
+        if len(borders) < 3:
             return None
-        some = tracked[:: math.ceil(len(tracked) / _POINTS)]
-        cameras = cameras.take(chosen)
-        cameras = cameras.replace(
-            intrinsics=scale_intrinsics(cameras.intrinsics, factor, factor), sizes_px=sizes[chosen]
-        )
+        chosen, tracked = list(map(views.names.index, borders)), well_tracked(scene).cpu()
+        some = tracked.nonzero()[:, 0][:: math.ceil((int(tracked.sum()) + 1) / _POINTS)]
+        intrinsics = scale_intrinsics(cameras.intrinsics, factor, factor)
+        cameras = cameras.replace(intrinsics=intrinsics, sizes_px=sizes).take(chosen)
         points = scene.points_world.detach().cpu().float()[some]
         pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
-        framed = ((pixels > 0) & (pixels < cameras.sizes_px[:, None])).all(dim=-1) & (depth > 0)
+        shown = ((pixels > 0) & (pixels < cameras.sizes_px[:, None])).all(dim=-1) & (depth > 0)
         return cls(
-            borders={views.names[view]: border for view, border in borders.items()},
+            borders=borders,
             cameras=cameras,
-            pixels=torch.where(framed[..., None], pixels, 0).long(),
-            shown=framed,
-            seen=scene.observed.cpu()[some].mT[chosen] & framed,
+            pixels=torch.where(shown[..., None], pixels, 0).long(),
+            shown=shown,
+            seen=scene.observed.cpu()[some].mT[chosen] & shown,
         )
-
-    @property
-    def dark(self) -> bool:
-        """Whether masks leave out the middle of the photographs, but not what is around it."""
-        rims, middles = [], []
-        for one in self.borders.values():
-            high, wide = one.shape
-            rims.append(torch.cat([one[0], one[-1], one[:, 0], one[:, -1]]))
-            middles.append(one[high // 4 : -(high // 4), wide // 4 : -(wide // 4)].flatten())
-        around, inside = ((torch.cat(some) > 0).float().mean() for some in (rims, middles))
-        # An object that fills its photographs is in the middle, too.
-        return bool(inside < 0.75 < around)
 
     def readings(self, views: Views, doubted: Sequence[str], *, ordered: bool) -> Iterator[Reading]:
         """List what files may show in place of the photographs' own masks.
@@ -253,7 +251,9 @@ class _Evidence:
             ordered: Whether photographs may have masks of other ones.
         """
         names = views.names
-        if self.dark:
+        around, inside = around_and_inside(list(self.borders.values()))
+        # An object that fills its photographs is in their middle, too.
+        if inside < 0.75 < around:
             yield Reading(said="inverted", inverted=True)
         square = bool((views.sizes_px[:, 0] == views.sizes_px[:, 1]).all())
         for turn, said in _TURNS.items():
@@ -305,19 +305,14 @@ class _Evidence:
         views, maps = self.read(reading)
         involved = torch.zeros(len(views))
         some = torch.arange(0, len(views), math.ceil(len(views) / _VIEWS))
-        masks, cameras = maps[some] > 0, self.cameras.take([views[one] for one in some.tolist()])
-        every = torch.ones(len(some), dtype=torch.bool)
-        box = box_round(Silhouettes(inside=masks.float(), reliable=every, source="masks"), cameras)
-        if box is None or not bool(masks.flatten(1).any(dim=1).all()):
+        found = _denied(maps[some], self.cameras.take([views[one] for one in some.tolist()]), 40)
+        if found is None:
             return 1.0, involved
-        own, with_others = _in_conflict(*_denied(masks, cameras, box, _FEW_PIXELS), every)
+        own, with_others = _in_conflict(*found, torch.ones(len(some), dtype=torch.bool))
         involved[some] = own + with_others.sum(dim=0)
         return float(own.mean()), involved
 
 
-# Pixels of each silhouette that are looked at and places on their rays; longer side of the pictures
-# in which that is done: choices.
-_PIXELS, _PLACES, _SIZE_PX = 100, 64, 320
 # Fraction of a silhouette's pixels in conflict, or of the median other's in conflict with it: 0.00
 # of true masks (potatoes and mug along an arc, jar and spot on a turntable, balls by hand, 8 to 12
 # views of 240x180 and 320x240). Where those of one or two views are wrong, theirs is 0.30 and more
@@ -355,56 +350,59 @@ def _in_conflict(
     return found[:, 0], found[:, 1:]
 
 
-def contradictory(silhouettes: Silhouettes, cameras: Cameras) -> ViewMask:
-    """Find the reliable views whose silhouettes clearly contradict those of the others.
-
-    Args:
-        silhouettes: At least one pixel in every reliable view.
+def contradictory(scene: SparseScene) -> ViewMask:
+    """Find the views whose masks clearly contradict those of the others.
 
     Returns:
-        All of them where fewer than three, or no more than half, would agree.
+        All that show anything where fewer than three, or no more than half, would agree.
     """
-    views = silhouettes.reliable.nonzero()[:, 0].cpu()
-    box = box_round(silhouettes, cameras)
-    if box is None:
-        return torch.zeros_like(silhouettes.reliable)
-    masks = silhouettes.take(views.tolist()).masks
-    denied, seen = _denied(masks, cameras.take(views.tolist()), box)
+    doubted = torch.zeros(scene.views.num_views, dtype=torch.bool)
+    evidence = _Evidence.of(scene)
+    if evidence is None:
+        return doubted
+    _, maps = evidence.read(AS_THEY_ARE)
+    found = _denied(maps, evidence.cameras, 100)
+    if found is None:
+        return doubted
+    views = torch.tensor(list(map(scene.views.names.index, evidence.borders)))
     left = torch.ones(len(views), dtype=torch.bool)
     while left.sum() >= max(3, len(views) // 2 + 1):
-        own, with_others = _in_conflict(denied, seen, left)
+        own, with_others = _in_conflict(*found, left)
         mine = torch.eye(len(left), dtype=torch.bool) | ~left[:, None]
         between = with_others.masked_fill(mine, torch.nan).nanmedian(dim=0).values
         clear = (torch.maximum(own, between) > _IN_CONFLICT) & left
         if not bool(clear.any()):
-            doubted = torch.zeros_like(silhouettes.reliable)
             doubted[views[~left]] = True
             return doubted
         involved = (own + with_others.sum(dim=0)).masked_fill(~clear, -1)
         left[involved.argmax()] = False
-    return silhouettes.reliable.clone()
+    doubted[views] = True
+    return doubted
 
 
 def _denied(
-    masks: Masks, cameras: Cameras, box_world: Float[Tensor, "2 3"], count: int = _PIXELS
-) -> tuple[Bool[Tensor, "view other pixel place"], Bool[Tensor, "view other pixel place"]]:
-    """Find which views deny, and see, places on rays through pixels of each smaller silhouette."""
-    by = max(1, math.ceil(max(masks.shape[1:]) / _SIZE_PX))
-    small = by_view(
-        lambda mask: max_pool2d(mask[None].float().cpu(), by, ceil_mode=True)[0] > 0, masks
-    )
-    cameras = cameras.to("cpu").to(torch.float32)
-    cameras = cameras.replace(
-        intrinsics=scale_intrinsics(cameras.intrinsics, 1 / by, 1 / by),
-        sizes_px=-(-cameras.sizes_px // by),
-    )
-    borders = torch.stack(list(side_by_side(signed_distance, list(small), tracked=False)))
+    borders: Maps, cameras: Cameras, count: int
+) -> tuple[Bool[Tensor, "view other pixel place"], Bool[Tensor, "view other pixel place"]] | None:
+    """Find which views deny, and see, places on rays through pixels of each mask.
+
+    Args:
+        borders: Signed distances to the masks.
+        count: Pixels of each.
+
+    Returns:
+        ``None`` where a mask shows nothing.
+    """
+    masks, views = borders > 0, range(len(borders))
+    shown = Silhouettes(inside=masks.float(), reliable=masks.flatten(1).any(dim=1), source="masks")
+    box = box_round(shown, cameras)
+    if box is None or not bool(shown.reliable.all()):
+        return None
 
     def followed(view: int) -> tuple[Tensor, Tensor]:
-        places, step = _places(small[view], cameras.take([view]), box_world.cpu().float(), count)
+        places, step = _places(masks[view], cameras.take([view]), box, count)
         pixels, depth = project(places, cameras.cam_from_world, cameras.intrinsics)
-        pixels = pixels.reshape(len(small), -1, _PLACES, 2)
-        depth = depth.reshape(len(small), -1, _PLACES)
+        pixels = pixels.reshape(len(masks), -1, _PLACES, 2)
+        depth = depth.reshape(len(masks), -1, _PLACES)
         size = cameras.sizes_px[:, None, None]
         seen = ((pixels > 0) & (pixels < size)).all(dim=-1) & (depth > 0)
         seen[view] = False
@@ -416,9 +414,8 @@ def _denied(
         # Masks are drawn by hand.
         return seen & (value < -reach - 0.01 * max(height, width)), seen
 
-    shape = len(small), len(small), count, _PLACES
-    denied, seen = zeros(shape, torch.bool), zeros(shape, torch.bool)
-    for view, found in enumerate(side_by_side(followed, range(len(small)), tracked=False)):
+    denied, seen = (zeros((len(views), len(views), count, _PLACES), torch.bool) for _ in range(2))
+    for view, found in enumerate(side_by_side(followed, views, tracked=False)):
         denied[view], seen[view] = found
     return denied, seen
 
