@@ -235,9 +235,11 @@ def test_folders_inside_hold_the_photographs_of_a_pose_each(tmp_path, pixels):
     assert views.poses.tolist() == [0, 0, 1, 1, 2, 2]
     for pose in (1, 2, 10):
         save(tmp_path / "shared" / f"pose_{pose}.png", pixels[..., 0])
-    with pytest.warns(PimperWarning, match="3 poses"):
-        shared = load_views(tmp_path / "photos", masks=tmp_path / "shared")
-    assert torch.equal(shared.masks, views.masks)
+        save(tmp_path / "inside" / f"pose_{pose}" / "all.png", pixels[..., 0])
+    for folder in ("shared", "inside"):
+        with pytest.warns(PimperWarning, match="3 poses"):
+            one_a_pose = load_views(tmp_path / "photos", masks=tmp_path / folder)
+        assert torch.equal(one_a_pose.masks, views.masks)
 
 
 @pytest.mark.parametrize("beside", ["masks", "Mask", "silhouettes", "normals", "depth"])

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -25,7 +25,7 @@ from pimper_torch.ground.shapes import Map, Mask, Masks
 from pimper_torch.method.silhouettes.given import around_and_inside
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, caution, some
-from pimper_torch.runtime.file_names import match_files
+from pimper_torch.runtime.file_names import match_poses
 from pimper_torch.runtime.mapped import drop_pages, each, parts, zeros
 
 _LIT_FRACTION = 1e-3  # more than hot pixels
@@ -171,33 +171,24 @@ def shrunk_focals(
 
 
 def _match_masks(names: Sequence[str], folder: Path) -> list[Path]:
-    """Find the mask of each photograph by its stem, its whole name (COLMAP), or with ``_mask``.
-
-    Those not found so are looked for as another program may have written the name.
-    """
-    by_stem = {image_name(path.with_suffix(""), folder): path for path in list_images(folder)}
-    found = [_mask_of(name, by_stem) for name in names]
+    """Find the mask of each photograph, or of its pose, by name, ``_mask`` appended or not."""
+    masks = list_images(folder)
+    exact = {image_name(path.with_suffix(""), folder): path for path in masks}
+    found = [exact.get(name.rpartition(".")[0]) or exact.get(name) for name in names]
     if lost := [index for index, mask in enumerate(found) if mask is None]:
-        free = [mask for mask in by_stem.values() if mask not in found]
-        called = [_MASK.sub(r"\1", mask.name) for mask in free]
+        free = [mask for mask in masks if mask not in found]
+        called = [_MASK.sub(r"\1", image_name(mask, folder)) for mask in free]
         wanted = [names[index] for index in lost]
-        places = match_files(wanted, called, where=str(folder), what="mask")
+        places = match_poses(wanted, called, where=str(folder), what="mask")
         for index, at in zip(lost, places, strict=True):
             found[index] = None if at is None else free[at]
     if missing := [name for name, mask in zip(names, found, strict=True) if mask is None]:
         raise InputError(
             f"{folder}: no mask for {some(missing)}; needed: one for each photograph, of the same "
             f"name (such as {missing[0].rpartition('.')[0]}.png). There are "
-            f"{some([path.name for path in by_stem.values()])}."
+            f"{some([path.name for path in masks])}."
         )
     return [mask for mask in found if mask is not None]
-
-
-def _mask_of(name: str, by_stem: Mapping[str, Path]) -> Path | None:
-    """Find a photograph's mask by exact names; one may be for all photographs of a pose."""
-    stem, folder = name.rpartition(".")[0], name.rpartition("/")[0]
-    names = (stem, name, f"{stem}_mask", folder)
-    return next((by_stem[one] for one in names if one in by_stem), None)
 
 
 def read_mask(path: Path | str, max_size_px: int = 0) -> Mask:

@@ -11,7 +11,7 @@ from pimper_torch.doors.camera_files.read_cameras import read_cameras
 from pimper_torch.doors.camera_files.transforms_json import read_cloud
 from pimper_torch.ground.geometry.lens_models import rescale_lens
 from pimper_torch.method.sfm import colmap, lenses
-from pimper_torch.method.sfm.model import SparseModel, match_names
+from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.method.sfm.model_files import largest_model
 from pimper_torch.records import Lens, Views
 from pimper_torch.runtime.errors import InputError, ReconstructionError, caution, some
@@ -39,7 +39,15 @@ def existing_model(views: Views, path: Path) -> SparseModel:
     path = largest_model(path)
     where = place(path)
     read = _model_of_file(views, path) if path.is_file() else colmap.read_model(path)
-    model = match_names(read, views.names, where, views.folder)
+    found = match_poses(views.names, read.names, folder=views.folder, where=where, what="image")
+    own = {name: at for name, at in zip(views.names, found, strict=True) if at is not None}
+    if not own:
+        raise InputError(
+            f"{where} has none of the photographs. Its images are {some(read.names)}; the "
+            f"photographs are {some(views.names)}. Rename the photographs to match, or leave the "
+            "model out to run structure from motion."
+        )
+    model = select_views(read, list(own.values())).replace(names=tuple(own))
     if model.num_views < 3:
         raise ReconstructionError(
             f"{where} holds {model.num_views} of {views.num_views} "

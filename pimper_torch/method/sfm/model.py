@@ -10,8 +10,6 @@ from torch import Tensor
 from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Lens, Record, pairs_table
 from pimper_torch.records.scene import no_maps, no_series
-from pimper_torch.runtime.errors import InputError, some
-from pimper_torch.runtime.file_names import match_poses
 from pimper_torch.runtime.ledger import leave_out
 
 
@@ -137,27 +135,3 @@ def longest_tracks(model: SparseModel, most: int) -> SparseModel:
     wanted = torch.zeros(len(model.points_world), dtype=torch.bool)
     wanted[model.observation_point[order[rank < most]]] = True
     return model.without(~wanted[model.observation_point])
-
-
-def match_names(
-    model: SparseModel, names: Sequence[str], where: str, photographs: str = ""
-) -> SparseModel:
-    """Find the photographs in a model by file name and put it in their order.
-
-    A model's image may lie in a subfolder, and its name may have been rewritten by another program:
-    see :func:`~pimper_torch.runtime.file_names.match_poses`. Photographs of a pose share its image.
-
-    Raises:
-        InputError: No photograph is in the model, or a name may be any of several.
-    """
-    found = match_poses(names, model.names, folder=photographs, where=where, what="image")
-    chosen = [index for index in found if index is not None]
-    if not chosen:
-        raise InputError(
-            f"{where} has none of the photographs. Its images are "
-            f"{some(model.names)}; the photographs are {some(names)}. Rename the "
-            "photographs to match, or leave the model out to run structure from motion."
-        )
-    return select_views(model, chosen).replace(
-        names=tuple(name for name, index in zip(names, found, strict=True) if index is not None)
-    )
