@@ -4,9 +4,8 @@ import shutil
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "docs" / "extensions"))
-sys.path.insert(0, str(ROOT / "bench"))
+sys.path.insert(0, str(Path(__file__).parent / "extensions"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 
 from sphinx.application import Sphinx
 
@@ -28,7 +27,8 @@ extensions = [
 exclude_patterns = ["extensions", "static"]
 
 # Notebooks are pages, with their stored outputs. Sphinx reads only what is in this folder.
-shutil.copytree(ROOT / "notebooks", ROOT / "docs" / "notebooks", dirs_exist_ok=True)
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+shutil.copytree(NOTEBOOKS, Path(__file__).parent / "notebooks", dirs_exist_ok=True)
 nb_execution_mode = "off"
 nb_merge_streams = True
 
