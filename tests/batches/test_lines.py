@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 
 import pytest
 
@@ -81,3 +82,27 @@ def test_the_page_rounds_figures_and_has_each_reason_once(tmp_path):
     assert "var(--bad)" in page  # the report's style
     (cup, *_) = csv.DictReader((tmp_path / "batch.csv").open(newline=""))
     assert (cup["seconds"], cup["peak_memory_mb"]) == ("71.2", "1245.8")
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1200])
+def test_the_page_is_as_wide_as_the_window(tmp_path, width):
+    """Long names and messages without spaces wrap."""
+    sync_api = pytest.importorskip("playwright.sync_api")
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+    name = 60 * "name"
+    outcomes = [
+        Outcome(name=name, status="failed", message=f"{60 * 'path/'}: it is so."),
+        Outcome(name="cup", status="lost", message="killed."),
+    ]
+    write_table(outcomes, tmp_path, {name: "photos", "cup": "cups"})
+    with sync_api.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": width, "height": 800})
+        page.goto((tmp_path / "batch.html").as_uri())
+        inner = "[...document.querySelectorAll('.scroll')].map((one) => one.scrollWidth)"
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert all(one <= width for one in page.evaluate(inner))
+        assert page.locator("#objects tr:visible").count() == (2 if width < 900 else 3)
+        browser.close()
