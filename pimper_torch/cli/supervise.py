@@ -1,9 +1,9 @@
 """The console's ``pimper``: a light process that watches the one that does the work.
 
 What kills the work, as a system without memory does, leaves the watcher, which says so. It passes
-on signals to stop, and kills work that has not ended a few seconds later, as a long call of a
-library does not hear them; a second Ctrl-C kills it at once. Where processes cannot be forked, as
-on Windows, there is one process alone.
+on signals to stop, which a long call of a library does not hear: work that has not ended a few
+seconds after SIGTERM or SIGHUP is killed, and so it is at once by a second Ctrl-C. Where processes
+cannot be forked, as on Windows, there is one process alone.
 """
 
 import ctypes
@@ -24,7 +24,7 @@ _SHRINK = (
     "told before the surface takes too much."
 )
 _GOES_ON = "No result was written; the same command goes on from what stages finished."
-# A choice: with it every command ends within five seconds.
+# A choice: with it every command ends within five seconds of SIGTERM.
 _PATIENCE_SECONDS = 4.0
 
 
@@ -48,10 +48,14 @@ def main() -> int:
         if not first:
             first.append((time.monotonic(), number))
             signal.setitimer(signal.ITIMER_REAL, _PATIENCE_SECONDS)
+        late = number == signal.SIGALRM
         # The first press of Ctrl-C may reach both processes; nobody presses again so fast.
-        again = number == signal.SIGALRM or time.monotonic() - first[0][0] > 0.2
-        with suppress(ProcessLookupError):  # it has just ended
-            os.kill(worker, signal.SIGKILL if again else number)
+        again = late or time.monotonic() - first[0][0] > 0.2
+        with suppress(OSError):  # it has just ended, or nobody reads
+            if late and first[0][1] == signal.SIGINT:
+                os.write(2, b"It ends after this step; a second Ctrl-C ends it at once.\n")
+            else:
+                os.kill(worker, signal.SIGKILL if again else number)
 
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as by nohup
@@ -67,6 +71,7 @@ def main() -> int:
     signal.signal(signal.SIGALRM, heard)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     _, status = os.waitpid(worker, 0)  # signals are heard while this waits
+    signal.setitimer(signal.ITIMER_REAL, 0)
     ended = os.waitstatus_to_exitcode(status)
     if ended >= 0:
         return ended

@@ -169,14 +169,17 @@ def test_a_command_inside_a_library_ends_within_five_seconds_of_a_signal(tmp_pat
     assert not (tmp_path / "out" / "mesh.ply").exists()
 
 
-def test_a_second_press_ends_what_cannot_be_interrupted(tmp_path):
+@pytest.mark.parametrize("late", [False, True])
+def test_a_second_press_ends_what_cannot_be_interrupted(tmp_path, late):
     ran = Ran(tmp_path, at_run(DEAF))
     os.killpg(ran.process.pid, signal.SIGINT)
-    time.sleep(0.5)
+    time.sleep(5 if late else 0.5)
+    assert ran.process.poll() is None
     os.killpg(ran.process.pid, signal.SIGINT)
     returned, _, err = ran.end()
     assert returned == 130
     assert "killed, as it did not end by itself" in err
+    assert ("a second Ctrl-C ends it at once.\n" in err) is late
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others look once a second")
