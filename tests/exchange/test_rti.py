@@ -9,6 +9,7 @@ from pimper_torch.doors.exchange.map_files import with_axes
 from pimper_torch.doors.exchange.rti import write_rti
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.result.viz.maps import view_maps
+from pimper_torch.runtime.errors import InputError
 
 
 @pytest.fixture
@@ -66,3 +67,19 @@ def test_an_object_of_one_material_shines_and_one_of_several_does_not(matte, tmp
     plain = brightest([])
     assert float((brightest([shiny]) - plain).max()) > 0.1
     assert torch.equal(brightest([shiny, shiny]), plain)
+
+
+@pytest.mark.parametrize("value", [None, "rough", float("nan")])
+def test_a_material_that_is_none_is_refused(matte, tmp_path, value):
+    bad = {"metallic": 0.0, "roughness": value, "specular": 1.0}
+    summary = {"relighting": {"materials": [bad]}}
+    with pytest.raises(InputError, match="3 finite numbers as metallic, roughness and specular"):
+        write_rti(matte.replace(summary=summary), tmp_path / "rti")
+
+
+def test_a_grey_surface_gives_grey_pictures(matte, tmp_path):
+    mesh = matte.mesh.replace(albedo=matte.mesh.albedo[:, :1])
+    write_rti(matte.replace(mesh=mesh), tmp_path / "rti")
+    _, stack = read_lp(tmp_path / "rti")
+    assert float(stack.max()) > 0.1
+    assert_close(stack[..., 0], stack[..., 2])

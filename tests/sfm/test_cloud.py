@@ -43,6 +43,22 @@ def test_points_on_one_plane_are_all_in_sight():
     assert bool(in_sight(points, torch.tensor([0.3, 0.2, 5.0]).double()).all())
 
 
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_of_points_at_one_place_some_are_in_sight(count):
+    seen = in_sight(torch.ones(count, 3).double(), torch.tensor([0.0, 0, 5]).double())
+    assert bool(seen.any())
+
+
+def test_of_a_cloud_that_is_found_nowhere_nothing_is_kept(views, bare):
+    dark = views.replace(images=0.01 * torch.ones_like(views.images))
+    with pytest.warns(PimperWarning, match="0 could be triangulated"):
+        found = triangulate(
+            dark, bare.replace(points_world=sphere(50)), ReconstructConfig(threads=1), "The file"
+        )
+    assert len(found.points_world) == 0
+    assert torch.equal(found.cam_from_world, bare.cam_from_world)
+
+
 def test_points_are_found_where_the_photographs_show_them(views, bare):
     found = cloud_tracks(views, bare.replace(points_world=sphere(1500)))
     assert torch.equal(found.cam_from_world, bare.cam_from_world)

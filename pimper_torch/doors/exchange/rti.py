@@ -1,10 +1,12 @@
 """A stack for reflectance transformation imaging (RTI): one viewpoint under many lights."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from PIL import Image
 
+from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.transforms_json import FLIP
 from pimper_torch.doors.exchange.result import WrittenResult
 from pimper_torch.ground.geometry.directions import even_directions
@@ -59,9 +61,13 @@ def write_rti(result: WrittenResult, folder: Path) -> None:
 
 
 def _material(result: WrittenResult) -> Materials | None:
-    found = (result.summary.get("relighting") or {}).get("materials") or []
-    if len(found) != 1:
+    relighting = result.summary.get("relighting")
+    found = relighting.get("materials") if isinstance(relighting, Mapping) else None
+    if not isinstance(found, list) or len(found) != 1:
         return None
-    values = [float(found[0][name]) for name in ("metallic", "roughness", "specular")]
+    file = DataSetPath(Path("summary.json"), "a result of `pimper reconstruct`")
+    (only,) = file.objects(found, "materials")
+    named = [only.get(name) for name in ("metallic", "roughness", "specular")]
+    values = file.numbers(named, 3, "metallic, roughness and specular")
     everywhere = torch.zeros(len(result.mesh.vertices_world), dtype=torch.long)
-    return Materials.of(everywhere, torch.tensor([values]))
+    return Materials.of(everywhere, values[None].float())

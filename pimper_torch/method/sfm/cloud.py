@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from pimper_torch.ground.geometry.projection import project
@@ -63,8 +63,10 @@ def in_sight(points_world: Points, center_world: Float[Tensor, "3"]) -> Bool[Ten
     lengths = np.linalg.norm(rays, axis=1, keepdims=True).clip(1e-12)
     flipped = rays * (2 * _RADIUS * lengths.max() / lengths - 1)
     seen = torch.zeros(len(rays) + 1, dtype=torch.bool)
-    # Joggled: points that lie on one plane have a hull, too.
-    seen[ConvexHull(np.concatenate([flipped, np.zeros((1, 3))]), qhull_options="QJ").vertices] = (
-        True
-    )
+    try:
+        # Joggled: points that lie on one plane have a hull, too.
+        hull = ConvexHull(np.concatenate([flipped, np.zeros((1, 3))]), qhull_options="QJ")
+        seen[torch.from_numpy(hull.vertices).long()] = True
+    except QhullError:  # of a few points, or of one place, none hides another
+        seen[:] = True
     return seen[:-1]

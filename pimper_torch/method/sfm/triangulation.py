@@ -53,6 +53,9 @@ def triangulate(
         Poses and lenses bit for bit as given. With the points as they were where no more are
         found, which a :class:`~pimper_torch.runtime.errors.PimperWarning` says.
     """
+    cloud = given.points_world
+    if len(cloud) and not len(given.observation_point):
+        given = given.replace(points_world=cloud[:0])
     if features.too_small(views):
         _warn_of_no_points(0, where)
         return given
@@ -65,18 +68,17 @@ def triangulate(
             enter_room(leave_out_room(space.database, settings))
         verified = matching.verified_pairs(space)
         require_agreement(given, verified, settings.max_error_px, where)
-        offset = local_origin(given.cam_from_world, given.points_world)
-        local = given.replace(
-            cam_from_world=to_local(given.cam_from_world, offset),
-            points_world=given.points_world - given.points_world.new_tensor(offset),
-        )
+        offset = local_origin(given.cam_from_world, cloud)
+        local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
         _match_along_lines(space, local, verified, settings)
         found = local.with_points(_triangulated(space, local, settings.seed))
     release_memory()
-    cloud = 0
-    if len(given.points_world) and not len(given.observation_point):
-        of_cloud = cloud_tracks(views, local)
-        cloud, found = len(of_cloud.points_world), found.joined(of_cloud)
+    own = ""
+    if len(cloud) > len(given.points_world):
+        shifted = cloud - cloud.new_tensor(offset)
+        of_cloud = cloud_tracks(views, local.replace(points_world=shifted))
+        found = found.joined(of_cloud)
+        own = f", {len(of_cloud.points_world):,} of them found from the cloud that it names"
     if len(found.points_world):
         found = refine_tracks(views, found, settings.track_iterations, cameras=False)
     points = found.points_world + found.points_world.new_tensor(offset)
@@ -84,7 +86,6 @@ def triangulate(
     if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
         _warn_of_no_points(len(found.points_world), where)
         return given
-    own = f", {cloud:,} of them found from the cloud that it names" if cloud else ""
     caution(
         f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
         f"were triangulated from the photographs with the cameras held fixed{own}, observed "
