@@ -12,7 +12,7 @@ from pimper_torch.doors.exchange.result import WrittenResult
 from pimper_torch.doors.io.decode import write_deep_png
 from pimper_torch.doors.io.reports import write_json
 from pimper_torch.records.priors import AXES, Axes
-from pimper_torch.result.viz.maps import ViewMaps, view_maps
+from pimper_torch.result.viz.maps import view_maps
 from pimper_torch.runtime.progress import track
 
 
@@ -38,11 +38,19 @@ def write_maps(result: WrittenResult, folder: Path, axes: Axes = "opengl") -> No
         depth = maps.depth.nan_to_num(0)[..., None].numpy()
         write_exr(depth, folder / "depth" / f"{stem}.exr", "along the camera's axis")
         write_exr(colours(maps.albedo), folder / "albedo" / f"{stem}.exr", "linear, sRGB primaries")
+        error = maps.expected_error
         np.savez_compressed(
             folder / "arrays" / f"{stem}.npz",
-            **_arrays(maps, result, view),
             normals=normals,
             axes=np.array(axes),
+            depth=maps.depth.numpy(),
+            albedo=maps.albedo.numpy(),
+            mask=maps.seen.numpy(),
+            confidence=maps.confidence.numpy(),
+            **({} if error is None else {"expected_error": error.numpy()}),
+            intrinsics=result.cameras.intrinsics[view].numpy(),
+            cam_from_world=result.cameras.cam_from_world[view].numpy(),
+            name=np.array(result.names[view]),
             allow_pickle=False,
         )
     about = {
@@ -65,17 +73,3 @@ def with_axes(normals_cam: Float[Tensor, "height width 3"], axes: Axes) -> np.nd
 def colours(albedo: Float[Tensor, "height width channel"]) -> np.ndarray:
     """Return three channels, of grey too; float32."""
     return np.asarray(albedo.expand(-1, -1, 3).numpy(), np.float32)
-
-
-def _arrays(maps: ViewMaps, result: WrittenResult, view: int) -> dict[str, np.ndarray]:
-    error = maps.expected_error
-    return {
-        "depth": maps.depth.numpy(),
-        "albedo": maps.albedo.numpy(),
-        "mask": maps.seen.numpy(),
-        "confidence": maps.confidence.numpy(),
-        **({} if error is None else {"expected_error": error.numpy()}),
-        "intrinsics": result.cameras.intrinsics[view].numpy(),
-        "cam_from_world": result.cameras.cam_from_world[view].numpy(),
-        "name": np.array(result.names[view]),
-    }

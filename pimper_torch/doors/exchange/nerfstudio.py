@@ -60,7 +60,10 @@ def write_transforms(
             frame["depth_file_path"] = f"depths/{file}"
         frame["transform_matrix"] = world_from_cam[index].tolist()
         frames.append(frame)
-        lenses.append(_said(cameras, index))
+        K = cameras.intrinsics[index].detach().cpu().double()
+        width, height = cameras.sizes_px[index].tolist()
+        lens = {"w": width, "h": height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1])}
+        lenses.append({**lens, "cx": float(K[0, 2]), "cy": float(K[1, 2])})
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     if not shared:
         frames = [{**lens, **frame} for lens, frame in zip(lenses, frames, strict=True)]
@@ -124,10 +127,3 @@ def depth_unit(farthest: float) -> float:
 def thinned(count: int) -> Int[Tensor, " point"]:
     """Choose at most a hundred thousand of so many points, evenly."""
     return torch.linspace(0, count - 1, min(count, 100_000), dtype=torch.float64).round().long()
-
-
-def _said(cameras: Cameras, index: int) -> dict[str, float | int]:
-    """Put a pinhole in the words of the format."""
-    K = cameras.intrinsics[index].detach().cpu().double()
-    values = (*cameras.sizes_px[index].tolist(), *K.diagonal()[:2].tolist(), *K[:2, 2].tolist())
-    return dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), values, strict=True))

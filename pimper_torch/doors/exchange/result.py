@@ -1,7 +1,7 @@
 """A folder that ``pimper reconstruct`` wrote, read back with its photographs."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from pimper_torch.runtime.config import build, read_mapping
 from pimper_torch.runtime.errors import InputError, PimperWarning, caution, some
 
 _KIND = "a result of `pimper reconstruct`"
+_DOUBTED = ("silhouettes.unreliable", "silhouettes.empty")
 _FILES = ("mesh.ply", "sparse", "lights.json", "config.yaml", "summary.json")
 
 
@@ -224,19 +225,15 @@ def _silhouettes(
                 f"{height}, as its photograph. Run `pimper reconstruct` again."
             )
         inside[index, :height, :width] = mask.to(inside)
-    doubted = _left_out(summary, ("silhouettes.unreliable", "silhouettes.empty"))
+    entries = summary.get("left_out")
+    doubted = {
+        name
+        for entry in (entries if isinstance(entries, list) else [])
+        if isinstance(entry, dict) and entry.get("guard") in _DOUBTED
+        for name in entry.get("names") or ()
+    }
     return Silhouettes(
         inside=inside,
         reliable=torch.tensor([name not in doubted for name in views.names]),
         source="masks" if given or summary.get("masks") else "found",
     )
-
-
-def _left_out(summary: Mapping[str, object], guards: Sequence[str]) -> set[object]:
-    entries = summary.get("left_out")
-    return {
-        name
-        for entry in (entries if isinstance(entries, list) else [])
-        if isinstance(entry, dict) and entry.get("guard") in guards
-        for name in entry.get("names") or ()
-    }

@@ -1,0 +1,47 @@
+"""Photographs are known again by thumbnails, whatever their size and padding."""
+
+import pytest
+import torch
+from torch.nn.functional import pad
+
+from pimper_torch.doors.io.thumbnails import compare_thumbnails, thumbnails
+from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.records import Views
+from pimper_torch.runtime.errors import InputError, PimperWarning
+
+
+def views_of(images, sizes=None):
+    count, _, height, width = images.shape
+    return Views(
+        images=images,
+        sizes_px=torch.tensor([[width, height]] * count if sizes is None else sizes),
+        names=tuple(f"{index}.png" for index in range(count)),
+        focals_px=torch.full((count,), torch.nan),
+    )
+
+
+@pytest.fixture
+def images():
+    return torch.rand(3, 3, 24, 40, generator=torch.Generator().manual_seed(71))
+
+
+def test_an_even_photograph_is_its_grey_level_everywhere():
+    color = torch.tensor([0.1, 0.2, 0.3])[:, None, None].expand(1, 3, 24, 40)
+    (found,) = thumbnails(views_of(color)).values()
+    assert bytes.fromhex(found) == bytes([int(to_bytes(torch.tensor(0.2)))] * 64)
+
+
+def test_neither_a_resize_nor_padding_changes_thumbnails(images):
+    larger = images.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
+    padded = views_of(pad(images, (0, 7, 0, 5), value=0.9), [[40, 24]] * 3)
+    assert thumbnails(views_of(images)) == thumbnails(views_of(larger)) == thumbnails(padded)
+
+
+def test_photographs_in_another_order_are_refused_and_those_unlike_all_are_not(images):
+    known = thumbnails(views_of(images))
+    with pytest.raises(InputError, match=r"0\.png shows 2\.png, 2\.png shows 0\.png; needed"):
+        compare_thumbnails(views_of(images.flip(0)), known, "photographs")
+    changed = images.clone()
+    changed[1] *= 0.5
+    with pytest.warns(PimperWarning, match=r"look different now: 1\.png"):
+        compare_thumbnails(views_of(changed), known, "photographs")
