@@ -346,7 +346,7 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     # Less is known of mean normals where patches know them for a fraction of the weight.
     information, known = certain * per_support, seen * per_support
     unknown = (1 - known).clamp_min(0) / known.clamp_min(_MIN_WEIGHT)
-    unknown = math.radians(_UNKNOWN_NORMAL_DEG) ** 2 * unknown
+    variance = math.radians(_UNKNOWN_NORMAL_DEG) ** 2
     return Blend(
         heights=_sum_at(vertex, weight * height, count) * per_support,
         supported=supported,
@@ -354,7 +354,7 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
         albedo=albedo * observed[:, None],
         seen=photometric,
         observed=observed,
-        normal_information=information / (1 + information * unknown) * photometric,
+        normal_information=information / (1 + information * variance * unknown) * photometric,
         offsets=offsets[:, 0],
         offset_information=swept * per_support,
         prior_normals_world=normalize(prior_normals, dim=-1),
