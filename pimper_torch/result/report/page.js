@@ -567,7 +567,7 @@
     // First-order light from all sides: that of photographs, or of a sky that is brighter above.
     surroundings() {
       if (!find("environment").checked) {
-        const ambient = Number(find("ambient").value) * (this.plain ? 2 : 1);
+        const ambient = Number(find("ambient").value) * (this.plain ? 1.5 : 1);
         return [ambient, this.up.clone().normalize().multiplyScalar(0.6 * ambient)];
       }
       const own = data.views[selected]?.environment;
@@ -594,7 +594,7 @@
       // Radiance is albedo times light here; the renderer divides it by pi, and by the distance's
       // square.
       const exact = fitted && !find("environment").checked;
-      this.light.intensity = find("lit").checked ? (plain ? 0.7 : 1) * Math.PI * distance ** 2 : 0;
+      this.light.intensity = find("lit").checked ? (plain ? 0.75 : 1) * Math.PI * distance ** 2 : 0;
       this.light.color.setRGB(...(exact ? fitted.directed : [1, 1, 1]));
       this.ambient.intensity = exact ? Math.PI : 0;
       if (exact) this.ambient.color.setRGB(...fitted.ambient);
