@@ -14,6 +14,7 @@ from PIL import Image
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Judged, Materials, Relighting, Silhouettes
 from pimper_torch.result.asset.make import textured
+from pimper_torch.result.asset.placement import Placement, standing
 from pimper_torch.result.asset.write import write_asset
 from pimper_torch.result.relighting.held_out import predict
 from pimper_torch.result.report.page import write_page
@@ -87,7 +88,9 @@ def shown(tmp_path_factory):
     )
     folder = tmp_path_factory.mktemp("page")
     asset = textured(mesh, mesh, materials.at_vertices())
-    write_asset(asset, folder / "asset.glb")
+    # The page undoes what the file does: it is upright, and its longest side is 1.
+    placed = standing(asset.mesh, scene.cameras, 1, torch.tensor([0.0, 0.0, 1.0]), None)
+    write_asset(asset, folder / "asset.glb", Placement(name="ball", scene_from_asset=placed))
     views = scene.views.num_views
     across = torch.arange(SIDE) + 0.5 - SIDE / 2
     y, x = torch.meshgrid(across, across, indexing="ij")
