@@ -178,7 +178,8 @@ def test_masks_that_contradict_points_in_any_reading_are_refused(scene, truth, f
 @pytest.mark.parametrize("turn", range(1, 9))
 def test_a_turn_of_masks_is_that_of_photographs(turn):
     masks = torch.rand(2, 5, 7, generator=torch.Generator().manual_seed(turn)) > 0.5
-    found = Reading(turns={"b": turn}).masks(dict(zip("ab", masks, strict=True)), torch.neg)
+    files = dict(zip("ab", masks, strict=True))
+    found = Reading(turns={"b": turn}).masks(files, files, torch.logical_not)
     assert torch.equal(found["a"], masks[0])
     assert torch.equal(found["b"], torch.from_numpy(rotated(masks[1].numpy(), turn)))
 

@@ -7,7 +7,7 @@ contradicts itself clearly less than the files as they are.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from operator import itemgetter
@@ -34,9 +34,8 @@ from pimper_torch.runtime.parallel import side_by_side
 _SMALL_PX, _POINTS, _PLACES = 320, 4000, 64
 _FEWEST = 50  # pairs of points and views; fewer are no evidence
 # Of what the files contradict, what another reading may at most; what it may at most in any case;
-# what is nothing to mend. Mug, jar and potatoes, 4 to 16 views of 320x240, cameras given and found,
-# hard and soft: true masks 0.0003 at most; inverted, turned, mirrored, shifted and exchanged ones
-# 0.005 and more, but for masks that are nearly alike.
+# what is nothing to mend: docs/decisions.md, "Masks that are turned, inverted or of other
+# photographs".
 _CLEARLY, _MOST, _LEAST = 1 / 3, 0.05, 0.0025
 _REFUSED = 0.5  # of the points in the masks of the median view: more than half; a choice
 # Masks that may be exchanged, readings whose pixels are looked at, and views of these: choices.
@@ -69,10 +68,12 @@ class Reading:
     turns: Mapping[str, int] = field(default_factory=dict)
     owners: Mapping[str, str] = field(default_factory=dict)
 
-    def masks(self, maps: Mapping[str, Map], inverse: Callable[[Map], Map]) -> dict[str, Map]:
-        """Return the mask of each photograph, of maps without padding by the names of files."""
+    def masks(
+        self, maps: Mapping[str, Map], names: Iterable[str], inverse: Callable[[Map], Map]
+    ) -> dict[str, Map]:
+        """Return the masks of photographs, of maps without padding by the names of files."""
         found = {}
-        for name in maps:
+        for name in names:
             if (owner := self.owners.get(name, name)) in maps:
                 one = _turned(maps[owner], self.turns.get(name, 1))
                 found[name] = inverse(one) if self.inverted else one
@@ -88,7 +89,7 @@ class Reading:
                 name: one[:high, :wide]
                 for name, one, (wide, high) in zip(names, maps, sizes_px.tolist(), strict=True)
             }
-            found = list(self.masks(files, inverse).values())
+            found = list(self.masks(files, names, inverse).values())
             high, wide = (
                 max(maps.shape[axis], *(one.shape[axis - 1] for one in found)) for axis in (1, 2)
             )
@@ -132,19 +133,22 @@ def right_reading(scene: SparseScene, given: Views) -> Reading:
     evidence = _Evidence.of(scene)
     if evidence is None:
         return AS_THEY_ARE
-    pairs, (denied, involved) = evidence.of_points(AS_THEY_ARE), evidence.of_pixels(AS_THEY_ARE)
+    names = list(evidence.borders)
+    some = names[:: math.ceil(len(names) / _VIEWS)]
+    pairs, (denied, involved) = evidence.of_points(), evidence.of_pixels(AS_THEY_ARE, some)
     share = _share(pairs, AS_THEY_ARE)
     off = (share + denied) / 2
     if off < _LEAST:
         return AS_THEY_ARE
     by_view = pairs[:, 0] / pairs.sum(dim=1).clamp_min(1)
     suspects = (by_view + involved).argsort(descending=True)[:_SUSPECTS].tolist()
-    doubted = [list(evidence.borders)[one] for one in suspects]
+    doubted = [names[view] for view in suspects]
+    some = list(dict.fromkeys([*some, *doubted]))
     most = min(_CLEARLY * off, _MOST)
     readings = evidence.readings(given, doubted, ordered=scene.views.poses is None)
-    rated = [(_share(evidence.of_points(one), one) / 2, one) for one in readings]
+    rated = [(_share(evidence.of_points(one, some), one) / 2, one) for one in readings]
     likely = sorted((one for one in rated if one[0] <= most), key=itemgetter(0))[:_TRIED]
-    found = [(half + evidence.of_pixels(one)[0] / 2, one) for half, one in likely]
+    found = [(half + evidence.of_pixels(one, some)[0] / 2, one) for half, one in likely]
     best, reading = min(found, key=itemgetter(0), default=(math.inf, AS_THEY_ARE))
     if best <= most:
         caution(
@@ -158,7 +162,8 @@ def right_reading(scene: SparseScene, given: Views) -> Reading:
         raise InputError(
             f"The masks contradict {wrong:.0%} of the points in the median view, and one another; "
             f"at most: {_REFUSED:.0%}; also inverted, turned, mirrored or in another order. Look "
-            "whether they show the same object in all photographs, or leave them out."
+            "whether they show the same object in all photographs, and whether the cameras are "
+            "those of these; or leave the masks out."
         )
     if share == 1:
         caution(
@@ -272,23 +277,28 @@ class _Evidence:
                 said = f"shifted by {step} in the list ({names[0]} has that of {names[step]})"
                 yield Reading(said=said, owners=owners)
 
-    def read(self, reading: Reading) -> tuple[list[int], Maps]:
-        """Return the views whose mask a reading has, and the distances to it."""
-        found = reading.masks(self.borders, torch.neg)
+    def read(self, reading: Reading, names: Iterable[str]) -> tuple[list[int], Maps]:
+        """Return the views, of those named, whose mask a reading has, and distances to these."""
+        found = reading.masks(self.borders, names, torch.neg)
         high, wide = self.cameras.sizes_px.amax(dim=0).flip(0).tolist()
         maps = torch.full((len(found), high, wide), -1e3)
         for into, one in zip(maps, found.values(), strict=True):
             into[: one.shape[0], : one.shape[1]] = one
-        names = list(self.borders)
-        return [names.index(name) for name in found], maps
+        every = list(self.borders)
+        return [every.index(name) for name in found], maps
 
-    def of_points(self, reading: Reading) -> Int[Tensor, "view 2"]:
+    def of_points(
+        self, reading: Reading = AS_THEY_ARE, names: Sequence[str] = ()
+    ) -> Int[Tensor, "view 2"]:
         """Count, in each view, pairs with points that contradict a reading, and that confirm it.
 
         A point is the object's where most views that observe it show it inside. Then it is inside
         in all views, or else outside in all that observe it; masks are drawn by hand.
+
+        Args:
+            names: Of the views that are compared; all by default.
         """
-        views, maps = self.read(reading)
+        views, maps = self.read(reading, names or self.borders)
         column, row = self.pixels[views].unbind(dim=-1)
         value = maps[torch.arange(len(views))[:, None], row, column]
         seen, shown, margin = self.seen[views], self.shown[views], 0.01 * max(maps.shape[1:])
@@ -297,19 +307,21 @@ class _Evidence:
         right = shown & own & (value >= -margin)
         return torch.stack([wrong.sum(dim=1), right.sum(dim=1)], dim=1)
 
-    def of_pixels(self, reading: Reading) -> tuple[float, Float[Tensor, " view"]]:
+    def of_pixels(
+        self, reading: Reading, names: Sequence[str]
+    ) -> tuple[float, Float[Tensor, " view"]]:
         """Return the fraction of the masks' pixels that others deny, and how each takes part in it.
 
-        Of many views a selection is compared.
+        Args:
+            names: Of the views that are compared.
         """
-        views, maps = self.read(reading)
-        involved = torch.zeros(len(views))
-        some = torch.arange(0, len(views), math.ceil(len(views) / _VIEWS))
-        found = _denied(maps[some], self.cameras.take([views[one] for one in some.tolist()]), 40)
+        views, maps = self.read(reading, names)
+        involved = torch.zeros(len(self.borders))
+        found = _denied(maps, self.cameras.take(views), 40)
         if found is None:
             return 1.0, involved
-        own, with_others = _in_conflict(*found, torch.ones(len(some), dtype=torch.bool))
-        involved[some] = own + with_others.sum(dim=0)
+        own, with_others = _in_conflict(*found, torch.ones(len(views), dtype=torch.bool))
+        involved[views] = own + with_others.sum(dim=0)
         return float(own.mean()), involved
 
 
@@ -360,7 +372,7 @@ def contradictory(scene: SparseScene) -> ViewMask:
     evidence = _Evidence.of(scene)
     if evidence is None:
         return doubted
-    _, maps = evidence.read(AS_THEY_ARE)
+    _, maps = evidence.read(AS_THEY_ARE, evidence.borders)
     found = _denied(maps, evidence.cameras, 100)
     if found is None:
         return doubted
