@@ -3,7 +3,7 @@
 import difflib
 import re
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -140,8 +140,8 @@ def _called(folder: Path, level: str, names: Sequence[str], kind: str) -> dict[s
     Of several files of one name, those come first whose names state the kind, and then those in
     whose formats least is lost. Files of other kinds count where there are no others.
     """
-    stems = {str(Path(name).with_suffix("")) for name in names}
-    known = {part for stem in stems for part in Path(stem).parts}
+    stems = {str(PurePosixPath(name).with_suffix("")) for name in names}
+    known = {part for stem in stems for part in stem.split("/")}
     flat = {stem.replace("/", mark): stem for stem in stems for mark in "_- ."}
     ranked: list[tuple[int, int, str, Path]] = []
     for path in sorted(folder.glob(level)):

@@ -103,9 +103,9 @@ def _raster(path: Path, values: np.ndarray) -> Layer:
         full = np.iinfo(values.dtype).max
         values = values / np.float32(full)
     if values.ndim != 3 or values.shape[2] not in (1, 3) or not 0 < values.size <= 3 * MAX_PIXELS:
-        stack = f", a stack of {shape[0]} maps" if len(shape) > 2 and shape[0] > 1 else ""
+        stack = f"{shape}, a stack of {shape[0]} maps" if len(shape) > 2 else f"{shape}"
         raise InputError(
-            f"{path}: has shape {shape}{stack}; needed: height width, with 3 channels first or "
+            f"{path}: has shape {stack}; needed: height width, with 3 channels first or "
             "last for normals. Write maps apart, under the names of their photographs."
         )
     return Layer(np.asarray(values, np.float32), full=full)
