@@ -24,7 +24,8 @@ pytest.importorskip("viser")
 @pytest.fixture
 def folder(reconstruction, tmp_path, small_pictures):
     """A folder of results whose photographs are gone."""
-    about = {"photographs": str(tmp_path / "gone"), "masks": None}
+    scale = {"factor": 2.0, "unit": "cm"}
+    about = {"photographs": str(tmp_path / "gone"), "masks": None, "scale": scale}
     results.write_result(reconstruction, CoarseToFineConfig(), tmp_path / "out", about=about)
     return tmp_path / "out"
 
@@ -35,6 +36,7 @@ def test_without_its_photographs_the_rest_is_shown_and_said(viewer, folder):
     scene = viewer.server.scene
     assert scene.get_handle_by_name("/surfaces/0: result") is not None
     assert scene.get_handle_by_name("/cameras/00002").image is None
+    assert viewer.unit == "cm"
 
 
 def test_a_folder_without_a_surface_is_refused(tmp_path):

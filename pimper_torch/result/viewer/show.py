@@ -3,6 +3,7 @@
 from contextlib import ExitStack
 from pathlib import Path
 
+from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.exchange.result import Result, read_result
 from pimper_torch.doors.io.estimates import read_estimate
 from pimper_torch.method.chains.chain import Step
@@ -28,6 +29,9 @@ def add_folder(viewer: Viewer, path: Path | str, photographs: Path | str | None 
     """
     path = Path(path)
     try:
+        if (summary := path / "summary.json").is_file():
+            scale = DataSetPath(summary, "result").read_json().get("scale")
+            viewer.unit = str(scale["unit"]) if isinstance(scale, dict) else None
         result = read_result(path, photographs)
     except InputError as error:
         estimate = read_estimate(path)
@@ -40,8 +44,6 @@ def add_folder(viewer: Viewer, path: Path | str, photographs: Path | str | None 
             viewer.add_cameras(names, estimate.cameras, points, place)
         viewer.add_pass(RESULT, estimate.mesh)
     else:
-        scale = result.summary.get("scale")
-        viewer.unit = str(scale["unit"]) if isinstance(scale, dict) else None
         add_found(viewer, result)
 
 
