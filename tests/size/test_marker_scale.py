@@ -98,11 +98,11 @@ def test_a_photographed_sheet_tells_the_size(scene):
 
 
 def test_markers_are_where_they_were_printed(scene):
-    printed = {one.code: one for one in layout(30)}
+    printed = layout(30)
     width, height = PAPERS_MM["a4"]
     for marker in find_markers(scene):
-        on = printed[marker.code]
-        left, top = on.left_mm - width / 2, height / 2 - on.top_mm
+        left_mm, top_mm = printed[marker.code]
+        left, top = left_mm - width / 2, height / 2 - top_mm
         corners = [(left, top), (left + 30, top), (left + 30, top - 30), (left, top - 30)]
         wanted = MM * torch.tensor([[*corner, 0.0] for corner in corners], dtype=torch.float64)
         off = (marker.corners_world - wanted).norm(dim=1) / MM
@@ -116,7 +116,7 @@ def test_sides_that_a_printer_changed_can_be_told_and_units_chosen(scene):
 
 
 def test_numbers_tell_the_sides_of_a_sheet():
-    assert side_of(layout(20)[0].code) == 20
+    assert side_of(min(layout(20))) == 20
     cameras = cameras_of(3, 40.0)
     scene = scene_of(photographed(picture_of(36, "letter"), cameras, "letter"), cameras)
     assert scale_of_markers(scene).factor * MM == pytest.approx(1, rel=2e-3)
@@ -128,9 +128,9 @@ def test_markers_of_a_sheet_lie_on_it_apart_from_each_other_and_have_their_own_n
     for side in range(MIN_SIDE_MM, MAX_SIDE_MM + 1):
         markers = layout(side, paper)
         assert 10 <= len(markers) <= 16
-        assert all(side_of(one.code) == side for one in markers)
-        codes += [one.code for one in markers]
-        corners = torch.tensor([[one.left_mm, one.top_mm] for one in markers])
+        assert all(side_of(code) == side for code in markers)
+        codes += markers
+        corners = torch.tensor(list(markers.values()))
         assert bool((corners >= 10).all())
         assert bool((corners + side + 10 <= torch.tensor(PAPERS_MM[paper])).all())
         apart = (corners[:, None] - corners).abs().amax(dim=-1).fill_diagonal_(torch.inf)

@@ -23,7 +23,7 @@ from pimper_bench.truth import Capture
 from pimper_torch.doors.camera_files import transforms_json
 from pimper_torch.doors.camera_files.camera_arrays import read_camera_arrays
 from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import PosedCamera, rigid_or_refuse
+from pimper_torch.doors.camera_files.posed_camera import PosedCamera
 from pimper_torch.doors.camera_files.read_cameras import FORMATS, read_cameras
 from pimper_torch.doors.io.decode import read_header
 from pimper_torch.doors.io.extras import SUFFIXES
@@ -157,7 +157,7 @@ def _llff_camera(name: str, row: Float[Tensor, "3 5"], root: DataSetPath) -> Pos
     )
     down, right, back, center = row[:, :4].unbind(dim=1)
     rotation = torch.stack([right, down, -back], dim=1)
-    pose = invert_rigid(rigid_or_refuse(rotation, center, "poses_bounds.npy", root))
+    pose = invert_rigid(root.rigid(rotation, center, "poses_bounds.npy"))
     return PosedCamera(name=name, lens=lens, cam_from_world=pose)
 
 

@@ -15,7 +15,6 @@ from pimper_torch.doors.camera_files.posed_camera import (
     decompose_projections,
     number_lenses,
     pinhole_lens,
-    rigid_or_refuse,
 )
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
 from pimper_torch.runtime.errors import some
@@ -108,7 +107,7 @@ def _plain(arrays: Arrays, file: DataSetPath) -> Rig:
         ok = bool((K.diagonal() > 0).all()) and K[2].tolist() == [0, 0, 1] and float(K[1, 0]) == 0
         file.expect(ok, f"f_x, s, c_x; 0, f_y, c_y; 0, 0, 1 as K {index}", f"{K.tolist()}")
     poses = [
-        rigid_or_refuse(matrix[:3, :3], matrix[:3, 3], f"cam_from_world {index}", file)
+        file.rigid(matrix[:3, :3], matrix[:3, 3], f"cam_from_world {index}")
         for index, matrix in enumerate(matrices)
     ]
     return intrinsics.expand(len(poses), 3, 3), torch.stack(poses)

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.runtime.errors import InputError, shortened, some
 
 T = TypeVar("T")
@@ -116,6 +118,20 @@ class DataSetPath(NamedTuple):
         plural = "s" if count > 1 else ""
         self.expect(ok, f"{count} finite number{plural} as {what}", _shown(value))
         return torch.from_numpy(array.copy())
+
+    def rigid(
+        self, rotation: Matrix3, translation: Float[Tensor, "3"], what: str
+    ) -> Float[Tensor, "4 4"]:
+        """Return the rigid transform of a rotation, made exact, and a translation of the file."""
+        U, _, Vh = torch.linalg.svd(rotation)
+        nearest = U @ Vh
+        off = float((rotation - nearest).abs().max())
+        mirrored = bool(torch.linalg.det(nearest) < 0)
+        found = f"a matrix that is {off:.2g} off the nearest rotation"
+        # Files round a rotation to some digits; more than this is a scale or a reflection.
+        sound = off <= 0.01 and not mirrored
+        self.expect(sound, f"a rotation in {what}", "a reflection" if mirrored else found)
+        return rigid(nearest, translation)
 
 
 def contents(path: Path) -> str:

@@ -8,11 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import (
-    PosedCamera,
-    polynomial_lens,
-    rigid_or_refuse,
-)
+from pimper_torch.doors.camera_files.posed_camera import PosedCamera, polynomial_lens
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
 from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import some
@@ -81,8 +77,8 @@ def _cam_from_world(
     what = f"rotation of {name}"
     rotation = file.numbers(transform.get("rotation"), 9, what).reshape(3, 3).T
     center = file.numbers(transform.get("center"), 3, f"center of {name}")
-    exact = rigid_or_refuse(rotation, center, what, file)[:3, :3]
-    return rigid_or_refuse(exact, -exact @ center, what, file)
+    exact = file.rigid(rotation, center, what)[:3, :3]
+    return file.rigid(exact, -exact @ center, what)
 
 
 def _lens(

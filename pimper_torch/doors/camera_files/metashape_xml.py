@@ -9,11 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import (
-    PosedCamera,
-    polynomial_lens,
-    rigid_or_refuse,
-)
+from pimper_torch.doors.camera_files.posed_camera import PosedCamera, polynomial_lens
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
 from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import InputError, caution, some
@@ -123,7 +119,7 @@ def _cam_from_world(
 ) -> Float[Tensor, "4 4"]:
     what = f"transform of {camera.get('label')}"
     chunk_from_cam = file.numbers(camera.findtext("transform"), 16, what).reshape(4, 4)
-    pose = rigid_or_refuse(chunk_from_cam[:3, :3], chunk_from_cam[:3, 3], what, file)
+    pose = file.rigid(chunk_from_cam[:3, :3], chunk_from_cam[:3, 3], what)
     components = {
         component.get("id"): component.find("transform")
         for component in chunk.iterfind("components/component")
@@ -139,7 +135,7 @@ def _cam_from_world(
     rotation = values("rotation", 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
     shift, scale = values("translation", 3, "0 0 0"), float(values("scale", 1, "1"))
     file.expect(scale > 0, "a positive scale of the chunk", f"{scale}")
-    world_from_chunk = rigid_or_refuse(rotation, shift, "the chunk's transform", file)
+    world_from_chunk = file.rigid(rotation, shift, "the chunk's transform")
     # Metres or whatever: the scale moves the camera and leaves its axes unit.
     return invert_rigid(world_from_chunk @ rigid(pose[:3, :3], scale * pose[:3, 3]))
 

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.records import Lens, Record
@@ -59,20 +58,6 @@ def polynomial_lens(
     """
     params = (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return ("FULL_OPENCV", params) if any(params) else ("PINHOLE", ())
-
-
-def rigid_or_refuse(
-    rotation: Matrix3, translation: Float[Tensor, "3"], what: str, file: DataSetPath
-) -> Float[Tensor, "4 4"]:
-    """Put a file's rotation and translation together, the rotation made exact."""
-    U, _, Vh = torch.linalg.svd(rotation)
-    nearest = U @ Vh
-    off = float((rotation - nearest).abs().max())
-    mirrored = bool(torch.linalg.det(nearest) < 0)
-    found = "a reflection" if mirrored else f"a matrix that is {off:.2g} off the nearest rotation"
-    # Files round a rotation to some digits; more than this is a scale or a reflection.
-    file.expect(off <= 0.01 and not mirrored, f"a rotation in {what}", found)
-    return rigid(nearest, translation)
 
 
 def decompose_projections(

@@ -15,7 +15,6 @@ from pimper_torch.doors.camera_files.posed_camera import (
     SizesOf,
     number_lenses,
     polynomial_lens,
-    rigid_or_refuse,
 )
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.ground.shapes import Points
@@ -122,7 +121,7 @@ def _camera(
     file.expect(bool(rows), f"4 rows of 4 numbers as {what}", type(matrix).__name__)
     world_from_cam = file.numbers(rows, 12, what).reshape(3, 4)
     turn, shift = world_from_cam[:, :3] * FLIP, world_from_cam[:, 3]
-    pose = invert_rigid(rigid_or_refuse(turn, shift, what, file))
+    pose = invert_rigid(file.rigid(turn, shift, what))
     return PosedCamera(name=name, lens=_lens(frame, name, size_px, file), cam_from_world=pose)
 
 

@@ -1,7 +1,5 @@
 """Detection and drawing of ArUco markers by OpenCV. Imports ``cv2``."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import torch
@@ -11,7 +9,6 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry import pixels
 from pimper_torch.ground.shapes import Map
-from pimper_torch.records import Record
 
 # Of 2^36 squares of random cells 587 x 4 are read as a marker where no cell may be wrong: 3 in
 # 10^8. Of DICT_4X4_50, with its 2^16, it would be 3 in 10^3.
@@ -21,27 +18,17 @@ CELLS = 8
 """Cells along a marker's side, with its black border."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Square(Record):
-    """A marker in a photograph.
-
-    Attributes:
-        code: Its number, of 587.
-        corners: Pixels of the black border's outer corners, clockwise from the marker's top left;
-            to about a pixel as OpenCV gives them.
-    """
-
-    code: int
-    corners: Float[Tensor, "4 2"]
-
-
-def find_squares(picture: UInt8[Tensor, "height width"]) -> list[Square]:
+def find_squares(picture: UInt8[Tensor, "height width"]) -> dict[int, Float[Tensor, "4 2"]]:
     """Find AprilTags of the family 36h11 in a picture, none of whose cells is misread.
 
-    A number that stands twice is left out: no one can tell which is which in other pictures.
+    A number that occurs twice is left out: nothing says which marker is which in other pictures.
 
     Args:
         picture: Grey, encoded by a curve such as sRGB.
+
+    Returns:
+        Pixels of the outer corners of each black border, by the marker's number of 587: clockwise
+        from the marker's top left, to about a pixel, as OpenCV finds them.
     """
     settings = cv2.aruco.DetectorParameters()
     settings.errorCorrectionRate = 0.0
@@ -49,14 +36,11 @@ def find_squares(picture: UInt8[Tensor, "height width"]) -> list[Square]:
     detector = cv2.aruco.ArucoDetector(family, settings)
     corners, codes, _ = detector.detectMarkers(np.ascontiguousarray(picture.numpy()))
     if codes is None:
-        return []
+        return {}
     numbers = np.ravel(codes).tolist()
     indices = torch.from_numpy(np.array(corners, np.float64).reshape(-1, 4, 2))
-    return [
-        Square(code=code, corners=four)
-        for code, four in zip(numbers, pixels.pixels_from_indices(indices), strict=True)
-        if numbers.count(code) == 1
-    ]
+    found = zip(numbers, pixels.pixels_from_indices(indices), strict=True)
+    return {code: four for code, four in found if numbers.count(code) == 1}
 
 
 def cells_of(code: int) -> Bool[Tensor, "8 8"]:

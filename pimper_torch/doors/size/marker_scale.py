@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
-from pimper_torch.doors.size.aruco import CELLS, Square, find_squares, refined_corners
+from pimper_torch.doors.size.aruco import CELLS, find_squares, refined_corners
 from pimper_torch.doors.size.given import MILLIMETRES, Unit
 from pimper_torch.doors.size.scale import AGREEING, Length, Scale, fitted
 from pimper_torch.doors.size.sheet import side_of
@@ -79,43 +79,40 @@ def find_markers(scene: SparseScene) -> list[Marker]:
     """Find printed markers in photographs, and where they are in space."""
     sizes, images = scene.views.sizes_px.tolist(), scene.views.images.detach()
 
-    def one(view: int) -> list[Square]:
+    def one(view: int) -> dict[int, Float[Tensor, "4 2"]]:
         width, height = sizes[view]
         return squares_of(images[view, :, :height, :width].cpu())
 
     found: dict[int, list[tuple[int, Tensor]]] = {}
     for view, squares in enumerate(side_by_side(one, range(len(sizes)))):
-        for square in squares:
-            found.setdefault(square.code, []).append((view, square.corners))
+        for code, corners in squares.items():
+            found.setdefault(code, []).append((view, corners))
     cameras = scene.cameras.detach().to("cpu", torch.float64)
     placed = []
     for code, seen in sorted(found.items()):
         if len(seen) > 1:
-            views, corners = zip(*seen, strict=True)
-            placed.append(_placed(code, cameras.take(views), torch.stack(corners)))
+            views, pixels = zip(*seen, strict=True)
+            placed.append(_placed(code, cameras.take(views), torch.stack(pixels)))
     return [marker for marker in placed if marker is not None]
 
 
-def squares_of(image: Float[Tensor, "channel height width"]) -> list[Square]:
-    """Find printed markers in a photograph, their corners to a small fraction of a pixel.
+def squares_of(image: Float[Tensor, "channel height width"]) -> dict[int, Float[Tensor, "4 2"]]:
+    """Find the corners of printed markers in a photograph, to a small fraction of a pixel.
 
     Markers on paper that is saturated are left out: there black squares look smaller.
     """
     picture = image.mean(dim=0)
     found = find_squares(to_bytes(picture))
     if not found:
-        return []
-    rough = torch.stack([square.corners for square in found])
+        return {}
+    rough = torch.stack([*found.values()])
     usable = torch.where(image.amax(dim=0) >= SATURATED, torch.nan, picture)
     fine = refined_corners(usable, rough)
     moved = (fine - rough).norm(dim=-1).amax(dim=1).nan_to_num(torch.inf)
     side = (rough - rough.roll(1, dims=1)).norm(dim=-1).mean(dim=1)
     sound = moved <= (side / CELLS / 2).clamp_min(_OFF_PX)
-    return [
-        square.replace(corners=corners)
-        for square, corners, keep in zip(found, fine, sound.tolist(), strict=True)
-        if keep
-    ]
+    kept = zip(found, fine, sound.tolist(), strict=True)
+    return {code: corners for code, corners, keep in kept if keep}
 
 
 def _placed(code: int, cameras: Cameras, pixels: Float[Tensor, "view 4 2"]) -> Marker | None:

@@ -115,14 +115,23 @@ def _met(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: 
     mesh = result.mesh.detach().to("cpu", torch.float64)
     hits = RayCaster(mesh.vertices_world, mesh.faces).cast(eye, ray[None])
     if int(hits.face) >= 0:
-        a, b, c = mesh.vertices_world[mesh.faces[int(hits.face)]]
+        corners = mesh.faces[int(hits.face)]
+        a, b, c = mesh.vertices_world[corners]
         if float(torch.linalg.cross(b - a, c - a) @ ray) > 0:
             raise InputError(
                 f"{pointer}: the ray behind this pixel goes through an opening of the surface. "
                 "Point at a part that the result shows, or at the place in two photographs: "
                 "NAME1,x,y+NAME2,x,y."
             )
-        _tell_unsure(pointer, mesh, int(hits.face))
+        sure = None if mesh.confidence is None else float(mesh.confidence[corners].mean())
+        if sure is not None and sure < _UNSURE:
+            caution(
+                f"{pointer}: photographs hardly determine the surface there: its confidence is "
+                f"{sure:.2f}, and {_UNSURE:g} or more is needed for a size to rely on. Point at a "
+                "part that more photographs show, or at the place in two of them: "
+                "NAME1,x,y+NAME2,x,y.",
+                stacklevel=3,
+            )
         hits = hits.refined(mesh.vertices_world, mesh.faces, eye, ray[None])
         return eye + float(hits.distance) * ray
     beside = _beside(pointer, result, mesh, view, eye, ray)
@@ -139,20 +148,6 @@ def _met(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: 
         "stands on is not known there. Point at the object, or at the place in two photographs: "
         "NAME1,x,y+NAME2,x,y. What stages found is kept: the same command goes on from there."
     )
-
-
-def _tell_unsure(pointer: Pointer, mesh: Mesh, face: int) -> None:
-    if mesh.confidence is None:
-        return
-    found = float(mesh.confidence[mesh.faces[face]].mean())
-    if found < _UNSURE:
-        caution(
-            f"{pointer}: photographs hardly determine the surface there: its confidence is "
-            f"{found:.2f}, and {_UNSURE:g} or more is needed for a size to rely on. Point at a "
-            "part that more photographs show, or at the place in two of them: "
-            "NAME1,x,y+NAME2,x,y.",
-            stacklevel=4,
-        )
 
 
 def _beside(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal, get_args
 
 from pimper_torch.doors.size.given import Unit
@@ -36,14 +36,8 @@ class Scale(Record):
     count: int
 
     def report(self) -> dict[str, object]:
-        """Return what ``summary.json`` tells of it as ``scale``."""
-        return {
-            "factor": self.factor,
-            "unit": self.unit,
-            "source": self.source,
-            "residual": None if math.isnan(self.residual) else self.residual,
-            "count": self.count,
-        }
+        """Return the entry ``scale`` of ``summary.json``."""
+        return asdict(self) | {"residual": None if math.isnan(self.residual) else self.residual}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

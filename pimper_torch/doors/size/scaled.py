@@ -6,47 +6,38 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
+from pimper_torch import records
 from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.records import (
-    Cameras,
-    CoarseMesh,
-    DepthPatches,
-    DepthPrior,
-    Depths,
-    FacetPoints,
-    Heights,
-    Mesh,
-    PatchPriors,
-    Record,
-    Silhouettes,
-    SparseScene,
-    StageReport,
-    Surface,
-    Templates,
-)
+from pimper_torch.records import Record
 from pimper_torch.runtime.config import require
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
 POWERS: Mapping[type[Record], Mapping[str, int]] = {
-    Mesh: {"vertices_world": 1, "expected_error": 1},
-    CoarseMesh: {"covariance_world": 2},
-    FacetPoints: {"points_world": 1, "covariance_world": 2},
-    SparseScene: {"points_world": 1},
-    Templates: {"origin": 1, "spacing": 1, "depth": 1},
-    Depths: {"depth": 1},
-    DepthPatches: {"mismatch": 1},
-    Heights: {"offset": 1, "information": -2},
-    PatchPriors: {"offset": 1, "offset_information": -2},
-    DepthPrior: {"depth": 1, "variance": 2},
-    Surface: {"vertices_world": 1, "expected_error": 1, "height_information": -2},
+    records.Mesh: {"vertices_world": 1, "expected_error": 1},
+    records.CoarseMesh: {"covariance_world": 2},
+    records.FacetPoints: {"points_world": 1, "covariance_world": 2},
+    records.SparseScene: {"points_world": 1},
+    records.Templates: {"origin": 1, "spacing": 1, "depth": 1},
+    records.Depths: {"depth": 1},
+    records.DepthPatches: {"mismatch": 1},
+    records.Heights: {"offset": 1, "information": -2},
+    records.PatchPriors: {"offset": 1, "offset_information": -2},
+    records.DepthPrior: {"depth": 1, "variance": 2},
+    records.Surface: {"vertices_world": 1, "expected_error": 1, "height_information": -2},
 }
 """Which power of a length each field is; fields that are not named have no unit, or hold others."""
 
-POSES: Mapping[type[Record], str] = {Cameras: "cam_from_world", Templates: "patch_from_world"}
+POSES: Mapping[type[Record], str] = {
+    records.Cameras: "cam_from_world",
+    records.Templates: "patch_from_world",
+}
 """Rigid transforms, whose shift is a length."""
 
-LAST: Mapping[type[Record], str] = {Depths: "transform", Silhouettes: "planes_world"}
+LAST: Mapping[type[Record], str] = {
+    records.Depths: "transform",
+    records.Silhouettes: "planes_world",
+}
 """Vectors of which the last entry alone is a length."""
 
 # What stages tell as scene units.
@@ -105,9 +96,9 @@ def _scaled_record(record: Record, factor: float, copies: dict[int, Any]) -> Rec
                 new = value * value.new_tensor([1.0, 1.0, 1.0, factor])
         if new is not value:
             changes[field.name] = new
-    if isinstance(record, SparseScene):
+    if isinstance(record, records.SparseScene):
         changes["offset_world"] = tuple(factor * one for one in record.offset_world)
-    if isinstance(record, StageReport) and set(_FIGURES) & record.figures.keys():
+    if isinstance(record, records.StageReport) and set(_FIGURES) & record.figures.keys():
         figures = record.figures
         changes["figures"] = {
             name: factor * figure if name in _FIGURES else figure

@@ -4,7 +4,6 @@ Numbers tell the size: sheets whose markers have sides of 10, 11, ... 36 millime
 each, so that photographs of a sheet tell its size without being told.
 """
 
-from dataclasses import dataclass
 from typing import Literal
 
 from pimper_torch.runtime.config import require
@@ -22,19 +21,6 @@ _NUMBERS = 16  # of one sheet: a frame of 4 by 6
 _ACROSS, _DOWN = 4, 6
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PrintedMarker:
-    """A marker on a sheet.
-
-    Attributes:
-        left_mm: Of its black border, from the sheet's left edge.
-    """
-
-    code: int
-    left_mm: float
-    top_mm: float
-
-
 def side_of(code: int) -> int | None:
     """Return the side of a sheet's marker in millimetres; ``None`` for one that is on no sheet.
 
@@ -45,8 +31,13 @@ def side_of(code: int) -> int | None:
     return side if side <= MAX_SIDE_MM else None
 
 
-def layout(side_mm: int = SIDE_MM, paper: Paper = "a4") -> list[PrintedMarker]:
-    """Put markers along the border of a sheet; the object stands in the middle."""
+def layout(side_mm: int = SIDE_MM, paper: Paper = "a4") -> dict[int, tuple[float, float]]:
+    """Put markers along the border of a sheet; the object stands in the middle.
+
+    Returns:
+        By number, the upper left corner of each black border: millimetres from the sheet's left
+        and upper edge.
+    """
     sound = MIN_SIDE_MM <= side_mm <= MAX_SIDE_MM
     needed = f"{MIN_SIDE_MM} to {MAX_SIDE_MM} whole millimetres"
     require(sound, "side_mm", side_mm, needed)
@@ -60,11 +51,7 @@ def layout(side_mm: int = SIDE_MM, paper: Paper = "a4") -> list[PrintedMarker]:
         for left in columns
         if left in (columns[0], columns[-1]) or top in (rows[0], rows[-1])
     ]
-    first = _NUMBERS * (side_mm - MIN_SIDE_MM)
-    return [
-        PrintedMarker(code=first + index, left_mm=left, top_mm=top)
-        for index, (left, top) in enumerate(places)
-    ]
+    return dict(enumerate(places, start=_NUMBERS * (side_mm - MIN_SIDE_MM)))
 
 
 def _evenly(extent_mm: float, side_mm: int, most: int) -> list[float]:

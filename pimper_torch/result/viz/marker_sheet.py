@@ -49,8 +49,8 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
     axes.set_axis_off()
     axes.set_xlim(0, width)
     axes.set_ylim(height, 0)
-    for marker in layout(side_mm, paper):
-        _draw_marker(axes, marker.code, marker.left_mm, marker.top_mm, side_mm)
+    for code, (left, top) in layout(side_mm, paper).items():
+        _draw_marker(axes, code, left, top, side_mm)
     left, y = (width - _RULER_MM) / 2, height / 2
     for at in range(0, _RULER_MM + 1):
         length = 6 if at % 10 == 0 else 4 if at % 5 == 0 else 2.5

@@ -25,7 +25,6 @@ from pimper_bench.datasets.posed import (
     mask_finder,
 )
 from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import rigid_or_refuse
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import LINEAR
@@ -152,7 +151,7 @@ def test_a_rounded_rotation_is_made_exact(tmp_path):
     skew = torch.tensor([[0.0, -1, 2], [1, 0, 3], [-2, -3, 0]]).double()
     rotation = torch.linalg.matrix_exp(skew)
     rounded, place = (rotation * 1e4).round() / 1e4, DataSetPath(tmp_path, "a toy")
-    exact = rigid_or_refuse(rounded, torch.ones(3).double(), "R", place)[:3, :3]
+    exact = place.rigid(rounded, torch.ones(3).double(), "R")[:3, :3]
     assert_close(exact @ exact.T, torch.eye(3).double(), rtol=0, atol=1e-14)
     assert_close(exact, rotation, rtol=0, atol=1e-4)  # what the rounding took
 
