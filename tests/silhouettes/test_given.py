@@ -147,6 +147,29 @@ def test_right_masks_stay_as_they_are_and_drawn_ones_do_too(scene, truth):
         assert right_reading(scene.replace(views=views), views) is AS_THEY_ARE
 
 
+def test_soft_masks_of_some_photographs_may_have_the_names_of_the_next_ones(scene, truth):
+    prior = soft(scene.views, truth).priors[0].take(list(range(12))).replace(names=NAMES[1:13])
+    views = scene.views.replace(priors=(prior,))
+    with pytest.warns(PimperWarning, match=r"shifted by 1 in the list \(00\.png has that of 01"):
+        (found,) = right_reading(scene.replace(views=views), views).of(views).priors
+    order = [found.names.index(name) for name in NAMES[:12]]
+    assert len(found.names) == 12
+    assert torch.equal(found.inside[order], prior.inside)
+
+
+def test_clicks_stay_where_they_are(scene, truth):
+    """Those in photographs of unlike sizes, too, whose rasters are padded with 0."""
+    inside = torch.full((2, 40, 60), 0.5)
+    inside[0, :, 50:], inside[:, 10:13, 20:23] = 0, 1
+    sizes = torch.tensor([[50, 40], [60, 40]])
+    click = SilhouettePrior(names=NAMES[2:4], sizes_px=sizes, inside=inside)
+    views = soft(scene.views, truth)
+    views = views.replace(priors=(click, *views.priors))
+    kept, inverted = Reading(inverted=True).of(views).priors
+    assert kept is click
+    assert torch.equal(inverted.inside > 0.5, ~truth)
+
+
 def test_an_object_without_texture_is_found_in_inverted_masks_and_nothing_else_is_guessed(
     scene, truth
 ):

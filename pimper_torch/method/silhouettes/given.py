@@ -84,27 +84,30 @@ class Reading:
 
         def read(
             names: Sequence[str], sizes_px: Tensor, maps: Tensor, inverse: Callable[[Map], Map]
-        ) -> tuple[Tensor, Tensor]:
+        ) -> tuple[tuple[str, ...], Tensor, Tensor]:
             files = {
                 name: one[:high, :wide]
                 for name, one, (wide, high) in zip(names, maps, sizes_px.tolist(), strict=True)
             }
-            found = list(self.masks(files, names, inverse).values())
-            high, wide = (
-                max(maps.shape[axis], *(one.shape[axis - 1] for one in found)) for axis in (1, 2)
-            )
-            whole = zeros((len(maps), high, wide), maps.dtype, maps.device)
-            for into, one in zip(whole, found, strict=True):
+            found = self.masks(files, dict.fromkeys([*names, *views.names]), inverse)
+            shapes = [maps.shape[1:], *(one.shape for one in found.values())]
+            size = [max(sides) for sides in zip(*shapes, strict=True)]
+            whole = zeros((len(found), *size), maps.dtype, maps.device)
+            for into, one in zip(whole, found.values(), strict=True):
                 into[: one.shape[0], : one.shape[1]] = one
-            return whole, sizes_px.new_tensor([one.shape[::-1] for one in found])
+            return tuple(found), whole, sizes_px.new_tensor([one[::-1] for one in shapes[1:]])
 
         masks, priors = views.masks, list(views.priors)
         if masks is not None:
-            masks, _ = read(views.names, views.sizes_px, masks, torch.logical_not)
-        for index, prior in enumerate(priors):
-            if isinstance(prior, SilhouettePrior) and not points_at(prior.inside):
-                inside, sizes = read(prior.names, prior.sizes_px, prior.inside, lambda one: 1 - one)
-                priors[index] = prior.replace(inside=inside, sizes_px=sizes)
+            _, masks, _ = read(views.names, views.sizes_px, masks, torch.logical_not)
+        for at, prior in enumerate(priors):
+            if not isinstance(prior, SilhouettePrior):
+                continue
+            sized = zip(prior.inside, prior.sizes_px.tolist(), strict=True)
+            if not all(points_at(one[:high, :wide]) for one, (wide, high) in sized):
+                found = read(prior.names, prior.sizes_px, prior.inside, lambda one: 1 - one)
+                names, inside, sizes = found
+                priors[at] = prior.replace(names=names, inside=inside, sizes_px=sizes)
         return views.replace(masks=masks, priors=tuple(priors))
 
 
