@@ -86,13 +86,12 @@ def turned(
 
 
 def turned_vectors(
-    vectors: Float[Tensor, "map height width 3"], orientations: Int[Tensor, " map"]
-) -> Float[Tensor, "map height width 3"]:
+    vectors: Float[Tensor, "pixel 3"], orientations: Int[Tensor, " pixel"]
+) -> Float[Tensor, "pixel 3"]:
     """Turn vectors, in axes x right, y down, like the pixels of maps that EXIF turns."""
-    tag = orientations.to(vectors.device)[:, None, None, None]
-    mirrored, flipped = _flips(tag)
-    found = torch.where(tag >= 5, vectors[..., [1, 0, 2]], vectors)
-    signs = [1 - 2 * mirrored.to(vectors), 1 - 2 * flipped.to(vectors)]
+    tag = orientations[:, None]
+    found = torch.where(tag >= 5, vectors[:, [1, 0, 2]], vectors)
+    signs = [1 - 2 * flips.to(vectors) for flips in _flips(tag)]
     return found * torch.cat([*signs, torch.ones_like(signs[0])], dim=-1)
 
 

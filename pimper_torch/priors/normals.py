@@ -6,7 +6,7 @@ reading of the normals is worth, of a point of the cloud, 1 less twice the mean 
 or -1 where they face away; of a place on an outline, the cosine between normal and outward.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import product
 from typing import NamedTuple
 
@@ -179,11 +179,10 @@ def _better_otherwise(
         best: The reading of the maps as they are.
         turns: Ways of turning maps, as numbers of EXIF.
     """
-    others = [(_BGR, _worth(prior.replace(normals=prior.normals.flip(-1)), at))]
+    others = [(_BGR, _worth(prior, at, change=lambda normals, _: normals.flip(-1)))]
     for what, tags in turns.items():
         # A network saw the picture as it lay, or vectors were turned and pixels were not.
-        seen = prior.replace(normals=turned_vectors(prior.normals, tags))
-        others += [(what, _worth(one, at, tags)) for one in (seen, prior)]
+        others += [(what, _worth(prior, at, tags, turned_vectors)), (what, _worth(prior, at, tags))]
     if not others[0][1].shape[1]:
         return ""
     fits = [(what, one[one.mean(dim=1).argmax()]) for what, one in others]
@@ -213,23 +212,31 @@ def _samples(prior: NormalPrior, scene: SparseScene, silhouettes: Silhouettes | 
 
 @torch.no_grad()
 def _worth(
-    prior: NormalPrior, at: _Samples, layout: Int[Tensor, " map"] | None = None
+    prior: NormalPrior,
+    at: _Samples,
+    tags: Int[Tensor, " map"] | None = None,
+    change: Callable[[Tensor, Tensor], Tensor] = lambda normals, _: normals,
 ) -> Float[Tensor, "reading sample"]:
-    """Return what readings are worth at points and outlines, of maps turned as EXIF says.
+    """Return what readings are worth at points and outlines; 0 where maps say nothing.
 
-    0 where maps say nothing.
+    Args:
+        tags: Numbers of EXIF by which maps are to be turned.
+        change: From normals, and the tags of their maps, to those that are looked at.
     """
-    place, rim = at.seen.place, at.rim
-    if layout is not None:
-        place, rim = turned(place, prior, layout), turned(rim, prior, layout)
-    known = prior.variance.isfinite()
-    found = _read(prior.normals[place.unbind(dim=-1)].to(at.ways), at.poses)
+    tags = torch.ones_like(prior.sizes_px[:, 0]) if tags is None else tags
+
+    def looked_up(place: Int[Tensor, "sample 3"]) -> tuple[Tensor, Tensor]:
+        there = turned(place, prior, tags).unbind(dim=-1)
+        normals = change(prior.normals[there].to(at.ways), tags.to(place)[place[:, 0]])
+        return normals, prior.variance[there].isfinite()
+
+    (normals, known), (rims, rim_known) = looked_up(at.seen.place), looked_up(at.rim)
+    found = _read(normals, at.poses)
     flat = 1 - 2 * (found[:, :, None] * at.ways).sum(dim=-1).abs().mean(dim=-1)
     faces = (found * at.rays).sum(dim=-1) < 0
-    worth = torch.where(known[place.unbind(dim=-1)], torch.where(faces, flat, -1), 0)
-    rims = _read(prior.normals[rim.unbind(dim=-1)].to(at.ways), at.rim_poses)
-    along = torch.where(known[rim.unbind(dim=-1)], (rims * at.outward).sum(dim=-1), 0)
-    return torch.cat([means_by(worth, at.seen.point), along], dim=1)
+    worth = torch.where(known, torch.where(faces, flat, -1), 0)
+    along = (_read(rims, at.rim_poses) * at.outward).sum(dim=-1)
+    return torch.cat([means_by(worth, at.seen.point), torch.where(rim_known, along, 0)], dim=1)
 
 
 @torch.no_grad()
