@@ -11,7 +11,7 @@ from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, Norma
 from pimper_torch.priors.prior_files.folder import read_maps, single
 from pimper_torch.priors.prior_files.map_file import LABELS, Layer
 from pimper_torch.records import DepthPrior, NormalPrior, Views
-from pimper_torch.runtime.errors import InputError, caution
+from pimper_torch.runtime.errors import InputError, caution, some
 
 
 def read_normals(
@@ -88,15 +88,17 @@ def read_depth(
         values = single(path, layer)
         if layer.labelled:
             raise InputError(f"{path}: holds whole numbers below {LABELS}, labels; needed: depth.")
-        none = _none_in(values * (layer.full or 1))
-        lost.update(f"{one:g}" for one in values[none] * (layer.full or 1))
+        levels = values * (layer.full or 1)
+        none = _none_in(levels)
+        for one, count in zip(*np.unique(levels[none], return_counts=True), strict=True):
+            lost[f"{one:g}"] += int(count)
         return np.where(none, np.float32(np.nan), values)
 
     maps = read_maps(folder, views, kinds, distances, undistorted=undistorted)
     if lost:
         caution(
-            f"{folder}: {sum(lost.values()):,} pixels of {len(maps.names)} maps hold "
-            f"{', '.join(sorted(lost))}, which is taken for no depth.",
+            f"{folder}: {sum(lost.values()):,} pixels hold {some(sorted(lost))}, which is "
+            "taken for no depth.",
             stacklevel=2,
         )
     return from_maps.depth_from(maps, inverse, along=along, gauge=gauge, error=error)
