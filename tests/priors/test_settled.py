@@ -144,10 +144,9 @@ def test_normals_that_are_turned_are_refused_with_the_reason(rendered, what, alo
     found_by_network = stored(camera, tags) * signs[:, None, None]  # of the picture as it lay
     if in_files:
         scene = scene.replace(views=scene.views.replace(orientations=torch.tensor(tags)))
-    for given in (stored(camera, tags), found_by_network):
-        for axes in (None, "opencv"):
-            with pytest.raises(InputError, match=f"are {what}. Cloud.* Turn maps and vectors"):
-                settle(scene, of_normals(scene, given, axes=axes), silhouettes)
+    for given, axes in ((stored(camera, tags), None), (found_by_network, "opencv")):
+        with pytest.raises(InputError, match=f"are {what}. Cloud.* Turn maps and vectors"):
+            settle(scene, of_normals(scene, given, axes=axes), silhouettes)
 
 
 def test_stated_axes_that_fit_are_believed_without_a_word(rendered):
@@ -306,9 +305,9 @@ def test_depth_that_is_turned_is_refused_with_the_reason(rendered, what, alone, 
         given = torch.where(rendered.silhouettes.inside > 0.5, given, torch.nan)
     if in_files:
         scene = scene.replace(views=scene.views.replace(orientations=torch.tensor(tags)))
-    for inverse in (None, kind == "disparity"):
-        with pytest.raises(InputError, match=f"The depth of .* is {what}: the cloud shows it"):
-            settle(scene, of_depth(scene, stored(given, tags), inverse=inverse))
+    prior = of_depth(scene, stored(given, tags), inverse=None if kind == "metres" else True)
+    with pytest.raises(InputError, match=f"The depth of .* is {what}: the cloud shows it"):
+        settle(scene, prior)
 
 
 @pytest.mark.parametrize("tag", range(1, 9))
