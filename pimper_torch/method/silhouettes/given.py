@@ -13,7 +13,7 @@ from itertools import combinations
 from operator import itemgetter
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -22,7 +22,7 @@ from pimper_torch.ground.geometry.pixels import grid_from_pixels, scale_intrinsi
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.supporting_plane import well_tracked
 from pimper_torch.ground.geometry.visual_hull import box_round
-from pimper_torch.ground.shapes import Map, Maps, Mask, ViewMask
+from pimper_torch.ground.shapes import Maps, Mask, ViewMask
 from pimper_torch.method.silhouettes.cues import points_at, soft_masks_of
 from pimper_torch.records import Cameras, SilhouettePrior, Silhouettes, SparseScene, Views
 from pimper_torch.runtime.errors import InputError, caution
@@ -41,6 +41,7 @@ _REFUSED = 0.5  # of the points in the masks of the median view: more than half;
 # Masks that may be exchanged, readings whose pixels are looked at, and views of these: choices.
 _SUSPECTS, _TRIED, _VIEWS = 4, 4, 40
 
+Raster = Shaped[Tensor, "_ _"]
 _TURNS = {
     2: "mirrored",
     3: "turned by a half turn",
@@ -69,8 +70,8 @@ class Reading:
     owners: Mapping[str, str] = field(default_factory=dict)
 
     def masks(
-        self, maps: Mapping[str, Map], names: Iterable[str], inverse: Callable[[Map], Map]
-    ) -> dict[str, Map]:
+        self, maps: Mapping[str, Raster], names: Iterable[str], inverse: Callable[[Raster], Raster]
+    ) -> dict[str, Raster]:
         """Return the masks of photographs, of maps without padding by the names of files."""
         found = {}
         for name in names:
@@ -83,7 +84,10 @@ class Reading:
         """Return the photographs with masks and soft masks that are read so."""
 
         def read(
-            names: Sequence[str], sizes_px: Tensor, maps: Tensor, inverse: Callable[[Map], Map]
+            names: Sequence[str],
+            sizes_px: Tensor,
+            maps: Tensor,
+            inverse: Callable[[Tensor], Tensor],
         ) -> tuple[tuple[str, ...], Tensor, Tensor]:
             files = {
                 name: one[:high, :wide]
@@ -114,7 +118,7 @@ class Reading:
 AS_THEY_ARE = Reading()
 
 
-def _turned(one: Map, turn: int) -> Map:
+def _turned(one: Raster, turn: int) -> Raster:
     """Turn a map upright that has the orientation of this number of EXIF's."""
     one = one.mT if turn >= 5 else one
     flipped = ((0, (3, 4, 7, 8)), (1, (2, 3, 6, 7)))
@@ -177,7 +181,7 @@ def right_reading(scene: SparseScene, given: Views) -> Reading:
     return AS_THEY_ARE
 
 
-def around_and_inside(maps: Sequence[Map]) -> tuple[float, float]:
+def around_and_inside(maps: Sequence[Raster]) -> tuple[float, float]:
     """Return the fractions above zero along the borders of maps, and in their middle halves."""
     around, inside = [], []
     for (one,) in each(maps):
@@ -210,7 +214,7 @@ class _Evidence:
         seen: Whether the view observes it.
     """
 
-    borders: Mapping[str, Map]
+    borders: Mapping[str, Raster]
     cameras: Cameras
     pixels: Int[Tensor, "view point 2"]
     shown: Bool[Tensor, "view point"]
