@@ -3,15 +3,8 @@
 import time
 from collections.abc import Callable
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskID,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
 
 from pimper_torch.cli.doctor.cost import minutes
 from pimper_torch.cli.doctor.forecast import Forecast
@@ -39,16 +32,16 @@ class Bars:
         self.console, self._forecast = console, forecast
         self._most, self._seconds = figures, seconds
         self._tenths, self._last = 0, 0.0
-        self._progress = Progress(
-            TextColumn("{task.description:<12}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-            TextColumn("[dim]{task.fields[found]}"),
+        self._progress = progress.Progress(
+            progress.TextColumn("{task.description:<12}"),
+            progress.BarColumn(),
+            progress.TaskProgressColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("[dim]{task.fields[found]}"),
             console=console,
             disable=not console.is_terminal,
         )
-        self._task: TaskID | None = None
+        self._task: progress.TaskID | None = None
 
     def __enter__(self) -> "Bars":
         self._progress.start()

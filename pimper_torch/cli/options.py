@@ -14,14 +14,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.doors.io.photograph_files import image_name, list_images
 from pimper_torch.doors.outputs.files import require_name
 from pimper_torch.doors.outputs.folders import prepare_output, require_apart
-from pimper_torch.doors.size.given import (
-    CameraDistance,
-    Mark,
-    ScaleBar,
-    Unit,
-    measured_in,
-    number_of,
-)
+from pimper_torch.doors.size import given
 from pimper_torch.method.chains.chain_config import Config, PublishedConfig, load_config
 from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.result.asset.mesh_files import MeshFiles, MeshFormat, TextureFormat
@@ -41,7 +34,7 @@ def _word(kind: type, read: Callable[[str], object], metavar: str) -> Any:  # no
     )
 
 
-_Place = Annotated[Mark, _word(Mark, Mark.read, "NAME,x,y")]
+_Place = Annotated[given.Mark, _word(given.Mark, given.Mark.read, "NAME,x,y")]
 _Name = Annotated[str, _word(str, str, "NAME")]
 _Bar = tuple[_Place, _Place, float]
 _Distance = tuple[_Name, _Name, float]
@@ -161,7 +154,7 @@ class InputOptions:
     scale_bar: ScaleBars = ()
     camera_distance: CameraDistances = ()
     markers: Markers = "auto"
-    unit: Unit = "mm"
+    unit: given.Unit = "mm"
     silhouettes: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     object_at: Places = ()
     normals: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -182,17 +175,19 @@ class InputOptions:
         _ = self.bars, self.distances  # refused before anything is read
 
     @property
-    def bars(self) -> tuple[ScaleBar, ...]:
+    def bars(self) -> tuple[given.ScaleBar, ...]:
         """Places in photographs with the lengths between them."""
         bars = self.scale_bar
-        return tuple(ScaleBar(first=one, second=two, length=length) for one, two, length in bars)
+        return tuple(
+            given.ScaleBar(first=one, second=two, length=length) for one, two, length in bars
+        )
 
     @property
-    def distances(self) -> tuple[CameraDistance, ...]:
+    def distances(self) -> tuple[given.CameraDistance, ...]:
         """Photographs with the lengths between their cameras."""
         pairs = self.camera_distance
         return tuple(
-            CameraDistance(first=one, second=two, length=length) for one, two, length in pairs
+            given.CameraDistance(first=one, second=two, length=length) for one, two, length in pairs
         )
 
 
@@ -334,8 +329,8 @@ def check(job: Job) -> Job:
     for name in filter(None, references):
         view_named(name, present)
     pointed = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
-    for name in (*measured_in(job.inputs.bars, job.inputs.distances), *pointed):
-        number_of(name, present)
+    for name in (*given.measured_in(job.inputs.bars, job.inputs.distances), *pointed):
+        given.number_of(name, present)
     return job
 
 

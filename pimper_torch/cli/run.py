@@ -23,15 +23,8 @@ from pimper_torch.doors.io.results import RESULT_NAMES, write_result
 from pimper_torch.doors.outputs.folders import held_output
 from pimper_torch.doors.outputs.marker import STAGES
 from pimper_torch.doors.outputs.stages import PREVIEW
+from pimper_torch.doors.size import given
 from pimper_torch.doors.size.find_scale import find_scale
-from pimper_torch.doors.size.given import (
-    Mark,
-    Pointer,
-    ScaleBar,
-    measured_in,
-    number_of,
-    require_inside,
-)
 from pimper_torch.doors.size.scale import Scale
 from pimper_torch.doors.size.scaled import scaled
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
@@ -75,7 +68,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
         chain = make_chain(job.config, observer, _store(job))
-        chain.needed = tuple(measured_in(job.inputs.bars, job.inputs.distances))
+        chain.needed = tuple(given.measured_in(job.inputs.bars, job.inputs.distances))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
         chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
@@ -208,22 +201,22 @@ def _costs(result: Reconstruction) -> str:
     return "\n".join(["stage             seconds   peak MB", *rows])
 
 
-def in_files(job: Job, views: Views, mark: Mark) -> Mark:
+def in_files(job: Job, views: Views, mark: given.Mark) -> given.Mark:
     """Return a place with the sizes of the files, whose pixels it is in.
 
     People click in files, which viewers turn as EXIF says; ``--max-size-px`` shrinks them later.
     """
     paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
-    def sized_pointer(pointer: Pointer) -> Pointer:
-        header = read_header(paths[views.names[number_of(pointer.name, views.names)]])
-        require_inside(pointer, header.width, header.height)
+    def sized_pointer(pointer: given.Pointer) -> given.Pointer:
+        header = read_header(paths[views.names[given.number_of(pointer.name, views.names)]])
+        given.require_inside(pointer, header.width, header.height)
         return replace(pointer, size_px=(header.width, header.height))
 
-    return Mark(pointers=tuple(map(sized_pointer, mark.pointers)))
+    return given.Mark(pointers=tuple(map(sized_pointer, mark.pointers)))
 
 
-def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
+def bars_in_files(job: Job, views: Views) -> tuple[given.ScaleBar, ...]:
     """Return scale bars as :func:`in_files`."""
     return tuple(
         replace(bar, first=in_files(job, views, bar.first), second=in_files(job, views, bar.second))
@@ -232,7 +225,7 @@ def bars_in_files(job: Job, views: Views) -> tuple[ScaleBar, ...]:
 
 
 def sized(
-    job: Job, bars: tuple[ScaleBar, ...], result: Reconstruction
+    job: Job, bars: tuple[given.ScaleBar, ...], result: Reconstruction
 ) -> tuple[Reconstruction, Scale | None]:
     """Scale a result to its real size, as far as anything tells it."""
     inputs = job.inputs

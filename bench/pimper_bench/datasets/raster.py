@@ -39,21 +39,21 @@ def read_photographs(
     headers = [read_header(there(path)) for path in paths]
     sizes = [shrunk_size(header, max_size_px) for header in headers]
     tell_cautions(paths[0].parent, paths, headers, encoding)
-    pictures = read_pictures(paths, headers, sizes, encoding)
+    images, transparent = read_pictures(paths, headers, sizes, encoding)
     files = [None] * len(paths) if masks is None else masks
     drawn = {path: _read_mask(path) for path in dict.fromkeys(files) if path is not None}
-    inside = torch.zeros(len(paths), *pictures.images.shape[-2:], dtype=torch.bool)
+    inside = torch.zeros(len(paths), *images.shape[-2:], dtype=torch.bool)
     for view, (path, opaque, (wide, high)) in enumerate(
-        zip(files, pictures.opaque, sizes, strict=True)
+        zip(files, transparent, sizes, strict=True)
     ):
         if path is None and opaque is not None:
             inside[view] = opaque
         else:
             mask = None if path is None else drawn[path]
             inside[view, :high, :wide] = resized_mask(mask, wide, high)
-    has_masks = bool(drawn) or any(opaque is not None for opaque in pictures.opaque)
+    has_masks = bool(drawn) or any(opaque is not None for opaque in transparent)
     return Views(
-        images=pictures.images,
+        images=images,
         sizes_px=torch.tensor(sizes),
         names=tuple(names),
         masks=inside if has_masks else None,

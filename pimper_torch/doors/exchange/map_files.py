@@ -21,7 +21,7 @@ def write_maps(result: WrittenResult, folder: Path, axes: Axes = "opengl") -> No
 
     ``normals/`` has unit normals as EXR, and as 16-bit PNG of ``(n + 1) / 2``; ``depth/`` and
     ``albedo/`` EXR; ``arrays/`` all of them and more as NPZ. What shows no surface is 0, in NPZ
-    NaN for depth. ``README.json`` tells what the files hold.
+    NaN for depth. ``README.json`` describes the files.
 
     Args:
         axes: Of the camera, that normals have.
@@ -38,16 +38,12 @@ def write_maps(result: WrittenResult, folder: Path, axes: Axes = "opengl") -> No
         depth = maps.depth.nan_to_num(0)[..., None].numpy()
         write_exr(depth, folder / "depth" / f"{stem}.exr", "along the camera's axis")
         write_exr(colours(maps.albedo), folder / "albedo" / f"{stem}.exr", "linear, sRGB primaries")
-        error = maps.expected_error
         np.savez_compressed(
             folder / "arrays" / f"{stem}.npz",
             normals=normals,
             axes=np.array(axes),
-            depth=maps.depth.numpy(),
             albedo=maps.albedo.numpy(),
-            mask=maps.seen.numpy(),
-            confidence=maps.confidence.numpy(),
-            **({} if error is None else {"expected_error": error.numpy()}),
+            **maps.arrays(),
             intrinsics=result.cameras.intrinsics[view].numpy(),
             cam_from_world=result.cameras.cam_from_world[view].numpy(),
             name=np.array(result.names[view]),

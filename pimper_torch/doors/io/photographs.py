@@ -95,22 +95,21 @@ def load_views(
     names = tuple(image_name(path, folder) for path in paths)
     matched = _match_masks(names, Path(masks)) if masks is not None else None
     sizes = [shrunk_size(header, max_size_px) for header in headers]
-    pictures = read_pictures(paths, headers, sizes, encoding)
-    images = pictures.images
-    has_masks = matched is not None or any(one is not None for one in pictures.opaque)
+    images, transparent = read_pictures(paths, headers, sizes, encoding)
+    has_masks = matched is not None or any(one is not None for one in transparent)
     drawn = zeros((images.shape[0], *images.shape[-2:]), torch.bool)
     opacities = _read_masks(matched, paths, headers) if matched else []
     if mask_object == "dark" or (mask_object == "auto" and _object_is_dark(opacities, masks)):
         for (opacity,) in each(opacities):
             opacity.copy_(1 - opacity)
-    for index, ((wide, high), opaque) in enumerate(zip(sizes, pictures.opaque, strict=True)):
+    for index, ((wide, high), opaque) in enumerate(zip(sizes, transparent, strict=True)):
         if opacities:
             drawn[index, :high, :wide] = resized_mask(opacities[index], wide, high)
         else:
             drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
         drop_pages()
     if has_masks and not opacities:
-        _tell_alpha(pictures.opaque, names, Path(folder))
+        _tell_alpha(transparent, names, Path(folder))
     lit = _judge(images, drawn, sizes, names, Path(folder), masks)
     views = Views(
         images=images,

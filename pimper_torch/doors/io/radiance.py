@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import prod
 from pathlib import Path
 from typing import NamedTuple
@@ -15,18 +15,10 @@ from torch.nn.functional import interpolate
 from pimper_torch.doors.io.decode import Decoded, decode
 from pimper_torch.doors.io.header import Header
 from pimper_torch.doors.io.responses import response_of
-from pimper_torch.ground.radiometry import (
-    SATURATED,
-    Curve,
-    Encoding,
-    Response,
-    Srgb,
-    find_saturation,
-)
+from pimper_torch.ground.radiometry import SATURATED, Curve, Encoding, Response, Srgb
 from pimper_torch.ground.radiometry.primaries import in_srgb_primaries
-from pimper_torch.ground.radiometry.saturation import PIXELS
+from pimper_torch.ground.radiometry.saturation import PIXELS, find_saturation
 from pimper_torch.ground.shapes import Mask, Scalar
-from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError, caution
 from pimper_torch.runtime.mapped import zeros
 from pimper_torch.runtime.parallel import side_by_side
@@ -37,20 +29,6 @@ _SENSOR_BITS = (10, 12, 14)
 # Choices: photographs share one raster, and one that makes it so many times as large as all are
 # together is no photograph of theirs, from 400 MB of raster on.
 _MAX_PADDING, _MUCH_PADDING = 8, 10**8
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Pictures(Record):
-    """Photographs on one raster, padded right and below.
-
-    Attributes:
-        images: Linear radiance, 1 where saturated.
-        opaque: Where each photograph's alpha channel shows the object, false in the padding;
-            ``None`` where it has none, or none that is transparent anywhere.
-    """
-
-    images: Float[Tensor, "view channel height width"]
-    opaque: tuple[Mask | None, ...]
 
 
 class _Kind(NamedTuple):
@@ -72,7 +50,7 @@ def read_pictures(
     headers: Sequence[Header],
     sizes_px: Sequence[tuple[int, int]],
     encoding: Encoding,
-) -> Pictures:
+) -> tuple[Float[Tensor, "view channel height width"], tuple[Mask | None, ...]]:
     """Read image files as linear radiance that is 1 where the sensor saturates.
 
     Black is taken away, values above saturation are cut off. Files whose saturation is to be
@@ -82,6 +60,10 @@ def read_pictures(
 
     Args:
         sizes_px: Width and height of each, at most those of its header.
+
+    Returns:
+        The radiance on one raster, padded right and below; and where each file's alpha channel
+        shows the object, false in the padding, ``None`` if it is transparent nowhere.
 
     Raises:
         InputError: Names a file that cannot be read, that the encoding does not fit, or that is
@@ -105,7 +87,7 @@ def read_pictures(
         caution(f"{files[0].parent}: {told}", stacklevel=3)
     if whites:
         opaque, _ = _fill(images, files, sizes_px, encoding, whites)
-    return Pictures(images=images, opaque=opaque)
+    return images, opaque
 
 
 def radiance_of(
@@ -174,7 +156,10 @@ def _fill(
 
     def of_file(index: int) -> tuple[Mask | None, _Kind, _Tally | None]:
         decoded, (wide, high) = decode(paths[index]), sizes_px[index]
-        response = file_response(decoded) if given is None else given
+        response = decoded.colour.response if given is None else given
+        of_colours = isinstance(response, Curve) and len(response.radiance) > len(decoded.samples)
+        if response is None or (given is None and of_colours):
+            response = Srgb()
         kind = _Kind(decoded.full, decoded.full_told, response)
         black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
         fitted = _fitted(response, decoded, paths[index])
@@ -206,14 +191,6 @@ def _fill(
             if tally is not None:
                 tallies[kind] = tally.expand(-1, images.shape[1], -1) + tallies.get(kind, 0)
     return tuple(opaque), tallies
-
-
-def file_response(decoded: Decoded) -> Response:
-    """Return the response that a file says it has, sRGB where it does not say."""
-    said = decoded.colour.response
-    if said is None or (isinstance(said, Curve) and len(said.radiance) > len(decoded.samples)):
-        return Srgb()
-    return said
 
 
 def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:

@@ -7,18 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from PIL import Image
-from torch import Tensor
 
+from pimper_torch.doors.io import reports
 from pimper_torch.doors.io.estimates import mask_path, read_lights
 from pimper_torch.doors.io.meshes import write_glb, write_obj, write_ply, write_stl
-from pimper_torch.doors.io.reports import (
-    lights_report,
-    relighting_report,
-    summary_report,
-    write_json,
-)
 from pimper_torch.doors.io.thumbnails import thumbnails
 from pimper_torch.doors.outputs.folders import written_whole
 from pimper_torch.doors.size.given import MILLIMETRES
@@ -113,10 +106,9 @@ def write_result(
         assert ready is not None
         assert asset is not None
         assert relighting is not None
-        found, whole = result, result.replace(mesh=ready.mesh)
-        offset = whole.scene.offset_world
+        whole = result.replace(mesh=ready.mesh)
         with part(0, _PARTS):
-            _write_meshes(ready, files, offset, staging)
+            _write_meshes(ready, files, whole.scene.offset_world, staging)
         with part(1, _PARTS):
             placement = _placement(whole, asset, files, folder.absolute().name, about or {})
             write_asset(asset, staging / "asset.glb", placement, files.texture)
@@ -126,16 +118,16 @@ def write_result(
                 write_asset_obj(asset, staging / "asset.obj", placement)
         _write_all(whole, config, staging)
         writing = reported("write", time.perf_counter() - began)
-        found = found.replace(report=(*found.report, writing))
+        found = result.replace(report=(*result.report, writing))
         summary = {
-            **summary_report(found, about or {}),
+            **reports.summary_report(found, about or {}),
             **({ready.how: ready.counts} if ready.how else {}),
             **({"caps": ready.caps} if ready.caps else {}),
             "asset": asset.summary,
-            "relighting": relighting_report(relighting),
+            "relighting": reports.relighting_report(relighting),
             "thumbnails": thumbnails(whole.scene.views),
         }
-        write_json(summary, staging / "summary.json")
+        reports.write_json(summary, staging / "summary.json")
         with part(5, _PARTS):
             if report:
                 write_page(
@@ -195,7 +187,7 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
             Image.fromarray(drawn.numpy()).save(path)
     with part(2, _PARTS):
         _write_maps(result, folder)
-    write_json(lights_report(result), folder / "lights.json", indent=None)
+    reports.write_json(reports.lights_report(result), folder / "lights.json", indent=None)
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
     with part(3, _PARTS):
         draw_overview(result, folder / "overview.png")
@@ -206,24 +198,17 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
 def _write_maps(result: Reconstruction, folder: Path) -> None:
     reference, cameras = result.coarse.reference, result.cameras
     maps = view_maps(result.mesh, cameras, reference)
-    _write_png((255 * normal_colors(maps.normals_cam)).round(), folder / "normals.png")
-    albedo = (maps.albedo * albedo_scale(result.mesh)).nan_to_num(0).clamp(0, 1)
-    _write_png(to_bytes(albedo), folder / "albedo.png")
-    error = maps.expected_error
+    normals = (255 * normal_colors(maps.normals_cam)).round().to(torch.uint8)
+    albedo = to_bytes((maps.albedo * albedo_scale(result.mesh)).nan_to_num(0).clamp(0, 1))
+    for name, picture in (("normals", normals), ("albedo", albedo)):
+        Image.fromarray(picture.detach().squeeze(-1).numpy()).save(folder / f"{name}.png")
     pose, offset = cameras.cam_from_world[reference], result.scene.offset_world
     far = offset != NO_OFFSET
     np.savez_compressed(
         folder / "depth.npz",
-        depth=array(maps.depth),
-        mask=maps.seen.numpy(),
-        confidence=array(maps.confidence),
-        **({} if error is None else {"expected_error": array(error)}),
+        **maps.arrays(),
         intrinsics=array(cameras.intrinsics[reference]),
         cam_from_world=from_local(pose[None], offset)[0].detach().numpy() if far else array(pose),
         name=np.array(result.scene.views.names[reference]),
         allow_pickle=False,
     )
-
-
-def _write_png(picture: Float[Tensor, "height width channel"] | Tensor, path: Path) -> None:
-    Image.fromarray(picture.detach().to(torch.uint8).squeeze(-1).numpy()).save(path)

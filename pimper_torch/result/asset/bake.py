@@ -6,13 +6,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
+from pimper_torch.ground.geometry import surfaces
 from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.surfaces import (
-    barycentric_2d,
-    side_lengths,
-    unit_face_normals,
-    vertex_normals,
-)
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.ground.shapes import Mask, PerVertex, Vertices
@@ -63,7 +58,7 @@ def baked(
     """
     normals = carried_normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
-    shape = vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
+    shape = surfaces.vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
     tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
     doubt = torch.zeros_like(full.vertices_world[:, 0]) if doubt is None else doubt
@@ -110,9 +105,9 @@ class _Surface:
 
     def __init__(self, full: Mesh, few: Mesh) -> None:
         self._caster = RayCaster(full.vertices_world, full.faces)
-        self._upright = unit_face_normals(full.vertices_world, full.faces)
+        self._upright = surfaces.unit_face_normals(full.vertices_world, full.faces)
         # Few faces are off by far less than their sides, and what is farther is another place.
-        self._reach = float(side_lengths(few.vertices_world[few.faces]).median())
+        self._reach = float(surfaces.side_lengths(few.vertices_world[few.faces]).median())
 
     def nearest(self, points: Float[Tensor, "texel 3"], along: Float[Tensor, "texel 3"]) -> Hits:
         """Meet the surface outward or inward, in lengths of ``along``; -1 where it is not near."""
@@ -152,7 +147,9 @@ def _laid(atlas: Atlas) -> Hits:
     (beside,) = torch.nonzero((distance > 0) & (distance < 1.5), as_tuple=True)
     face, barycentric = met.face.clone(), met.barycentric.clone()
     face[beside] = met.face[nearest[beside]]
-    barycentric[beside] = barycentric_2d(centers[beside], flat[atlas.faces[face[beside]], :2])
+    barycentric[beside] = surfaces.barycentric_2d(
+        centers[beside], flat[atlas.faces[face[beside]], :2]
+    )
     # Slivers would be continued far.
     close = (barycentric > -1.0).all(dim=1)
     return met.replace(face=torch.where(close, face, -1), barycentric=barycentric)

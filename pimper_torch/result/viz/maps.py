@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -34,6 +35,13 @@ class ViewMaps(Record):
     albedo: Float[Tensor, "height width channel"]
     confidence: Map
     expected_error: Map | None = None
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return what NPZ files hold: depth, mask, confidence, and expected error where known."""
+        maps = {"depth": self.depth, "mask": self.seen, "confidence": self.confidence}
+        if self.expected_error is not None:
+            maps["expected_error"] = self.expected_error
+        return {name: values.detach().cpu().numpy() for name, values in maps.items()}
 
 
 def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None) -> ViewMaps:
