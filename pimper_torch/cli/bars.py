@@ -23,11 +23,7 @@ class Bars:
     """
 
     def __init__(
-        self,
-        console: Console,
-        forecast: Forecast,
-        figures: int | None = 3,
-        seconds: float = 10.0,
+        self, console: Console, forecast: Forecast, figures: int | None = 3, seconds: float = 10.0
     ) -> None:
         self.console, self._forecast = console, forecast
         self._most, self._seconds = figures, seconds

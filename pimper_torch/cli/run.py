@@ -67,7 +67,12 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
             bars = bars_in_files(job, views)
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
-        chain = make_chain(job.config, observer, _store(job))
+        store = Store(
+            folder=common.cache or job.out / STAGES,
+            max_bytes=bytes_of(common.max_kept),
+            fresh=common.fresh,
+        )
+        chain = make_chain(job.config, observer, store)
         chain.needed = tuple(given.measured_in(job.inputs.bars, job.inputs.distances))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
         chain.watch = None if viewer is None else partial(add_found, viewer)
@@ -113,12 +118,6 @@ def _preview(
         draw_preview(scene, coarse, path)
         output.event("preview", path=path)
         output.remark(f"{path} shows the coarse surface, until the run ends.")
-
-
-def _store(job: Job) -> Store:
-    common = job.common
-    folder = common.cache or job.out / STAGES
-    return Store(folder=folder, max_bytes=bytes_of(common.max_kept), fresh=common.fresh)
 
 
 def _read(job: Job) -> Views:
@@ -181,7 +180,12 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
 
 def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
     fewer = " (simplified; --faces all writes every one)" if job.common.faces is None else ""
-    output.remark(f"{_costs(result)}\n{headline(result)}")
+    costs = [
+        f"{one.name:<16}{'kept' if one.kept else f'{one.seconds:.1f}':>9}{one.peak_memory_mb:10.0f}"
+        for one in result.report
+    ]
+    rows = ["stage             seconds   peak MB", *costs, headline(result)]
+    output.remark("\n".join(rows))
     if result.scene.doubt:
         output.warning(result.scene.doubt)
     if left_out := closing_line(result.left_out):
@@ -191,14 +195,6 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
     paths = {name: job.out / name for name in RESULT_NAMES if (job.out / name).exists()}
     figures = json.loads((job.out / "summary.json").read_text(encoding="utf-8"))
     output.result({"folder": job.out, **paths}, figures=figures)
-
-
-def _costs(result: Reconstruction) -> str:
-    rows = [
-        f"{one.name:<16}{'kept' if one.kept else f'{one.seconds:.1f}':>9}{one.peak_memory_mb:10.0f}"
-        for one in result.report
-    ]
-    return "\n".join(["stage             seconds   peak MB", *rows])
 
 
 def in_files(job: Job, views: Views, mark: given.Mark) -> given.Mark:

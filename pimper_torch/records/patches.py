@@ -9,7 +9,7 @@ plane z = 0 and its outward normal is -z. A depth on the template is a coordinat
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Any, TypeVar
 
@@ -139,7 +139,15 @@ class OverPatches(Record):
         return self._part({index: row for index, row in rows.items() if len(row)})
 
     def _part(self: AnyPatches, rows: Mapping[int, Tensor]) -> AnyPatches:
-        return self.replace(patches=self._templates._part(rows), buckets=_taken(self, rows))
+        """Take rows of buckets, by the number of each, here and in the patches that it is over."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        changes = {
+            name: value._part(rows)
+            for name, value in values.items()
+            if isinstance(value, OverPatches)
+        }
+        kept = tuple(values["buckets"][index].take(row) for index, row in rows.items())
+        return self.replace(**changes, buckets=kept)
 
     def faults(self) -> Faults:
         """List buckets that are not those of the templates, and what is wrong in one."""
@@ -157,10 +165,6 @@ class OverPatches(Record):
                 yield f"buckets[{index}]", f"has patches, height, width {shape}", needed
             for name, found, needed in bucket.faults():
                 yield f"buckets[{index}].{name}", found, needed
-
-
-def _taken(patches: Any, rows: Mapping[int, Tensor]) -> tuple[Any, ...]:  # noqa: ANN401
-    return tuple(patches.buckets[index].take(row) for index, row in rows.items())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -184,9 +188,6 @@ class PatchSet(OverPatches):
     @property
     def _templates(self) -> "PatchSet":
         return self
-
-    def _part(self, rows: Mapping[int, Tensor]) -> "PatchSet":
-        return self.replace(buckets=_taken(self, rows))
 
     def faults(self) -> Faults:
         """List templates of facets that are none, and of no size."""
@@ -507,10 +508,6 @@ class OverPhotometry(OverPatches):
         """The decomposition underneath."""
         return self.photometric.patches
 
-    def _part(self: AnyPatches, rows: Mapping[int, Tensor]) -> AnyPatches:
-        photometric = self.photometric._part(rows)  # type: ignore[attr-defined]
-        return self.replace(photometric=photometric, buckets=_taken(self, rows))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Heights(Record):
@@ -579,13 +576,6 @@ class Depths(Record):
     def faults(self) -> Faults:
         """List depths that are nowhere."""
         yield from faults_in("depth", "finite where valid", not_finite, self.depth, self.valid)
-
-    @property
-    def aligned(self) -> Bool[Tensor, " patch"]:
-        """Whether the height field meets a neighbour's; false before alignment."""
-        if self.status is None:
-            return torch.zeros_like(self.transform[:, 0], dtype=torch.bool)
-        return self.status == int(AlignStatus.ALIGNED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -13,11 +13,6 @@ from pimper_torch.records.views import Views
 from pimper_torch.runtime.mapped import by_view
 
 
-def no_planes() -> Float[Tensor, "0 4"]:
-    """List no planes."""
-    return torch.zeros(0, 4)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Silhouettes(Record):
     """The object's silhouette in every view.
@@ -37,7 +32,7 @@ class Silhouettes(Record):
     inside: Float[Tensor, "view height width"]
     reliable: Bool[Tensor, " view"]
     source: Literal["masks", "found", "everything"]
-    planes_world: Float[Tensor, "plane 4"] = field(default_factory=no_planes)
+    planes_world: Float[Tensor, "plane 4"] = field(default_factory=lambda: torch.zeros(0, 4))
     hidden: Masks | None = None
 
     @classmethod
@@ -49,11 +44,12 @@ class Silhouettes(Record):
         Args:
             planes_world: What lies below one of them is not the object.
         """
+        planes = torch.zeros(0, 4) if planes_world is None else planes_world
         return cls(
             inside=by_view(Tensor.float, views.inside),
             reliable=torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device),
             source="everything",
-            planes_world=(no_planes() if planes_world is None else planes_world).to(views.images),
+            planes_world=planes.to(views.images),
         )
 
     @property

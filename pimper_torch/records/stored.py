@@ -130,9 +130,13 @@ def as_json(value: object, names: Mapping[int, str] | None = None) -> str:
         if isinstance(value, Record):
             fields = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
             return {"record": type(value).__name__, "fields": fields}
-        if isinstance(value, Tensor) and names and id(value) in names and _is_writable(value):
-            return {"tensor": names[id(value)]}
-        kind = f"{value.dtype} {value.layout} " if isinstance(value, Tensor) else ""
+        kind = ""
+        if isinstance(value, Tensor):
+            # safetensors holds dense tensors of every type but complex128.
+            dense = value.layout == torch.strided and not value.is_meta
+            if names and id(value) in names and dense and value.dtype != torch.complex128:
+                return {"tensor": names[id(value)]}
+            kind = f"{value.dtype} {value.layout} "
         raise InputError(
             f"A file cannot hold a {kind}{type(value).__name__}; needed: records, dense tensors "
             "with values, tuples, mappings by texts, numbers, texts or None."
@@ -188,11 +192,6 @@ def _fits(found: Any, hint: Any, tensors: Mapping[str, Tensor]) -> bool:  # noqa
 
 def _is_a(hint: object, cls: type | types.UnionType) -> bool:
     return isinstance(hint, type) and issubclass(hint, cls)
-
-
-def _is_writable(tensor: Tensor) -> bool:
-    known = tensor.dtype != torch.complex128  # the one that safetensors lacks
-    return known and tensor.layout == torch.strided and not tensor.is_meta
 
 
 def _apart(tensors: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:

@@ -14,9 +14,9 @@ from pimper_torch.doors.camera_files.posed_camera import (
     SizesOf,
     decompose_projections,
     number_lenses,
-    pinhole_lens,
 )
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
+from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.numpy_files import read_npz
 
@@ -65,13 +65,12 @@ def read_camera_arrays(
             "their names, or an array `names`",
             f"{len(poses)} cameras",
         )
-    cameras = [
-        PosedCamera(
-            name=name, lens=pinhole_lens(K, size), skew_px=float(K[0, 1]), cam_from_world=pose
-        )
-        for name, size, K, pose in zip(names, sizes_of(names), intrinsics, poses, strict=True)
-        if size is not None
-    ]
+    cameras = []
+    for name, size, K, pose in zip(names, sizes_of(names), intrinsics.tolist(), poses, strict=True):
+        if size is not None:
+            params = (K[0][0], K[1][1], K[0][2], K[1][2])
+            lens = Lens(camera=1, model="PINHOLE", params=params, width=size[0], height=size[1])
+            cameras.append(PosedCamera(name=name, lens=lens, skew_px=K[0][1], cam_from_world=pose))
     return number_lenses(cameras)
 
 

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.records import Lens, Record
 
 SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
@@ -40,13 +39,6 @@ def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
         camera.replace(lens=camera.lens.replace(camera=1 + lenses.index(camera.lens)))
         for camera in cameras
     ]
-
-
-def pinhole_lens(intrinsics: Matrix3, size_px: tuple[int, int]) -> Lens:
-    """Return the lens of a pinhole's ``K``, but for its skew."""
-    K = intrinsics.tolist()
-    params = (K[0][0], K[1][1], K[0][2], K[1][2])
-    return Lens(camera=1, model="PINHOLE", params=params, width=size_px[0], height=size_px[1])
 
 
 def polynomial_lens(

@@ -11,12 +11,12 @@ from pimper_torch.doors.io.extras import load_extra
 from pimper_torch.doors.io.header import Header, focal_from_exif
 from pimper_torch.doors.io.profiles import colour_of_codes, colour_of_exif, colour_of_info
 from pimper_torch.doors.io.tiff import PREMULTIPLIED
-from pimper_torch.ground.radiometry.colour import SILENT, Colour
+from pimper_torch.ground.radiometry.colour import SILENT
 from pimper_torch.runtime.errors import InputError
 
 
 def read_heic_header(path: Path | str) -> Header:
-    """Read what the primary picture of a HEIC file is, without its pixels.
+    """Read size, colours and EXIF of the primary picture of a HEIC file, without its pixels.
 
     The file's own rotation is applied; EXIF's, which only repeats it, is not.
     """
@@ -26,7 +26,12 @@ def read_heic_header(path: Path | str) -> Header:
     exif = Image.Exif()
     if isinstance(info.get("exif"), bytes):
         exif.load(info["exif"])
-    colour = _colour(info)
+    colour, codes = SILENT, info.get("nclx_profile")
+    if info.get("icc_profile"):
+        colour = colour_of_info(info)
+    elif isinstance(codes, Mapping):  # its matrix and range are undone by the decoder
+        primaries, curve = codes["color_primaries"], codes["transfer_characteristics"]
+        colour = colour_of_codes(int(primaries), int(curve), "HEIC's nclx")
     bits = int(info.get("bit_depth", 8))
     return Header(
         width=image.size[0],
@@ -53,14 +58,3 @@ def read_heic(path: Path | str) -> np.ndarray:
 def _opened(path: Path | str) -> Any:  # noqa: ANN401 - of a package that may be absent
     heif = load_extra("heic", path)
     return heif.open_heif(Path(path).read_bytes(), convert_hdr_to_8bit=False, bgr_mode=False)
-
-
-def _colour(info: Mapping[str, Any]) -> Colour:
-    codes = info.get("nclx_profile")
-    if info.get("icc_profile"):
-        return colour_of_info(info)
-    if not isinstance(codes, Mapping):
-        return SILENT
-    # Its matrix and range are undone by the decoder.
-    primaries, curve = codes["color_primaries"], codes["transfer_characteristics"]
-    return colour_of_codes(int(primaries), int(curve), "HEIC's nclx")

@@ -50,19 +50,18 @@ def write_ply(
         offset_world: Added to the vertices; see ``SparseScene.offset_world``.
         measured: Written as the faces' property of this name, 0 of those that close a hole.
     """
-    path = Path(path)
-    columns = dict(zip("xyz", _positions(mesh, offset_world).unbind(dim=1), strict=True))
-    columns |= dict(
-        zip(("nx", "ny", "nz"), carried_normals(mesh).float().unbind(dim=1), strict=True)
-    )
+    columns = {"x y z": _positions(mesh, offset_world), "nx ny nz": carried_normals(mesh).float()}
     if mesh.albedo is not None:
-        colors = to_bytes(_colors(mesh)).unbind(dim=1)
-        columns |= dict(zip(("red", "green", "blue"), colors, strict=True))
+        columns["red green blue"] = to_bytes(_colors(mesh))
     for name in _ERRORS:
         known = getattr(mesh, name)
         if known is not None:
-            columns[name] = known.float()
-    arrays = {name: values.detach().cpu().numpy() for name, values in columns.items()}
+            columns[name] = known.float()[:, None]
+    arrays = {
+        name: column.detach().cpu().numpy()
+        for names, values in columns.items()
+        for name, column in zip(names.split(), values.unbind(dim=1), strict=True)
+    }
     row = [(name, array.dtype.newbyteorder("<")) for name, array in arrays.items()]
     vertices = np.empty(len(mesh.vertices_world), row)
     for name, array in arrays.items():
@@ -82,7 +81,7 @@ def write_ply(
         *([] if measured is None else ["property uchar measured"]),
         "end_header",
     ]
-    with path.open("wb") as file:
+    with Path(path).open("wb") as file:
         file.write("".join(f"{line}\n" for line in header).encode("ascii"))
         vertices.tofile(file)
         faces.tofile(file)

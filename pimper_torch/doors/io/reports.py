@@ -198,7 +198,7 @@ def _rounded(light: Float[Tensor, " 4"]) -> list[float | None]:
 
 
 def relighting_report(found: Relighting) -> dict[str, object]:
-    """Return what ``summary.json`` tells of lights and materials."""
+    """Return the entry ``relighting`` of ``summary.json``: lights and materials."""
     vertices = torch.bincount(found.materials.cluster, minlength=len(found.materials.metallic))
     shares = (vertices / vertices.sum()).tolist()
     rows = zip(shares, found.materials.values.tolist(), strict=True)
@@ -210,7 +210,11 @@ def relighting_report(found: Relighting) -> dict[str, object]:
         "psnr_matte_db": _mean(found.matte.psnr_db),
         "psnr_textured_db": None if found.textured is None else _mean(found.textured.psnr_db),
         "views": [
-            {"name": name, "psnr_db": _figure(with_one), "psnr_matte_db": _figure(without)}
+            {
+                "name": name,
+                "psnr_db": _finite(round(with_one, 3)),
+                "psnr_matte_db": _finite(round(without, 3)),
+            }
             for name, with_one, without in judged
         ],
         "materials": [
@@ -221,8 +225,4 @@ def relighting_report(found: Relighting) -> dict[str, object]:
 
 
 def _mean(values: Float[Tensor, " view"]) -> float | None:
-    return _figure(float(values.nanmean()))
-
-
-def _figure(value: float) -> float | None:
-    return round(value, 3) if value == value else None
+    return _finite(round(float(values.nanmean()), 3))

@@ -127,10 +127,7 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
             behind.
     """
     folder = Path(folder)
-    with (
-        held_output(folder, kind, overwrite=overwrite) as target,
-        _refused_by_the_disk(folder),
-    ):
+    with held_output(folder, kind, overwrite=overwrite) as target, _refused_by_the_disk(folder):
         new = target / STAGES / NEW
         new.mkdir()
         try:

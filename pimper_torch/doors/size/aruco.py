@@ -14,6 +14,8 @@ from pimper_torch.ground.shapes import Map
 # 10^8. Of DICT_4X4_50, with its 2^16, it would be 3 in 10^3.
 _FAMILY = cv2.aruco.DICT_APRILTAG_36h11
 
+Corners = Float[Tensor, "square 4 2"]
+
 CELLS = 8
 """Cells along a marker's side, with its black border."""
 
@@ -53,9 +55,7 @@ def cells_of(code: int) -> Bool[Tensor, "8 8"]:
 _REACH, _MIN_REACH_PX = 0.6, 1.5
 
 
-def refined_corners(
-    picture: Map, corners: Float[Tensor, "square 4 2"]
-) -> Float[Tensor, "square 4 2"]:
+def refined_corners(picture: Map, corners: Corners) -> Corners:
     """Intersect lines through the sides of squares.
 
     Across each side profiles are read; a step is where their gradient has its centroid, whatever
@@ -75,9 +75,7 @@ def refined_corners(
     return found
 
 
-def _refined_once(
-    picture: Map, corners: Float[Tensor, "square 4 2"]
-) -> Float[Tensor, "square 4 2"]:
+def _refined_once(picture: Map, corners: Corners) -> Corners:
     along = corners.roll(-1, dims=1) - corners
     length = along.norm(dim=-1, keepdim=True)
     outward = torch.stack([along[..., 1], -along[..., 0]], dim=-1) / length

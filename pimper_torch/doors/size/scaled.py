@@ -72,18 +72,14 @@ def scaled(record: AnyRecord, factor: float) -> AnyRecord:
 
 
 def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: ANN401 - of any field
-    """Scale whatever stands in a field; each object once."""
+    """Scale the value of a field; each object once."""
     if isinstance(value, tuple) and any(isinstance(item, Record) for item in value):
         return tuple(_copy(item, factor, copies) for item in value)
     if not isinstance(value, Record):
         return value
-    if id(value) not in copies:
-        copies[id(value)] = _scaled_record(value, factor, copies)
-    return copies[id(value)]
-
-
-def _scaled_record(record: Record, factor: float, copies: dict[int, Any]) -> Record:
-    kind, changes = type(record), dict[str, object]()
+    if id(value) in copies:
+        return copies[id(value)]
+    record, kind, changes = value, type(value), dict[str, object]()
     for field in fields(record):
         value = getattr(record, field.name)
         new = _copy(value, factor, copies)
@@ -104,4 +100,4 @@ def _scaled_record(record: Record, factor: float, copies: dict[int, Any]) -> Rec
             name: factor * figure if name in _FIGURES else figure
             for name, figure in figures.items()
         }
-    return record.replace(**changes) if changes else record
+    return copies.setdefault(id(record), record.replace(**changes) if changes else record)

@@ -17,13 +17,13 @@ from pimper_torch.runtime.stage import Stage
 # What people can edit, and browsers draw at once.
 _FACES = 50_000
 
-# Steps that the eye hardly sees on a rendered surface, and errors far below what these two
-# figures are known to.
+# Steps that the eye hardly sees on a rendered surface, and errors far below the accuracy of these
+# two figures.
 _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
 
 
 class Simplify(Stage):
-    """Reduce a surface to as few vertices as tell it, and close it where that is asked for."""
+    """Reduce a surface to as few vertices as its shape needs, and close it if asked to."""
 
     def forward(self, mesh: Mesh, files: MeshFiles) -> Finished:
         """Make a surface ready to be written."""
@@ -37,11 +37,8 @@ class Simplify(Stage):
         else:
             how, found = "simplified", simplify(mesh, values=written_channels(mesh))
             few = found.mesh
-            moved = {
-                "spacing": found.spacing,
-                "max_spacings": found.max_spacings,
-                "max_angle_deg": found.max_angle_deg,
-            }
+            figures = ("spacing", "max_spacings", "max_angle_deg")
+            moved = {name: getattr(found, name) for name in figures}
         if files.watertight and whole is None:
             whole = closed(few)
         return Finished(

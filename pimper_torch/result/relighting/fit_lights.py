@@ -52,13 +52,6 @@ class Observed(Record):
     weight: Float[Tensor, "pixel channel"]
     saturated: Bool[Tensor, " pixel"]
 
-    def errors(
-        self, predicted: Float[Tensor, "*batch pixel channel"]
-    ) -> Float[Tensor, "*batch pixel channel"]:
-        """Return how far predicted radiance is off; 0 where it exceeds a saturated photograph's."""
-        error = predicted - self.radiance
-        return torch.where(self.saturated[:, None], error.clamp_max(0), error)
-
     def thinned(self, most: int) -> "Observed":
         """Keep every n-th pixel, so that few enough are left."""
         step = -(-len(self.radiance) // most)
@@ -149,7 +142,9 @@ def fit_strengths(
         ay = (weight * diffuse * radiance).sum(dim=1)
         by = (weight * response * radiance).sum(dim=1)
         ambient, directed = _non_negative(aa, ab, bb, ay, by)
-        error = seen.errors(ambient[:, None] * diffuse + directed[:, None] * response)
+        error = ambient[:, None] * diffuse + directed[:, None] * response - radiance
+        # A saturated photograph says nothing of radiance above its own.
+        error = torch.where(seen.saturated[:, None], error.clamp_max(0), error)
         used = (error != 0).float()
         size = (seen.weight * error**2).sum(dim=-1).sqrt()
         robust = cauchy_weights(size, torch.full_like(size[:1, :1], scale))
@@ -245,15 +240,12 @@ def _fit(
         lights = best(many, _neighbours(lights[0], step)[None])[0]
     ambient, directed, _ = fit_strengths(many, *rendered(many, lights[:1]), scale)
     return ViewLights(
-        direction_world=lights[:1, :3],
-        closeness=lights[:1, 3],
-        ambient=ambient,
-        directed=directed,
+        direction_world=lights[:1, :3], closeness=lights[:1, 3], ambient=ambient, directed=directed
     )
 
 
 def _neighbours(light: Float[Tensor, " 4"], step: float) -> Float[Tensor, "11 4"]:
-    """Return a light, and others round it: ``step`` radians beside it, nearer and farther."""
+    """Return a light and others around it: ``step`` radians away, nearer and farther."""
     direction = light[:3]
     axis = torch.eye(3).to(direction)[direction.abs().argmin()]
     first = normalize(torch.linalg.cross(direction, axis), dim=0)

@@ -31,6 +31,11 @@ _STEPS = (1.5, 1.22, 1.1, 1.05)
 
 _CLUSTERS = 4
 
+# Metallic, roughness and specular.
+_Materials = Float[Tensor, "cluster 3"]
+_Candidates = Float[Tensor, "candidate 3"]
+_Clusters = Int[Tensor, " vertex"]
+
 # A gain counts from this fraction of the loss, and from so many standard errors of its mean.
 _LEAST_GAIN, _SIGNIFICANT = 2e-3, 1.0
 
@@ -48,8 +53,10 @@ def materials_under(
     values = trial.improved(cluster, values, 0, grid)
     if bool((values == torch.tensor(_MATTE)).all()):
         return Materials.of(cluster, values)
-    values = trial.improved(cluster, values, 0, _metals(values[0]))
-    shared = values
+    # Metals, whose highlight has more and more the surface's colour.
+    roughness = (values[0, 1] * torch.tensor([0.8, 1.0, 1.25])).clamp(_LEAST_ROUGHNESS, 1)
+    metals = torch.cartesian_prod(torch.tensor(_METALLIC), roughness, values[0, 2:])
+    shared = values = trial.improved(cluster, values, 0, metals)
     for count in range(2, _CLUSTERS + 1):
         finer = clusters(surface.base_color, count)
         split = shared.repeat(count, 1)
@@ -80,7 +87,7 @@ class _Trial:
         ]
 
     def losses(
-        self, cluster: Int[Tensor, " vertex"], tried: Float[Tensor, "candidate cluster 3"]
+        self, cluster: _Clusters, tried: Float[Tensor, "candidate cluster 3"]
     ) -> Float[Tensor, "view candidate"]:
         """Return the loss of every photograph under materials."""
 
@@ -94,15 +101,11 @@ class _Trial:
         return torch.stack(list(side_by_side(of_view, range(len(self.observed)), tracked=False)))
 
     def improved(
-        self,
-        cluster: Int[Tensor, " vertex"],
-        values: Float[Tensor, "cluster 3"],
-        one: int,
-        tried: Float[Tensor, "candidate 3"],
-    ) -> Float[Tensor, "cluster 3"]:
+        self, cluster: _Clusters, values: _Materials, one: int, tried: _Candidates
+    ) -> _Materials:
         """Return materials with a better one for one cluster, if the photographs agree on it."""
 
-        def with_one(rows: Float[Tensor, "candidate 3"]) -> Float[Tensor, "candidate cluster 3"]:
+        def with_one(rows: _Candidates) -> Float[Tensor, "candidate cluster 3"]:
             changed = values.repeat(len(rows), 1, 1)
             changed[:, one] = rows
             return changed
@@ -132,15 +135,7 @@ def _agreed(losses: Float[Tensor, "view candidate"]) -> bool:
     return gain > _LEAST_GAIN * before and gain > _SIGNIFICANT * error
 
 
-def _metals(value: Float[Tensor, " 3"]) -> Float[Tensor, "candidate 3"]:
-    """Return materials whose highlight has more and more the surface's colour."""
-    factors = value[1] * torch.tensor([0.8, 1.0, 1.25])
-    return torch.cartesian_prod(
-        torch.tensor(_METALLIC), factors.clamp(_LEAST_ROUGHNESS, 1), value[2:]
-    )
-
-
-def _around(value: Float[Tensor, " 3"], step: float) -> Float[Tensor, "candidate 3"]:
+def _around(value: Float[Tensor, " 3"], step: float) -> _Candidates:
     """Return materials of more and less roughness and specular, by a factor."""
     factors = torch.tensor([1 / step, 1.0, step])
     specular = (value[2] * factors) if value[2] > 0 else factors
@@ -151,7 +146,7 @@ def _around(value: Float[Tensor, " 3"], step: float) -> Float[Tensor, "candidate
     )
 
 
-def clusters(base_color: Float[Tensor, "vertex channel"], count: int) -> Int[Tensor, " vertex"]:
+def clusters(base_color: Float[Tensor, "vertex channel"], count: int) -> _Clusters:
     """Divide vertices by their colour as sRGB shows it; a cluster may have none."""
     colors = srgb_from_linear(base_color.double())
     sample = colors[:: -(-len(colors) // 4096)]

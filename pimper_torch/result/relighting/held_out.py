@@ -20,6 +20,7 @@ from pimper_torch.result.relighting.fit_lights import Observed, lights_of, obser
 from pimper_torch.result.relighting.fit_materials import materials_under
 from pimper_torch.result.relighting.lit_surface import (
     LitSurface,
+    Radiance,
     SurfacePixels,
     TexturedSurface,
     diffuse_color,
@@ -31,7 +32,7 @@ from pimper_torch.runtime.stage import Stage
 def predict(
     mesh: Mesh | LitSurface, camera: Cameras, light: ViewLights, materials: Materials | None = None
 ) -> Float[Tensor, "height width channel"]:
-    """Return the linear radiance that a camera sees, with cast shadows; NaN beside the mesh.
+    """Return the linear radiance that a camera sees, with cast shadows; NaN off the mesh.
 
     Args:
         mesh: With albedo; prepared where several pictures of it are wanted.
@@ -47,7 +48,7 @@ def predict(
 
 def shaded(
     surface: LitSurface, pixels: SurfacePixels, light: ViewLights, materials: Materials | None
-) -> Float[Tensor, "pixel channel"]:
+) -> Radiance:
     """Return the linear radiance of pixels."""
     material = None if materials is None else materials.at_vertices()[pixels.vertex]
     incidence = surface.incidence(pixels, light.direction_world, light.closeness)
@@ -55,9 +56,7 @@ def shaded(
     return light.ambient * diffuse_color(pixels, material) + light.directed * lit
 
 
-def psnr(
-    predicted: Float[Tensor, "pixel channel"], radiance: Float[Tensor, "pixel channel"]
-) -> float:
+def psnr(predicted: Radiance, radiance: Radiance) -> float:
     """Return the peak signal-to-noise ratio of sRGB values in [0, 1], in decibels.
 
     Args:
@@ -81,7 +80,7 @@ class Relight(Stage):
 
         Args:
             mesh: In the scene's frame, with albedo.
-            held_out: What is predicted; without, the scene's own photographs.
+            held_out: Photographs to predict; the scene's own by default.
         """
         surface = LitSurface(mesh)
         observed = observe_all(surface, scene, silhouettes)

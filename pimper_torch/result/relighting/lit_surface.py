@@ -29,8 +29,13 @@ from pimper_torch.records import Cameras, Mesh, Record, Textured
 from pimper_torch.result.asset.tangents import frames
 from pimper_torch.result.viz.maps import base_color, carried_normals
 
+Broadcast = Float[Tensor, "*#batch"]
+Radiance = Float[Tensor, "pixel channel"]
+Directions = Float[Tensor, "pixel 3"]
+Material = Float[Tensor, "*batch pixel 3"]  # metallic, roughness and specular
 
-def facet_density(cosine: Float[Tensor, "*#batch"], alpha: Float[Tensor, "*#batch"]) -> Scalars:
+
+def facet_density(cosine: Broadcast, alpha: Broadcast) -> Scalars:
     """Return GGX's density of facets per solid angle.
 
     Args:
@@ -41,11 +46,7 @@ def facet_density(cosine: Float[Tensor, "*#batch"], alpha: Float[Tensor, "*#batc
     return alpha**2 / (torch.pi * spread**2)
 
 
-def masking(
-    to_light: Float[Tensor, "*#batch"],
-    to_eye: Float[Tensor, "*#batch"],
-    alpha: Float[Tensor, "*#batch"],
-) -> Scalars:
+def masking(to_light: Broadcast, to_eye: Broadcast, alpha: Broadcast) -> Scalars:
     """Return Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
 
     Args:
@@ -68,7 +69,7 @@ class SurfacePixels(Record):
     Attributes:
         pixel: Index into the raster, row by row.
         points_world: Intersections of the rays through the pixels' centres.
-        normals_world: Unit, as the mesh has them.
+        normals_world: Unit, those of the mesh.
         to_eye: Unit, towards the camera.
         vertex: The nearest vertex of the face that is met.
         inner: False beside pixels that show something else, with which they are blended.
@@ -98,7 +99,7 @@ class Incidence(Record):
 
 
 class LitSurface:
-    """A mesh prepared to be seen and to cast shadows; a constant to autograd, on the CPU."""
+    """A mesh prepared for rays and cast shadows; a constant to autograd, on the CPU."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh = mesh.detach().to("cpu", torch.float32)
@@ -129,9 +130,7 @@ class LitSurface:
             inner=~elsewhere[seen],
         )
 
-    def appearance(
-        self, met: Hits
-    ) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel channel"]]:
+    def appearance(self, met: Hits) -> tuple[Directions, Radiance]:
         """Return unit normals, world frame, and base colours where rays meet the mesh."""
         faces = self.mesh.faces
         normals = normalize(met.interpolate(self.normals_world, faces), dim=-1)
@@ -173,7 +172,7 @@ DIELECTRIC = 0.04
 
 
 def diffuse_color(
-    pixels: SurfacePixels, material: Float[Tensor, "*batch pixel 3"] | None = None
+    pixels: SurfacePixels, material: Material | None = None
 ) -> Float[Tensor, "*batch pixel channel"]:
     """Return the albedo of the matte part, which ambient light meets, too.
 
@@ -184,7 +183,7 @@ def diffuse_color(
 
 
 def response(
-    pixels: SurfacePixels, light: Incidence, material: Float[Tensor, "*batch pixel 3"] | None = None
+    pixels: SurfacePixels, light: Incidence, material: Material | None = None
 ) -> Float[Tensor, "lit pixel channel"]:
     """Return the radiance under directed lights of strength 1.
 
@@ -216,9 +215,7 @@ class TexturedSurface(LitSurface):
         super().__init__(asset.mesh.replace(normals_world=asset.normals))
         self.asset = asset
 
-    def appearance(
-        self, met: Hits
-    ) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel channel"]]:
+    def appearance(self, met: Hits) -> tuple[Directions, Radiance]:
         """Return unit normals, world frame, and base colours where rays meet the mesh."""
         asset, faces = self.asset, self.mesh.faces
         uv = met.interpolate(asset.uv, faces)

@@ -47,9 +47,8 @@ class ViewMaps(Record):
 def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None) -> ViewMaps:
     """Look at a mesh through one camera.
 
-    A mesh without normals shows those of its faces, averaged round the vertices; one
-    without albedo is grey, one without confidence has full confidence. A constant to
-    autograd.
+    A mesh without normals shows those of its faces, averaged around the vertices; one without
+    albedo is grey, one without confidence has full confidence. A constant to autograd.
 
     Args:
         hits: Of the view's rays on the mesh, if they are known already.
@@ -60,21 +59,23 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
     confidence = torch.ones_like(vertices[:, 0]) if mesh.confidence is None else mesh.confidence
     error = mesh.expected_error
     seen = hits.face >= 0
-    shown = normalize(hits.interpolate(carried_normals(mesh), mesh.faces), dim=-1)
+
+    def shown(values: Float[Tensor, "vertex channel"]) -> Float[Tensor, "height width channel"]:
+        return hits.interpolate(values, mesh.faces)
+
+    normals_world = normalize(shown(carried_normals(mesh)), dim=-1)
     return ViewMaps(
         seen=seen,
         depth=torch.where(seen, hits.distance, torch.nan),
-        normals_cam=rotate(cameras.cam_from_world[view], shown),
-        albedo=hits.interpolate(albedo, mesh.faces),
-        confidence=hits.interpolate(confidence[:, None], mesh.faces)[..., 0],
-        expected_error=None
-        if error is None
-        else hits.interpolate(error[:, None], mesh.faces)[..., 0],
+        normals_cam=rotate(cameras.cam_from_world[view], normals_world),
+        albedo=shown(albedo),
+        confidence=shown(confidence[:, None])[..., 0],
+        expected_error=None if error is None else shown(error[:, None])[..., 0],
     )
 
 
 def carried_normals(mesh: Mesh) -> Vertices:
-    """Return a mesh's normals; without, those of its faces, averaged round the vertices."""
+    """Return a mesh's normals; without, those of its faces, averaged around the vertices."""
     if mesh.normals_world is None:
         return vertex_normals(mesh.vertices_world, mesh.faces)
     return mesh.normals_world
@@ -83,7 +84,7 @@ def carried_normals(mesh: Mesh) -> Vertices:
 def normal_colors(normals_cam: Vectors) -> Vectors:
     """Colour normals the usual way: red to the right, green up, blue to the viewer.
 
-    A zero normal, which is none, is black.
+    Zero, where there is no normal, is black.
 
     >>> normal_colors(torch.tensor([0.0, 0.0, -1.0]))  # faces the camera
     tensor([0.5000, 0.5000, 1.0000])

@@ -31,7 +31,6 @@ from pimper_torch.result.viz.tiles import (
     encoded,
     fitted,
     sheet,
-    with_color,
     with_triangles,
 )
 from pimper_torch.runtime.mapped import drop_pages
@@ -149,7 +148,8 @@ def _photograph(
     if result.silhouettes.source != "everything":
         inside = array(result.silhouettes.inside[reference][box])[..., None]
         drawn = torch.from_numpy(fitted(inside.repeat(3, axis=-1), panel_px)[..., 0] > 0.5)
-        outlined = with_color(photograph, border(drawn), RELIABLE)
+        outlined = photograph.copy()
+        outlined[border(drawn).numpy()] = RELIABLE
     coarse = result.coarse.mesh
     pixels, _ = project(coarse.vertices_world, own.cam_from_world[0], own.intrinsics[0])
     corners = (pixels - pixels.new_tensor([left, top]))[coarse.faces]

@@ -15,7 +15,9 @@ from pimper_torch.ground.geometry.visibility import cast_view
 from pimper_torch.ground.shapes import Points, Scalars, Vectors
 from pimper_torch.records import Cameras, Mesh
 
-# Raking light from up on the left shows height field; a weaker one beside the viewer keeps the far
+Pixel = Float[Tensor, " 2"]
+
+# Raking light from up on the left shows the relief; a weaker one next to the viewer keeps the far
 # side from drowning.
 _POINT_LIGHTS_CAM = ((0.62, (-0.60, -0.60, -0.53)), (0.26, (0.0, 0.0, -1.0)))
 _INSIDE = (0.55, 0.62, 0.75)  # tint of faces seen from behind
@@ -24,7 +26,7 @@ _INSIDE = (0.55, 0.62, 0.75)  # tint of faces seen from behind
 def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "height width 3"]:
     """Draw a mesh as grey matte stuff under a raking point light.
 
-    Its own shape is shaded, never the normals that it carries: height field that is seen is there.
+    Its own shape is shaded, never the normals that it carries: relief that is seen is there.
     Faces seen from behind are bluish. A constant to autograd.
 
     Args:
@@ -80,11 +82,11 @@ def lambertian(normals_cam: Vectors) -> Scalars:
 
 
 def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
-    """Walk round a point, about the vertical of the picture.
+    """Move a camera around a point, about the vertical of the picture.
 
     Args:
-        center_world: Stays where it is in the picture, and as far away.
-        angle_deg: Positive walks to the right and shows the object's right side.
+        center_world: The point, which stays at its pixel and its distance.
+        angle_deg: Positive moves to the right and shows the object's right side.
     """
     angle = math.radians(angle_deg)
     cos, sin = math.cos(angle), math.sin(angle)
@@ -98,19 +100,17 @@ def frame(camera: Cameras, points_world: Points, longer_side_px: int, margin: fl
     """Crop and scale a camera's picture to the bounding box of some points.
 
     Args:
-        points_world: At least one of them before the camera.
-        margin: Round the box, as a fraction of its longer side.
+        points_world: At least one of them in front of the camera.
+        margin: Around the box, as a fraction of its longer side.
     """
     return crop(camera, *bounding_box(camera, points_world, margin), longer_side_px)
 
 
-def crop(
-    camera: Cameras, low: Float[Tensor, " 2"], high: Float[Tensor, " 2"], longer_side_px: int
-) -> Cameras:
+def crop(camera: Cameras, low: Pixel, high: Pixel, longer_side_px: int) -> Cameras:
     """Crop and scale a camera's picture to a rectangle.
 
     Args:
-        low: Upper left corner, pixels; may lie outside the picture, as all of it may.
+        low: Upper left corner, pixels; the rectangle may be outside of the picture.
     """
     factor = longer_side_px / float((high - low).detach().max())
     cropped = camera.intrinsics.clone()
@@ -120,9 +120,7 @@ def crop(
     return camera.replace(intrinsics=intrinsics, sizes_px=sides[None])
 
 
-def bounding_box(
-    camera: Cameras, points_world: Points, margin: float
-) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"]]:
+def bounding_box(camera: Cameras, points_world: Points, margin: float) -> tuple[Pixel, Pixel]:
     """Return the corners (top left, bottom right) of the pixels that some points cover."""
     pixels, depth = project(points_world, camera.cam_from_world[0], camera.intrinsics[0])
     pixels = pixels[depth > 0]

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.ground.shapes import Mask, Scalars
+from pimper_torch.ground.shapes import Scalars
 
 Picture = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
@@ -26,7 +26,7 @@ class Tile:
 
     Attributes:
         picture: sRGB in [0, 1], rows first; ``None`` where there is none.
-        note: Stands in the place of a missing picture.
+        note: Written in place of a missing picture.
         wide: Takes a row of its own, as wide as the sheet.
     """
 
@@ -52,18 +52,19 @@ def sheet(rows: Sequence[Sequence[Tile]], tile_px: int, headline: str = "") -> I
         top += _GAP_PX
     page = Image.new("RGB", (width, top), "white")
     draw = ImageDraw.Draw(page)
-    draw.text((width / 2, _HEADLINE_PX / 2), headline, "black", _font(_LARGE_PX), anchor="mm")
+    large, usual, small = map(ImageFont.load_default, (_LARGE_PX, _TEXT_PX, _SMALL_PX))
+    draw.text((width / 2, _HEADLINE_PX / 2), headline, "black", large, anchor="mm")
     for top, room, row, pictures in placed:
         for column, (tile, picture) in enumerate(zip(row, pictures, strict=True)):
             left = _GAP_PX + column * (tile_px + _GAP_PX)
             above = (left + room / 2, top - _TITLE_PX / 2)
-            draw.text(above, tile.title, "black", _font(_TEXT_PX), anchor="mm")
+            draw.text(above, tile.title, "black", usual, anchor="mm")
             if picture is not None:
                 page.paste(picture, (left + (room - picture.width) // 2, top))
             elif tile.note:
                 words = textwrap.fill(tile.note, room // 8, max_lines=4, placeholder=" …")
                 at = (left + room / 2, top + room / 4)
-                draw.text(at, words, "gray", _font(_SMALL_PX), anchor="mm", align="center")
+                draw.text(at, words, "gray", small, anchor="mm", align="center")
     return page
 
 
@@ -87,13 +88,6 @@ def with_triangles(picture: Picture, corners: Float[Tensor, "face 3 2"], color: 
     return _picture(large.reduce(2))
 
 
-def with_color(picture: Picture, where: Mask, color: tuple[float, float, float]) -> Picture:
-    """Colour some pixels of a picture."""
-    painted = picture.copy()
-    painted[where.cpu().numpy()] = color
-    return painted
-
-
 def encoded(radiance: Float[Tensor, "height width channel"]) -> Picture:
     """Encode linear radiance for the screen, cut off at 1; grey has three equal channels."""
     return array(srgb_from_linear(radiance.detach().clamp(0, 1)).expand(-1, -1, 3))
@@ -110,7 +104,3 @@ def _image(picture: Picture) -> Image.Image:
 
 def _picture(image: Image.Image) -> Picture:
     return np.asarray(image, dtype=np.float32) / np.float32(255)
-
-
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)

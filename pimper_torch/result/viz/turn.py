@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d, normalize
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.ground.geometry.visibility import Hits, cast_view
+from pimper_torch.ground.geometry.visibility import cast_view
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.result.viz.maps import albedo_scale
@@ -29,8 +29,8 @@ _QUALITY, _EXPOSURE = 70, 1.4  # the latter takes albedo under the raking light 
 def up_world(cameras: Cameras) -> Float[Tensor, " 3"]:
     """Return the direction that pictures call up: y, unless photographs were held otherwise.
 
-    The frame has y up where a plane or level cameras told it; where they did not, up is that of
-    the photographs on average.
+    The frame has y up where a plane or level cameras showed it; otherwise up is that of the
+    photographs on average.
     """
     mean = normalize(-cameras.cam_from_world[:, 1, :3].mean(dim=0), dim=0)
     return torch.tensor([0.0, 1.0, 0.0]).to(mean) if float(mean[1]) > 0.5 else mean
@@ -40,12 +40,12 @@ def up_world(cameras: Cameras) -> Float[Tensor, " 3"]:
 def draw_turn(
     mesh: Mesh, cameras: Cameras, reference: int, path: Path | str, side_px: int = 280
 ) -> None:
-    """Draw a surface turning once round, its shape on the left and its albedo lit on the right.
+    """Draw one turn of a surface, its shape on the left and its lit albedo on the right.
 
-    An animated WebP with a transparent ground. The light stays beside the viewer.
+    An animated WebP with a transparent ground. The light stays next to the viewer.
 
     Args:
-        cameras: Of the photographs, which tell where up is.
+        cameras: Of the photographs, which show where up is.
         reference: View whose side of the surface is seen first.
     """
     mesh, cameras = mesh.to("cpu"), cameras.to("cpu")
@@ -58,7 +58,18 @@ def draw_turn(
     look = torch.cat([normals, colors], dim=1)
 
     def drawn(view: int) -> Image.Image:
-        return _drawn(cast_view(mesh, circle, view), look, mesh, circle.cam_from_world[view])
+        """Draw the shape and the lit albedo side by side, averaged over the pixels' parts."""
+        hits, pose = cast_view(mesh, circle, view), circle.cam_from_world[view]
+        seen = hits.face >= 0
+        values = hits.take(seen).interpolate(look, mesh.faces)
+        shading = lambertian(normalize(rotate(pose, values[:, :3]), dim=-1))[:, None]
+        lit = srgb_from_linear((_EXPOSURE * shading * values[:, 3:]).clamp(0, 1))
+        layers = seen.float().repeat(4, 2, 1, 1)
+        layers[:3, :, seen] = torch.stack([tone(shading).expand_as(lit), lit]).movedim(-1, 0)
+        colors = avg_pool2d(layers.transpose(1, 2).flatten(2), _OVERSAMPLING).movedim(0, -1)
+        opacity = colors[..., 3:]
+        picture = torch.cat([colors[..., :3] / opacity.clamp_min(1e-6), opacity], dim=-1)
+        return Image.fromarray((255 * picture).round().to(torch.uint8).numpy())
 
     frames = list(side_by_side(drawn, range(_FRAMES), tracked=False))
     frames[0].save(
@@ -76,11 +87,11 @@ def draw_turn(
 def circling(
     mesh: Mesh, up: Float[Tensor, " 3"], start: Float[Tensor, " 3"], number: int, side_px: int
 ) -> Cameras:
-    """Return square pinholes that look at a mesh from a circle round it.
+    """Return square pinholes that look at a mesh from a circle around it.
 
     Args:
         up: Unit, world frame.
-        start: Place above or below which the first one stands, world.
+        start: World point on whose side of the mesh the first pinhole is.
         number: Of cameras, equally far apart.
     """
     low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)
@@ -97,21 +108,3 @@ def circling(
     eyes = center + _MARGIN * radius / math.sin(half) * back
     focal_px = side_px / 2 / math.tan(half)
     return pinholes(look_at(eyes, center, up), focal_px, side_px, side_px)
-
-
-def _drawn(hits: Hits, look: Float[Tensor, "vertex 6"], mesh: Mesh, pose: Tensor) -> Image.Image:
-    """Draw the shape and the lit albedo side by side, averaged over the pixels' parts.
-
-    Args:
-        look: Normal and albedo of every vertex.
-    """
-    seen = hits.face >= 0
-    values = hits.take(seen).interpolate(look, mesh.faces)
-    shading = lambertian(normalize(rotate(pose, values[:, :3]), dim=-1))[:, None]
-    lit = srgb_from_linear((_EXPOSURE * shading * values[:, 3:]).clamp(0, 1))
-    layers = seen.float().repeat(4, 2, 1, 1)
-    layers[:3, :, seen] = torch.stack([tone(shading).expand_as(lit), lit]).movedim(-1, 0)
-    colors = avg_pool2d(layers.transpose(1, 2).flatten(2), _OVERSAMPLING).movedim(0, -1)
-    opacity = colors[..., 3:]
-    picture = torch.cat([colors[..., :3] / opacity.clamp_min(1e-6), opacity], dim=-1)
-    return Image.fromarray((255 * picture).round().to(torch.uint8).numpy())
