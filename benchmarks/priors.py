@@ -21,9 +21,9 @@ from torch.nn.functional import interpolate, normalize
 
 import pimper_torch as pt
 from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.metrics.estimates import estimate_of
 from pimper_bench.metrics.evaluation import EvaluateConfig, evaluate
 from pimper_bench.truth import Capture
-from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.records import Prior
 
 KINDS = ("none", "normals:2", "normals:2:5", "smooth:10", "smooth:10:5", "depth:5", "inliers")

@@ -22,13 +22,13 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
 import pimper_torch as pt
+from pimper_bench.metrics.estimates import estimate_of
 from pimper_bench.metrics.evaluation import EvaluateConfig, evaluate
 from pimper_bench.scenes.render_in_memory import render_objects
 from pimper_bench.scenes.scene_lights import Lights
 from pimper_bench.scenes.scene_settings import SceneConfig, SensorConfig, expose
 from pimper_bench.scenes.whole_scene import Scene, build_scene
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.ground.geometry.lens_models import undistort_pixels
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.radiometry import srgb_from_linear

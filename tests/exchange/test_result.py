@@ -8,10 +8,10 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
+from pimper_bench.metrics.estimates import estimate_of
 from pimper_torch.doors.exchange import read_result, read_written, write_formats
 from pimper_torch.doors.exchange.nerfstudio import write_nerfstudio
 from pimper_torch.doors.io import results
-from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import Encoding

@@ -5,8 +5,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.metrics.estimates import estimate_of
 from pimper_torch.doors.io import results
-from pimper_torch.doors.io.estimates import estimate_of, read_estimate
+from pimper_torch.doors.io.estimates import read_estimate
 from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.result.asset.mesh_files import MeshFiles

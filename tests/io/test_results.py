@@ -12,9 +12,10 @@ import yaml
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_bench.metrics.estimates import estimate_of
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.doors.io import results
-from pimper_torch.doors.io.estimates import estimate_of, read_estimate
+from pimper_torch.doors.io.estimates import read_estimate
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.reports import common_lights, lights_report, summary_report, world_lights
 from pimper_torch.doors.io.results import RESULT_NAMES, write_result

@@ -12,13 +12,13 @@ from torch import nn
 from pimper_bench.baselines.openmvs import OpenMvs
 from pimper_bench.baselines.smoothed import Smoothed
 from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.metrics.estimates import estimate_of
 from pimper_bench.metrics.evaluation import EvaluateConfig, prepared_surface
 from pimper_bench.metrics.similarity import pair_views
 from pimper_bench.metrics.surface_distances import TrueSurface
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.truth import Capture
-from pimper_torch.doors.io.estimates import estimate_of
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.method.chains.chain_config import Config, load_config
 from pimper_torch.method.chains.presets import make_chain

@@ -7,6 +7,7 @@ from pimper_bench.metrics.camera_errors import (
     compare_lights,
 )
 from pimper_bench.metrics.dtu_protocol import DtuFigures, dtu_figures, thin
+from pimper_bench.metrics.estimates import estimate_of
 from pimper_bench.metrics.evaluation import EvaluateConfig, Evaluation, evaluate
 from pimper_bench.metrics.figure_rows import FigureRow, report, rows
 from pimper_bench.metrics.in_view import (
@@ -52,6 +53,7 @@ __all__ = [
     "compare_cameras",
     "compare_lights",
     "dtu_figures",
+    "estimate_of",
     "evaluate",
     "pair_views",
     "relative_error",

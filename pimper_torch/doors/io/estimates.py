@@ -8,48 +8,22 @@ from torch import Tensor
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.io.reports import common_lights
-from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.method.sfm.epipolar import pinholes_of
 from pimper_torch.method.sfm.model_files import read_model
-from pimper_torch.records import Estimate, Reconstruction
+from pimper_torch.records import Estimate
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.numpy_files import read_npz
 
 _KIND = "a result of `pimper reconstruct`"
 
 
-def estimate_of(result: Reconstruction) -> Estimate:
-    """Take what a run of ours says about the object, in the frame that it is written in.
-
-    A view's light is that of the patches that determine it, taken together, NaN where none
-    does; see :func:`pimper_torch.doors.io.reports.common_lights`.
-    """
-    lights, counts = common_lights(result)
-    names, offset = result.scene.views.names, result.scene.offset_world
-    mesh, cameras = result.mesh, result.cameras
-    if offset != NO_OFFSET:
-        vertices = mesh.vertices_world.double()
-        mesh = mesh.replace(vertices_world=vertices + vertices.new_tensor(offset))
-        poses = from_local(cameras.cam_from_world, offset)
-        intrinsics = cameras.intrinsics.double()
-        cameras = cameras.replace(cam_from_world=poses, intrinsics=intrinsics)
-    return Estimate(
-        mesh=mesh,
-        names=names,
-        cameras=cameras,
-        lights_world=torch.where(counts[:, None] > 0, lights, torch.nan),
-        reference=names[result.coarse.reference],
-    )
-
-
 def read_estimate(path: Path | str) -> Estimate:
-    """Read what a method says about an object.
+    """Read a method's estimate of an object.
 
     Args:
-        path: A mesh or point cloud; or a folder with ``mesh.ply`` and, as far as they are
-            there, ``sparse/`` (COLMAP model whose pinholes are the cameras), ``lights.json``
-            and ``depth.npz`` (whose ``name`` is the reference view), as
+        path: A mesh or point cloud; or a folder with ``mesh.ply`` and, if it has them, ``sparse/``
+            (COLMAP model whose pinholes are the cameras), ``lights.json`` and ``depth.npz`` (whose
+            ``name`` is the reference view), as
             :func:`pimper_torch.doors.io.results.write_result` writes them.
     """
     path = Path(path)
