@@ -183,6 +183,15 @@ def test_an_object_without_texture_is_found_in_inverted_masks_and_nothing_else_i
         assert right_reading(bare.replace(views=views), views).inverted
 
 
+def test_without_a_cloud_the_masks_alone_are_compared(scene, truth):
+    bare, views = observing(scene, slice(0)), hard(scene.views, truth)
+    assert right_reading(bare.replace(views=views), views) is AS_THEY_ARE
+    views = hard(scene.views, truth[order((3, 11), (11, 3))])
+    with pytest.warns(PimperWarning, match=r"exchanged between (03|11)\.png"):
+        reading = right_reading(bare.replace(views=views), views)
+    assert torch.equal(read(views, reading), truth)
+
+
 def test_an_object_that_fills_its_photographs_is_not_taken_for_inverted(scene, truth):
     """Its masks run along the borders; points inside are wrong by as much as a cloud may be."""
     filling = hard(scene.views, torch.ones_like(truth))

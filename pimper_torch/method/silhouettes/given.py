@@ -143,7 +143,7 @@ def right_reading(scene: SparseScene, given: Views) -> Reading:
     names = list(evidence.borders)
     some = names[:: math.ceil(len(names) / _VIEWS)]
     pairs, (denied, involved) = evidence.of_points(), evidence.of_pixels(AS_THEY_ARE, some)
-    share = _share(pairs, AS_THEY_ARE)
+    share = evidence.share(pairs, AS_THEY_ARE)
     off = (share + denied) / 2
     if off < _LEAST:
         return AS_THEY_ARE
@@ -153,7 +153,7 @@ def right_reading(scene: SparseScene, given: Views) -> Reading:
     some = list(dict.fromkeys([*some, *doubted]))
     most = min(_CLEARLY * off, _MOST)
     readings = evidence.readings(given, doubted, ordered=scene.views.poses is None)
-    rated = [(_share(evidence.of_points(one, some), one) / 2, one) for one in readings]
+    rated = [(evidence.share(evidence.of_points(one, some), one) / 2, one) for one in readings]
     likely = sorted((one for one in rated if one[0] <= most), key=itemgetter(0))[:_TRIED]
     found = [(half + evidence.of_pixels(one, some)[0] / 2, one) for half, one in likely]
     best, reading = min(found, key=itemgetter(0), default=(math.inf, AS_THEY_ARE))
@@ -190,17 +190,6 @@ def around_and_inside(maps: Sequence[Raster]) -> tuple[float, float]:
         middle = one[high // 4 : -(-3 * high // 4), wide // 4 : -(-3 * wide // 4)]
         inside.append(middle.gt(0).float().mean())
     return float(torch.stack(around).mean()), float(torch.stack(inside).mean())
-
-
-def _share(pairs: Int[Tensor, "view 2"], reading: Reading) -> float:
-    """Return the fraction of pairs that contradict; 1 where hardly any point is in the masks.
-
-    An object without texture has no points: inverted masks need not show any.
-    """
-    wrong, total = int(pairs[:, 0].sum()), int(pairs.sum())
-    if total < _FEWEST:
-        return _MOST if reading.inverted else 1.0
-    return wrong / total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -267,22 +256,22 @@ class _Evidence:
         # An object that fills its photographs is in their middle, too.
         if inside < 0.75 < around:
             yield Reading(said="inverted", inverted=True)
+        alike = ordered and bool((views.sizes_px == views.sizes_px[0]).all())
+        for one, other in combinations(doubted, 2) if alike else ():
+            said = f"exchanged between {one} and {other}"
+            yield Reading(said=said, owners={one: other, other: one})
         square = bool((views.sizes_px[:, 0] == views.sizes_px[:, 1]).all())
         for turn, said in _TURNS.items():
             if turn < 5 or square:
                 yield Reading(said=said, turns=dict.fromkeys(names, turn))
         if views.orientations is not None:
-            told = zip(views.names, views.orientations.tolist(), strict=True)
+            told = zip(names, views.orientations.tolist(), strict=True)
             turns = {name: turn for name, turn in told if turn < 5 or square}
             yield Reading(said="of the pixels that files store, not turned by EXIF", turns=turns)
-        if bool((views.sizes_px == views.sizes_px[0]).all()) and ordered:
-            for one, other in combinations(doubted, 2):
-                said = f"exchanged between {one} and {other}"
-                yield Reading(said=said, owners={one: other, other: one})
-            for step in range(1, len(names)):
-                owners = dict(zip(names, (*names[step:], *names[:step]), strict=True))
-                said = f"shifted by {step} in the list ({names[0]} has that of {names[step]})"
-                yield Reading(said=said, owners=owners)
+        for step in range(1, len(names)) if alike else ():
+            owners = dict(zip(names, (*names[step:], *names[:step]), strict=True))
+            said = f"shifted by {step} in the list ({names[0]} has that of {names[step]})"
+            yield Reading(said=said, owners=owners)
 
     def read(self, reading: Reading, names: Iterable[str]) -> tuple[list[int], Maps]:
         """Return the views, of those named, whose mask a reading has, and distances to these."""
@@ -313,6 +302,19 @@ class _Evidence:
         wrong = (shown & own & (value < -margin)) | (seen & ~own & (value > margin))
         right = shown & own & (value >= -margin)
         return torch.stack([wrong.sum(dim=1), right.sum(dim=1)], dim=1)
+
+    def share(self, pairs: Int[Tensor, "view 2"], reading: Reading) -> float:
+        """Return the fraction of pairs that contradict; 1 where hardly any point is in the masks.
+
+        An object without texture has no points: inverted masks need not show any. A cloud with
+        hardly any point contradicts nothing.
+        """
+        wrong, total = int(pairs[:, 0].sum()), int(pairs.sum())
+        if int(self.seen.sum()) < _FEWEST:
+            return 0.0
+        if total < _FEWEST:
+            return _MOST if reading.inverted else 1.0
+        return wrong / total
 
     def of_pixels(
         self, reading: Reading, names: Sequence[str]
