@@ -83,8 +83,8 @@ from .records import Views as Views
 from .records.stored import load_record as load_record
 from .records.stored import save_record as save_record
 from .result import viz as viz
+from .result.asset.bake import Texture as Texture
 from .result.asset.finish import Simplify as Simplify
-from .result.asset.make import Texture as Texture
 from .result.asset.mesh_files import MeshFiles as MeshFiles
 from .result.relighting.held_out import Relight as Relight
 from .result.viewer.show import show as show

@@ -21,21 +21,3 @@ def brought() -> dict[str, str]:
     """Find what other distributions bring: the module of each command by its name."""
     found = {one.name: one.module for one in entry_points(group="pimper.commands")}
     return found if find_spec("pimper_bench") is None else OF_BENCH | found
-
-
-def listed(text: str, commands: dict[str, str]) -> str:
-    """Leave commands that are not there out of the help, and add what it does not know.
-
-    Args:
-        text: The help of all commands that are known, each on a line of its own.
-        commands: Those that other distributions bring.
-    """
-    lines = text.splitlines(keepends=True)
-    named = {line: line.split()[0] for line in lines if line.startswith("  ")}
-    kept = [line for line in lines if named.get(line) not in {*OF_BENCH} - {*commands}]
-    last = max(kept.index(line) for line in named if line in kept)
-    new = sorted({*commands} - {*named.values()})
-    kept[last + 1 : last + 1] = [
-        f"  {name:<26} brought by {commands[name].partition('.')[0]}\n" for name in new
-    ]
-    return "".join(kept)

@@ -21,9 +21,9 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from typing import TextIO
+from typing import Any
 
-from pimper_torch.cli.commands import OF_BENCH, brought, listed
+from pimper_torch.cli.commands import OF_BENCH, brought
 from pimper_torch.cli.deaths import write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
@@ -39,27 +39,30 @@ usage: pimper COMMAND [options]
 Photographs from many viewpoints under many unknown lights, to a dense surface with normals,
 albedo and light.
 
-  reconstruct PHOTOS -o OUT  a folder of photographs
-  batch LIST -o OUT          many objects, on this machine or on an engine
-  doctor [PHOTOS]            what is installed here, and what photographs are worth, before a run
-  demo                       the photographs of a skull that come with the package
-  config [NAME]              the settings of a preset and what they mean, or one of them
-  render SCENE -o OUT        photographs of a scene with known truth
-  export RESULT -o OUT       a result in the layouts of other programs
-  evaluate RESULT TRUTH      a result against the truth
-  bench                      the table: scenes, presets and baselines
-  convert DATA -o OUT        a data set of another layout, or to one
-  gamma PHOTOS               the response of photographs from a fixed camera under several lights
-  view OUT                   a result in the browser, to turn and to light
-  frames VIDEO -o OUT        photographs out of a video: sharp frames, equally far apart on the way
-  markers -o SHEET           a sheet to print and to photograph with an object, which tells its size
-  clean OUT                  what runs into a folder kept to go on from, and what killed runs left
+{}
 
 `pimper COMMAND --help` tells the options, `--help-all` those of every stage, too.
 
 Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpected; 130 interrupted;
 143 terminated; 137 killed and 139 crashed, as a rule for want of memory.
 """
+_ABOUT = {
+    "reconstruct PHOTOS -o OUT": "a folder of photographs",
+    "batch LIST -o OUT": "many objects, on this machine or on an engine",
+    "doctor [PHOTOS]": "what is installed here, and what photographs are worth, before a run",
+    "demo": "the photographs of a skull that come with the package",
+    "config [NAME]": "the settings of a preset and what they mean, or one of them",
+    "render SCENE -o OUT": "photographs of a scene with known truth",
+    "export RESULT -o OUT": "a result in the layouts of other programs",
+    "evaluate RESULT TRUTH": "a result against the truth",
+    "bench": "the table: scenes, presets and baselines",
+    "convert DATA -o OUT": "a data set of another layout, or to one",
+    "gamma PHOTOS": "the response of photographs from a fixed camera under several lights",
+    "view OUT": "a result in the browser, to turn and to light",
+    "frames VIDEO -o OUT": "photographs out of a video: sharp frames, equally far apart on the way",
+    "markers -o SHEET": "a sheet to print and to photograph with an object, which tells its size",
+    "clean OUT": "what runs into a folder kept to go on from, and what killed runs left",
+}
 # Where each of this package is carried out. `checked` reads and checks the arguments; `--help` ends
 # it with SystemExit. It and `run` refuse with PimperError before anything is written.
 _COMMANDS = {
@@ -93,8 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Those of the process unless given.
 
     Returns:
-        0 for success; 2 for anything the user can correct, in one paragraph; 130 when interrupted,
-        143 when terminated; 1 for anything unexpected, whose traceback is kept in a file.
+        The exit code, see above. The traceback of anything unexpected is kept in a file.
     """
     if arguments is None:
         _print_anything()
@@ -111,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _print_anything() -> None:
-    """Let no character be one that cannot be printed, and no stream be closed."""
+    """Replace closed streams, and escape characters that a stream cannot print."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -122,7 +124,7 @@ def _print_anything() -> None:
 
 def _main(given: list[str]) -> int:
     if not given or given[0] in ("-h", "--help", "--help-all"):
-        sys.stdout.write(listed(_HELP, brought()))
+        sys.stdout.write(_help())
         return 0 if given else _BAD_INPUT
     if given[0] == "--version":
         sys.stdout.writelines(f"{name} {version}\n" for name, version in versions().items())
@@ -142,6 +144,15 @@ def _main(given: list[str]) -> int:
     except (Exception, KeyboardInterrupt) as error:
         return _failed(output, error)
     return 0
+
+
+def _help() -> str:
+    """List the commands that are there, those of other distributions that have no line last."""
+    home = commands()
+    lines = {usage: about for usage, about in _ABOUT.items() if usage.split()[0] in home}
+    others = {*home} - {usage.split()[0] for usage in lines}
+    lines |= {name: f"brought by {home[name].partition('.')[0]}" for name in sorted(others)}
+    return _HELP.format("\n".join(f"  {usage:<26} {about}" for usage, about in lines.items()))
 
 
 def commands() -> dict[str, str]:
@@ -173,7 +184,7 @@ def _run(command: str, home: str, arguments: list[str], output: Output) -> None:
 
 
 def _prepare_threads() -> None:
-    """Set what torch and the C library read once."""
+    """Set variables and options that torch and the C library read once."""
     # Threads that spin while they wait take the processor from those they wait for when the
     # machine is busy, and many small steps then take ten times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -227,7 +238,7 @@ def _failed(output: Output, error: BaseException) -> int:
 
 
 def _of_the_world(error: BaseException) -> str | None:
-    """Report of an error that is no fault of the package what to do; ``None`` of any other."""
+    """Return advice for an error that is not the package's fault; ``None`` for any other."""
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return (
             "memory ran out; no result was written. Shrink the photographs (`--max-size-px`), "
@@ -247,18 +258,11 @@ def _readable_warnings(output: Output) -> Iterator[None]:
         warnings.simplefilter("always", PimperWarning)
         usual = warnings.showwarning
 
-        def show(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:
+        def show(message: Warning | str, category: type[Warning], *at: Any, **where: Any) -> None:  # noqa: ANN401
             if issubclass(category, PimperWarning):
                 output.warning(str(message))
             elif output.shows("warning"):
-                usual(message, category, filename, lineno, file, line)
+                usual(message, category, *at, **where)
 
         warnings.showwarning = show
         yield

@@ -1,8 +1,5 @@
 """Frozen data that travels between stages; no algorithms."""
 
-from pimper_torch.records.estimate import Estimate as Estimate
-from pimper_torch.records.failure import Failure as Failure
-from pimper_torch.records.failure import LeftOut as LeftOut
 from pimper_torch.records.finished import Closed as Closed
 from pimper_torch.records.finished import Finished as Finished
 from pimper_torch.records.finished import Judged as Judged
@@ -34,6 +31,9 @@ from pimper_torch.records.priors import MapPrior as MapPrior
 from pimper_torch.records.priors import NormalPrior as NormalPrior
 from pimper_torch.records.priors import Prior as Prior
 from pimper_torch.records.priors import SilhouettePrior as SilhouettePrior
+from pimper_torch.records.reconstruction import Estimate as Estimate
+from pimper_torch.records.reconstruction import Failure as Failure
+from pimper_torch.records.reconstruction import LeftOut as LeftOut
 from pimper_torch.records.reconstruction import Reconstruction as Reconstruction
 from pimper_torch.records.reconstruction import StageReport as StageReport
 from pimper_torch.records.record import Record as Record

@@ -14,7 +14,7 @@ from typing import TypeVar
 import torch
 from jaxtyping import Int
 
-from pimper_torch.records.failure import Failure, LeftOut
+from pimper_torch.records.reconstruction import Failure, LeftOut
 from pimper_torch.runtime.errors import (
     NumericalError,
     OnFailure,

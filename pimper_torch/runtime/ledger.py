@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ground.shapes import Faces, Vertices
-from pimper_torch.records.failure import LeftOut, What
+from pimper_torch.records.reconstruction import LeftOut, What
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.journal import Journal, current, writing
 

@@ -37,8 +37,8 @@ from pimper_torch.method.silhouettes.find import FindSilhouettes as FindSilhouet
 from pimper_torch.method.silhouettes.trace import TraceContours as TraceContours
 from pimper_torch.method.sweep.sweep import Sweep as Sweep
 from pimper_torch.paper.triangulate import Triangulate as Triangulate
+from pimper_torch.result.asset.bake import Texture as Texture
 from pimper_torch.result.asset.finish import Simplify as Simplify
-from pimper_torch.result.asset.make import Texture as Texture
 from pimper_torch.result.relighting.held_out import Relight as Relight
 from pimper_torch.runtime.stage import Given as Given
 from pimper_torch.runtime.stage import Stage as Stage

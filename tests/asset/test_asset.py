@@ -24,9 +24,8 @@ from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear
 from pimper_torch.records import Cameras, Mesh, Textured
 from pimper_torch.result.asset import atlas as atlases
 from pimper_torch.result.asset.atlas import MAX_SIDE, by_triangles, unwrapped
-from pimper_torch.result.asset.bake import baked
+from pimper_torch.result.asset.bake import baked, textured
 from pimper_torch.result.asset.inpaint import inpainted
-from pimper_torch.result.asset.make import textured
 from pimper_torch.result.asset.placement import Placement, standing
 from pimper_torch.result.asset.tangents import tangents
 from pimper_torch.result.asset.usd import write_usdz

@@ -7,7 +7,7 @@ from pimper_torch.doors.io.reports import relighting_report
 from pimper_torch.ground.geometry.poisson import reduced
 from pimper_torch.method.chains.coarse_to_fine import held_apart
 from pimper_torch.records import Silhouettes
-from pimper_torch.result.asset.make import textured
+from pimper_torch.result.asset.bake import textured
 from pimper_torch.result.relighting.held_out import Relight, judge_textures
 from pimper_torch.runtime.errors import ConfigError
 from tests.relighting.ball import ball_mesh, photographed

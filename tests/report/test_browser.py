@@ -13,7 +13,7 @@ from PIL import Image
 
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Judged, Materials, Relighting, Silhouettes
-from pimper_torch.result.asset.make import textured
+from pimper_torch.result.asset.bake import textured
 from pimper_torch.result.asset.placement import Placement, standing
 from pimper_torch.result.asset.write import write_asset
 from pimper_torch.result.relighting.held_out import predict

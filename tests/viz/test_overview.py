@@ -18,8 +18,8 @@ from pimper_torch.result.viz.overview import (
     draw_overview,
     draw_preview,
     headline,
+    panels_of,
     thumbnails,
-    tiles,
 )
 from pimper_torch.result.viz.render import frame, shade
 
@@ -37,7 +37,7 @@ def thumbnail(picture):
 
 def test_every_picture_is_another_and_on_the_sheet(reconstruction, tmp_path):
     draw_overview(reconstruction, tmp_path / "overview.png", 120)
-    shown = tiles(reconstruction, 120)
+    shown = panels_of(reconstruction, 120)
     assert len(shown) == 8
     assert shown[0].title == "photograph b.png"
     whole = drawn(tmp_path / "overview.png")
@@ -63,7 +63,7 @@ def test_facets_lie_where_the_photograph_shows_their_corners(reconstruction):
     images = (away < 1.2).float().expand(3, 3, 40, 60)
     scene = reconstruction.scene.replace(views=views.replace(images=images))
     photograph, facets = (
-        tile.picture for tile in tiles(reconstruction.replace(scene=scene), 300)[:2]
+        tile.picture for tile in panels_of(reconstruction.replace(scene=scene), 300)[:2]
     )
     yellow = (facets[..., 0] > 0.5) & (facets[..., 2] < 0.7 * facets[..., 0])
     spots, count = ndimage.label(photograph[..., 0] > 0.5)
@@ -91,7 +91,7 @@ def test_silhouettes_are_drawn_over_the_photograph_and_all_views_below(reconstru
     reliable = torch.tensor([True, False, True])
     silhouettes = Silhouettes(inside=inside, reliable=reliable, source="found")
     outlined = reconstruction.replace(silhouettes=silhouettes)
-    marked, bare = tiles(outlined, 60)[0].picture, tiles(reconstruction, 60)[0].picture
+    marked, bare = panels_of(outlined, 60)[0].picture, panels_of(reconstruction, 60)[0].picture
     assert 20 < (marked != bare).any(axis=-1).sum() < 400
     draw_overview(outlined, tmp_path / "outlined.png", 200)
     draw_overview(reconstruction, tmp_path / "bare.png", 200)

@@ -14,8 +14,8 @@ from pimper_torch.doors.exchange.result import read_result
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.surfaces import unit_face_normals
 from pimper_torch.records import Mesh
+from pimper_torch.result.asset.bake import Texture
 from pimper_torch.result.asset.finish import Simplify
-from pimper_torch.result.asset.make import Texture
 from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.asset.write import write_asset
 from pimper_torch.result.relighting.held_out import Relight

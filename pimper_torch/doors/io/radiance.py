@@ -39,18 +39,18 @@ class _Kind(NamedTuple):
     response: Response
 
 
-# Levels of saturation of files of a kind, fractions of full scale, one a colour.
-_Whites = Mapping[_Kind, Float[Tensor, " channel"]]
+Images = Float[Tensor, "view channel height width"]
+Planes = Float[Tensor, "channel height width"]
+Levels = Float[Tensor, " channel"]  # fractions of full scale, one a colour
+Sizes = Sequence[tuple[int, int]]  # width and height
+_Whites = Mapping[_Kind, Levels]  # of saturation, where it was found
 # Of all files of a kind: how often each level occurs, and in how many files it does so often.
 _Tally = Int[Tensor, "2 channel level"]
 
 
 def read_pictures(
-    paths: Sequence[Path | str],
-    headers: Sequence[Header],
-    sizes_px: Sequence[tuple[int, int]],
-    encoding: Encoding,
-) -> tuple[Float[Tensor, "view channel height width"], tuple[Mask | None, ...]]:
+    paths: Sequence[Path | str], headers: Sequence[Header], sizes_px: Sizes, encoding: Encoding
+) -> tuple[Images, tuple[Mask | None, ...]]:
     """Read image files as linear radiance that is 1 where the sensor saturates.
 
     Black is taken away, values above saturation are cut off. Files whose saturation is to be
@@ -90,9 +90,7 @@ def read_pictures(
     return images, opaque
 
 
-def radiance_of(
-    decoded: Decoded, response: Response, black: Scalar, white: Float[Tensor, " channel"]
-) -> Float[Tensor, "channel height width"]:
+def radiance_of(decoded: Decoded, response: Response, black: Scalar, white: Levels) -> Planes:
     """Undo the response, so that ``black`` becomes 0 and ``white``, or more, 1.
 
     Args:
@@ -105,9 +103,7 @@ def radiance_of(
     return ((response.linear_from_encoded(decoded.samples) - dark) / span).clamp(0, 1)
 
 
-def resized(
-    planes: Float[Tensor, "channel height width"], width: int, height: int
-) -> Float[Tensor, "channel {height} {width}"]:
+def resized(planes: Planes, width: int, height: int) -> Float[Tensor, "channel {height} {width}"]:
     """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
     if tuple(planes.shape[-2:]) == (height, width):
         return planes
@@ -117,7 +113,7 @@ def resized(
 
 
 def resized_radiance(
-    radiance: Float[Tensor, "channel height width"], width: int, height: int
+    radiance: Planes, width: int, height: int
 ) -> Float[Tensor, "channel {height} {width}"]:
     """Shrink radiance; a pixel made of some that are saturated is saturated, colour by colour.
 
@@ -140,11 +136,7 @@ def resized_mask(
 
 
 def _fill(
-    images: Float[Tensor, "view channel height width"],
-    paths: Sequence[Path],
-    sizes_px: Sequence[tuple[int, int]],
-    encoding: Encoding,
-    whites: _Whites,
+    images: Images, paths: Sequence[Path], sizes_px: Sizes, encoding: Encoding, whites: _Whites
 ) -> tuple[tuple[Mask | None, ...], dict[_Kind, _Tally]]:
     """Write the radiance of each file into the images, and count its levels.
 
@@ -239,8 +231,8 @@ def _low_levels(tallies: Mapping[_Kind, _Tally], whites: _Whites) -> Iterator[st
 
 
 def _levels(
-    encoding: Encoding, decoded: Decoded, path: Path, found: Float[Tensor, " channel"] | None
-) -> tuple[Scalar, Float[Tensor, " channel"]]:
+    encoding: Encoding, decoded: Decoded, path: Path, found: Levels | None
+) -> tuple[Scalar, Levels]:
     """Return black and white of a file as fractions of its full scale."""
     full, channels = decoded.full, decoded.samples.shape[0]
     saturation, black = encoding.saturation, encoding.black

@@ -7,15 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.doors.size.given import Mark, Pointer, number_of, require_inside
+from pimper_torch.ground.geometry import supporting_plane
 from pimper_torch.ground.geometry.lens_models import undistort_pixels
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import invert_rigid
-from pimper_torch.ground.geometry.supporting_plane import (
-    Plane,
-    fixation,
-    supporting_plane,
-    well_tracked,
-)
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
@@ -178,13 +173,13 @@ def _beside(
     return eye + float(depth[nearest]) * ray
 
 
-def ground(scene: SparseScene, silhouettes: Silhouettes) -> Plane | None:
+def ground(scene: SparseScene, silhouettes: Silhouettes) -> supporting_plane.Plane | None:
     """Return the plane that the object stands on: the silhouettes', else that of the cloud."""
     if len(silhouettes.planes_world):
         found = silhouettes.planes_world[0].detach().cpu()  # of the first series, whose up is up
         length = found[:3].norm()
-        return Plane(normal_world=found[:3] / length, offset=-found[3] / length)
+        return supporting_plane.Plane(normal_world=found[:3] / length, offset=-found[3] / length)
     cameras = scene.cameras.detach().to("cpu")
-    points = scene.points_world.detach()[well_tracked(scene)].cpu()
-    distance = float(fixation(cameras.cam_from_world).distance)
-    return supporting_plane(points, cameras.centers_world, distance)
+    points = scene.points_world.detach()[supporting_plane.well_tracked(scene)].cpu()
+    distance = float(supporting_plane.fixation(cameras.cam_from_world).distance)
+    return supporting_plane.supporting_plane(points, cameras.centers_world, distance)

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 from torch import Tensor
 
-from pimper_torch import records
+import pimper_torch.records as records
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.records import Record
 from pimper_torch.runtime.config import require

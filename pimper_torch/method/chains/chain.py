@@ -39,8 +39,8 @@ from pimper_torch.records import (
     Textured,
     Views,
 )
+from pimper_torch.result.asset.bake import Texture
 from pimper_torch.result.asset.finish import Simplify
-from pimper_torch.result.asset.make import Texture
 from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.relighting.held_out import Relight, judge_textures
 from pimper_torch.runtime.config import nearest

@@ -1,4 +1,4 @@
-"""Textures of a mesh of few faces, read off the surface that it stands for."""
+"""Textures of a mesh of few faces, read off the surface that it approximates."""
 
 import torch
 from jaxtyping import Float, Int
@@ -11,12 +11,42 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.ground.shapes import Mask, PerVertex, Vertices
-from pimper_torch.records import Mesh, Textured
-from pimper_torch.result.asset.atlas import Atlas
-from pimper_torch.result.asset.inpaint import INPAINTED
+from pimper_torch.records import Mesh, Relighting, Textured
+from pimper_torch.result.asset.atlas import Atlas, unwrapped
+from pimper_torch.result.asset.inpaint import INPAINTED, inpainted
 from pimper_torch.result.asset.tangents import frames, tangents
 from pimper_torch.result.viz.maps import albedo_scale, base_color, carried_normals
 from pimper_torch.runtime.parallel import side_by_side
+from pimper_torch.runtime.stage import Stage
+
+# Texels along a median side of the surface's faces.
+_TEXELS_PER_SIDE = 1.5
+
+
+class Texture(Stage):
+    """Bake a surface and its materials onto few faces, see :func:`textured`."""
+
+    def forward(self, full: Mesh, few: Mesh, relighting: Relighting) -> Textured:
+        """Bake it.
+
+        Args:
+            few: The mesh whose vertices have the materials.
+        """
+        return textured(full, few, relighting.materials.at_vertices())
+
+
+def textured(full: Mesh, few: Mesh, reflectance: Vertices | None = None) -> Textured:
+    """Bake a surface onto few faces, without albedo that is implausibly bright.
+
+    Args:
+        full: The surface, on the CPU.
+        few: The same of fewer faces.
+        reflectance: Metallic, roughness and specular of its vertices; matte without.
+    """
+    full, few = (one.detach().to(torch.float32) for one in (full, few))
+    side = float(surfaces.side_lengths(full.vertices_world[full.faces]).median())
+    full, doubt = inpainted(full)
+    return baked(full, few, unwrapped(few, side / _TEXELS_PER_SIDE), reflectance, doubt)
 
 
 def halved(asset: Textured) -> Textured:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d, interpolate, max_pool2d
+from torch.nn.functional import adaptive_avg_pool2d, interpolate, max_pool2d, pad
 
 from pimper_torch.ground.geometry.poisson import reduced
 from pimper_torch.ground.geometry.projection import project
@@ -21,18 +21,9 @@ from pimper_torch.records import (
     SparseScene,
     Views,
 )
+from pimper_torch.result.viz import tiles
 from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.result.viz.render import bounding_box, crop, frame, rotation, shade
-from pimper_torch.result.viz.tiles import (
-    TALLEST,
-    Picture,
-    Tile,
-    array,
-    encoded,
-    fitted,
-    sheet,
-    with_triangles,
-)
 from pimper_torch.runtime.mapped import drop_pages
 
 _ACROSS, _PANEL_PX = 4, 390
@@ -43,21 +34,20 @@ _THUMBNAILS_ACROSS, _THUMBNAILS_DOWN = 8, 8
 def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PANEL_PX) -> None:
     """Draw the contact sheet of a run as PNG.
 
-    Shown in the reference view, cropped to the object: the photograph, the facets over it
-    and shaded, the normals and albedo that the mesh carries, the mesh's own shape shaded,
-    and that again from 40 degrees to the left and to the right. Where silhouettes are known they
-    are drawn over the photograph, and below over small photographs of all views, or of 64 where
-    there are more, red where a view is not trusted.
+    In the reference view, cropped to the object: the photograph, the facets over it and shaded, the
+    normals and albedo that the mesh carries, the mesh's own shape shaded, and that again from 40
+    degrees to the left and to the right. Known silhouettes are drawn over the photograph, and below
+    over small photographs of all views, 64 at most, red where a view is not trusted.
     """
-    shown = tiles(result, panel_px)
+    shown = panels_of(result, panel_px)
     rows = [shown[first : first + _ACROSS] for first in range(0, len(shown), _ACROSS)]
     if result.silhouettes.source != "everything":
         rows.append([_all_views(result, _ACROSS * panel_px)])
-    sheet(rows, panel_px, headline(result)).save(path, compress_level=3)
+    tiles.sheet(rows, panel_px, headline(result)).save(path, compress_level=3)
 
 
-def tiles(result: Reconstruction, panel_px: int) -> list[Tile]:
-    """Make the pictures of the contact sheet."""
+def panels_of(result: Reconstruction, panel_px: int) -> list[tiles.Tile]:
+    """Draw the pictures of the contact sheet."""
     reference = result.coarse.reference
     own = result.cameras.take([reference])
     shape = reduced(result.mesh, 200_000)  # more than a panel has pixels to show
@@ -71,21 +61,21 @@ def tiles(result: Reconstruction, panel_px: int) -> list[Tile]:
     coarse = result.coarse.mesh
     shown = {
         f"photograph {name}": outlined,
-        f"{len(coarse.faces)} facets on {len(coarse.vertices_world)} points": with_triangles(
+        f"{len(coarse.faces)} facets on {len(coarse.vertices_world)} points": tiles.with_triangles(
             0.45 * photograph, corners, _FACETS
         ),
-        "facets, shaded": array(shade(coarse, camera, flat=True)),
-        "surface, shaded": array(shade(shape, camera)),
-        "normals": array(normal_colors(maps.normals_cam)),
-        "albedo": encoded(albedo_scale(result.mesh) * maps.albedo),
-        "surface from 40° left": array(shade(shape, sides[0])),
-        "surface from 40° right": array(shade(shape, sides[1])),
+        "facets, shaded": tiles.array(shade(coarse, camera, flat=True)),
+        "surface, shaded": tiles.array(shade(shape, camera)),
+        "normals": tiles.array(normal_colors(maps.normals_cam)),
+        "albedo": tiles.encoded(albedo_scale(result.mesh) * maps.albedo),
+        "surface from 40° left": tiles.array(shade(shape, sides[0])),
+        "surface from 40° right": tiles.array(shade(shape, sides[1])),
     }
-    return [Tile(title=title, picture=picture) for title, picture in shown.items()]
+    return [tiles.Tile(title=title, picture=picture) for title, picture in shown.items()]
 
 
-def _all_views(result: Reconstruction, width_px: int) -> Tile:
-    """Show photographs with their silhouettes: of many a selection, those not trusted first."""
+def _all_views(result: Reconstruction, width_px: int) -> tiles.Tile:
+    """Draw photographs with their silhouettes: all, or a selection with those not trusted."""
     silhouettes = result.silhouettes
     shown = _selected(silhouettes.reliable.cpu())
     small = thumbnails(
@@ -96,11 +86,11 @@ def _all_views(result: Reconstruction, width_px: int) -> Tile:
     title = f"{origin}, {int(silhouettes.reliable.sum())} of {count} views trusted"
     if len(shown) < count:
         title += f", {len(shown)} shown"
-    return Tile(title=title, picture=array(small), wide=True)
+    return tiles.Tile(title=title, picture=tiles.array(small), wide=True)
 
 
 def _selected(reliable: Bool[Tensor, " view"]) -> list[int]:
-    """Return the views that are shown, in order: of those that are trusted evenly many."""
+    """Choose the views that are drawn, in order: those not trusted, the others evenly."""
     most = _THUMBNAILS_ACROSS * _THUMBNAILS_DOWN
     doubted = (~reliable).nonzero()[:most, 0]
     trusted = reliable.nonzero()[:, 0]
@@ -113,11 +103,11 @@ def _framed(camera: Cameras, vertices: Vertices, width_px: int) -> Cameras:
     """Crop a camera's picture to the object, at the size that its panel has on the sheet."""
     low, high = bounding_box(camera, vertices, 0.05)
     width, height = (high - low).tolist()
-    return crop(camera, low, high, round(width_px * min(max(height / width, 1.0), TALLEST)))
+    return crop(camera, low, high, round(width_px * min(max(height / width, 1.0), tiles.TALLEST)))
 
 
 def headline(result: Reconstruction) -> str:
-    """State in a line what went in and what came out."""
+    """Return counts of the input and the result in a line."""
     taken = result.scene.views.num_views
     given = taken + len(result.scene.unregistered)
     seconds = sum(report.seconds for report in result.report)
@@ -130,7 +120,7 @@ def headline(result: Reconstruction) -> str:
 
 def _photograph(
     result: Reconstruction, own: Cameras, panel_px: int
-) -> tuple[Picture, Picture, Float[Tensor, "facet 3 2"]]:
+) -> tuple[tiles.Picture, tiles.Picture, Float[Tensor, "facet 3 2"]]:
     """Crop the reference photograph to the object.
 
     Returns:
@@ -143,11 +133,11 @@ def _photograph(
     left, top = (max(0, int(corner)) for corner in low.floor())
     right, bottom = (int(corner) for corner in high.ceil())
     box = slice(top, min(bottom, height)), slice(left, min(right, width))
-    image = encoded(result.scene.views.images[reference][:, *box].movedim(0, -1))
-    photograph = outlined = fitted(image, panel_px)
+    image = tiles.encoded(result.scene.views.images[reference][:, *box].movedim(0, -1))
+    photograph = outlined = tiles.fitted(image, panel_px)
     if result.silhouettes.source != "everything":
-        inside = array(result.silhouettes.inside[reference][box])[..., None]
-        drawn = torch.from_numpy(fitted(inside.repeat(3, axis=-1), panel_px)[..., 0] > 0.5)
+        inside = tiles.array(result.silhouettes.inside[reference][box])[..., None]
+        drawn = torch.from_numpy(tiles.fitted(inside.repeat(3, axis=-1), panel_px)[..., 0] > 0.5)
         outlined = photograph.copy()
         outlined[border(drawn).numpy()] = RELIABLE
     coarse = result.coarse.mesh
@@ -175,7 +165,7 @@ def thumbnails(
     wide = max(1, width_px // across)
     high = max(1, round(wide * height / width))
     rows = -(-len(shown) // across)
-    sheet = torch.ones(rows * high, across * wide, 3)
+    whole = torch.ones(rows * high, across * wide, 3)
     for place, view in enumerate(shown):
         image = adaptive_avg_pool2d(views.images[view].detach().cpu(), (high, wide))
         inside = adaptive_avg_pool2d(silhouettes.inside[view].cpu()[None], (high, wide))[0]
@@ -184,13 +174,13 @@ def thumbnails(
             RELIABLE if silhouettes.reliable[view] else DOUBTED
         )
         top, left = place // across * high, place % across * wide
-        sheet[top : top + high, left : left + wide] = tile
+        whole[top : top + high, left : left + wide] = tile
         drop_pages()
-    return sheet
+    return whole
 
 
 def border(mask: Mask) -> Mask:
-    """Find pixels of the mask next to others; the picture's edge is no border."""
+    """Find pixels of the mask next to others; the picture's edge is not a border."""
     beside = max_pool2d((~mask)[None].float(), kernel_size=3, stride=1, padding=1)[0] > 0
     return mask & beside
 
@@ -213,16 +203,13 @@ def draw_preview(
     size = (panel_px, max(1, round(panel_px * width / height)))
     photograph = interpolate(image, size=size, mode="area")[0].movedim(0, -1)
     center = mesh.vertices_world.mean(dim=0)
-    panels = [Image.fromarray(to_bytes(photograph.expand(*size, 3)).numpy())]
+    panels = [to_bytes(photograph.expand(*size, 3))]
     for angle in (0.0, -40.0, 40.0):
         camera = frame(rotation(own, center, angle), mesh.vertices_world, panel_px, 0.05)
         drawn = (255 * shade(mesh, camera)).round().to(torch.uint8)
-        panels.append(Image.fromarray(drawn.numpy()))
-    sheet = Image.new("RGB", (sum(one.width for one in panels), panel_px), "white")
-    left = 0
-    for panel in panels:
-        sheet.paste(panel, (left, (panel_px - panel.height) // 2))
-        left += panel.width
+        above = (panel_px - len(drawn)) // 2
+        below = panel_px - len(drawn) - above
+        panels.append(pad(drawn, (0, 0, 0, 0, above, below), value=255))
     fresh = path.with_name(f"{path.name}.new")
-    sheet.save(fresh, format="PNG")
+    Image.fromarray(torch.cat(panels, dim=1).numpy()).save(fresh, format="PNG")
     fresh.replace(path)

@@ -7,6 +7,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from pimper_torch.ground.geometry.visibility import cast_view
+from pimper_torch.ground.shapes import Maps
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -29,12 +30,12 @@ AnyPatch = PatchSet | PatchViews | PhotometricPatches | SweptPatches | DepthPatc
 def plot_patch(
     patch: AnyPatch, seen: PatchViews | None = None, sample: tuple[int, int] | None = None
 ) -> "Figure":
-    """Draw what a record says about one patch, on its template's raster.
+    """Draw the values of one patch in a record, on its template's raster.
 
     Of :class:`PatchViews` every view that shows it; of the others albedo, normals (red right, green
-    up, blue to the viewer), confidence and heights, as far as the record has them. With views
-    beside photometry, the residual of every sample, too, and a sample's radiance in every view that
-    has it, observed and predicted: the light on it.
+    up, blue to the viewer), confidence and heights, as far as the record has them. With views and
+    photometry, also the residual of every sample, and a sample's radiance in every view that has
+    it, observed and predicted.
 
     Args:
         patch: A record of one patch, such as ``heights[17]``.
@@ -70,7 +71,7 @@ def plot_patch(
     return figure
 
 
-def _residual(patch: AnyPatch, seen: PatchViews) -> Float[Tensor, "view height width"]:
+def _residual(patch: AnyPatch, seen: PatchViews) -> Maps:
     """Return observed less predicted gray radiance; NaN where a view has no sample."""
     facets = [one.buckets[0].facet.tolist() for one in (_templates(patch), seen.patches)]
     if isinstance(patch, PatchSet | PatchViews) or facets[0] != facets[1]:
@@ -85,10 +86,7 @@ def _residual(patch: AnyPatch, seen: PatchViews) -> Float[Tensor, "view height w
 
 
 def _draw_light(
-    axes: "Axes",
-    seen: PatchViews,
-    residual: Float[Tensor, "view height width"],
-    sample: tuple[int, int] | None,
+    axes: "Axes", seen: PatchViews, residual: Maps, sample: tuple[int, int] | None
 ) -> None:
     """Draw a sample's radiance in every view that has it, observed and predicted."""
     (views,), (templates,) = seen.buckets, seen.patches.buckets
