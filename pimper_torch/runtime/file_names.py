@@ -73,47 +73,39 @@ def match_poses(
 ) -> list[int | None]:
     """Find the file of each photograph, or of the pose whose folder the photograph is in.
 
-    Where none is found by :func:`match_files`, it is that of another photograph in the folder, else
-    the one that is called like the folder, else the only one in a folder of that name.
+    Where some files are in folders that are named like poses, these are the photographs' own, pose
+    by pose; else all files may be. A photograph without a file by :func:`match_files` has that of
+    another photograph of its pose, else the file that is named like the pose, else the only file
+    in the folder of the pose.
 
     >>> match_poses(["p1/a.jpg", "p1/b.jpg", "p2/a.jpg"], ["p2.png", "p1/b.jpg"], where="", what="")
     [1, 1, 0]
     """
     poses = [name.rpartition("/")[0] for name in wanted]
-    folders = [next(iter(_folders(name)), "") for name in present]
-    found: list[int | None] = [None] * len(wanted)
+    own = {
+        pose: [at for at, name in enumerate(present) if _folders(name)[:1] == [_folded(pose)]]
+        for pose in poses
+        if pose
+    }
 
-    def match(views: Sequence[int], places: Sequence[int]) -> None:
-        names = [wanted[view] for view in views], [present[place] for place in places]
-        matched = match_files(*names, folder=folder, where=where, what=what)
-        for view, at in zip(views, matched, strict=True):
-            found[view] = None if at is None else places[at]
+    def match(names: Sequence[str], places: Sequence[int]) -> dict[str, int]:
+        files = [present[place] for place in places]
+        matched = match_files(names, files, folder=folder, where=where, what=what)
+        return {
+            name: places[at] for name, at in zip(names, matched, strict=True) if at is not None
+        }
 
-    for pose in dict.fromkeys(filter(None, poses)):
-        own = [place for place, one in enumerate(folders) if one == _folded(pose)]
-        match([view for view, one in enumerate(poses) if one == pose], own)
-    known = {place for place in found if place is not None}
-    elsewhere = [
-        place for place, one in enumerate(folders) if place not in known and not (known and one)
-    ]
-    match([view for view, place in enumerate(found) if place is None], elsewhere)
-
+    found = {} if any(own.values()) else match(wanted, range(len(present)))
+    for pose, places in own.items():
+        found |= match([name for name, of in zip(wanted, poses, strict=True) if of == pose], places)
     of_pose: dict[str, int] = {}
-    for pose, place in zip(poses, found, strict=True):
-        if pose and place is not None:
-            of_pose.setdefault(pose, place)
-    free = [place for place in range(len(present)) if place not in found]
-    alone = [folders[place] for place in free]
-    alone = [one if alone.count(one) == 1 else "" for one in alone]
-    for called in ([present[place] for place in free], alone):
-        lost = [pose for pose in dict.fromkeys(filter(None, poses)) if pose not in of_pose]
-        for pose, at in zip(lost, match_files(lost, called, where=where, what=what), strict=True):
-            if at is not None:
-                of_pose[pose] = free[at]
-    return [
-        of_pose.get(pose) if place is None else place
-        for pose, place in zip(poses, found, strict=True)
-    ]
+    for name, pose in zip(wanted, poses, strict=True):
+        if pose and name in found:
+            of_pose.setdefault(pose, found[name])
+    lost = [pose for pose in own if pose not in of_pose]
+    of_pose |= {pose: own[pose][0] for pose in lost if len(own[pose]) == 1}
+    of_pose |= match(lost, [at for at in range(len(present)) if at not in found.values()])
+    return [found.get(name, of_pose.get(pose)) for name, pose in zip(wanted, poses, strict=True)]
 
 
 def _of_one_folder(
