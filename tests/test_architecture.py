@@ -12,7 +12,7 @@ import pytest
 
 import pimper_bench
 import pimper_torch
-from pimper_torch.cli.commands import OF_BENCH
+from pimper_torch.cli.main import OF_BENCH
 
 PACKAGE = Path(pimper_torch.__file__).parent
 BENCH = Path(pimper_bench.__file__).parent

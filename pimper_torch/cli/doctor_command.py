@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from pimper_torch.cli.arguments import read_arguments
-from pimper_torch.cli.doctor.findings import Finding
+from pimper_torch.cli.doctor.findings import Finding, machine
 from pimper_torch.cli.output import Output
 from pimper_torch.doors.io.photograph_files import list_images
 from pimper_torch.ground.radiometry import FROM_FILES, Encoding
@@ -36,7 +36,6 @@ class _Job:
 def run(job: _Job, output: Output) -> None:
     """Carry out ``doctor``: tell each finding in a line, with what to do."""
     from pimper_torch.cli.doctor.checks import examine_folder
-    from pimper_torch.cli.doctor.machine import machine
     from pimper_torch.runtime.reporting import stage
 
     findings = list(machine())

@@ -21,9 +21,10 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from typing import Any
 
-from pimper_torch.cli.commands import OF_BENCH, brought
 from pimper_torch.cli.deaths import write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
@@ -77,6 +78,13 @@ _COMMANDS = {
     "frames": "pimper_torch.cli.frames",
     "markers": "pimper_torch.cli.markers",
     "clean": "pimper_torch.cli.clean",
+}
+# Those of `pimper-bench`, which serve in a checkout that is not installed, too.
+OF_BENCH = {
+    "render": "pimper_bench.cli.render_command",
+    "evaluate": "pimper_bench.cli.evaluate",
+    "bench": "pimper_bench.cli.bench",
+    "convert": "pimper_bench.cli.convert",
 }
 _LIGHT = ("batch", "clean", "config")  # carried out without torch, too
 _UNEXPECTED, _BAD_INPUT = 1, 2
@@ -156,8 +164,15 @@ def _help() -> str:
 
 
 def commands() -> dict[str, str]:
-    """List all commands, and where each is carried out."""
-    return brought() | _COMMANDS
+    """List all commands, and where each is carried out.
+
+    Other distributions bring some by entry points of the group ``pimper.commands``: the name is the
+    command's, the value the module. Its ``checked(command, arguments)`` reads and checks the
+    arguments, and its ``run(job, output)`` carries the command out.
+    """
+    found = {one.name: one.module for one in entry_points(group="pimper.commands")}
+    own = {} if find_spec("pimper_bench") is None else OF_BENCH
+    return own | found | _COMMANDS
 
 
 def _no_command(name: str) -> str:

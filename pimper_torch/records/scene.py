@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -33,12 +34,12 @@ class Lens(Record):
 
 
 def no_maps() -> Float[Tensor, "0 3 3"]:
-    """List no maps."""
+    """Return no maps."""
     return torch.zeros(0, 3, 3)
 
 
 def no_series() -> Int[Tensor, "0"]:
-    """Number no series."""
+    """Return no numbers of series."""
     return torch.zeros(0, dtype=torch.long)
 
 
@@ -120,6 +121,52 @@ def pairs_table(
     table = torch.zeros(shape, dtype=torch.bool, device=point.device)
     table[point, view] = True
     return table
+
+
+def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
+    """Keep some of the views, and what these observe; the others count as not registered."""
+    index = kept.nonzero()[:, 0].tolist()
+    observed = kept.to(scene.observation_view.device)[scene.observation_view]
+    number = kept.long().cumsum(dim=0).to(scene.observation_view.device) - 1
+    maps, series, names = scene.background_from_view, scene.series, scene.views.names
+    left_out = tuple(name for name, keep in zip(names, kept.tolist(), strict=True) if not keep)
+    return scene.replace(
+        views=scene.views.take(index),
+        cameras=scene.cameras.take(index),
+        observation_point=scene.observation_point[observed],
+        observation_view=number[scene.observation_view[observed]],
+        observation_pixels=scene.observation_pixels[observed],
+        lenses=tuple(scene.lenses[view] for view in index) if scene.lenses else (),
+        unregistered=(*scene.unregistered, *left_out),
+        background_from_view=maps[kept.to(maps.device)] if len(maps) else maps,
+        series=series[kept.to(series.device)] if len(series) else series,
+    )
+
+
+def with_points(scene: SparseScene, kept: Bool[Tensor, " point"]) -> SparseScene:
+    """Keep some of the points, and where they were observed."""
+    observed = kept[scene.observation_point]
+    number = kept.long().cumsum(dim=0) - 1
+    return scene.replace(
+        points_world=scene.points_world[kept],
+        reprojection_errors_px=scene.reprojection_errors_px[kept],
+        observation_point=number[scene.observation_point[observed]],
+        observation_view=scene.observation_view[observed],
+        observation_pixels=scene.observation_pixels[observed],
+    )
+
+
+class OneAPose(NamedTuple):
+    """A scene with one photograph of every pose.
+
+    Attributes:
+        scene: Those photographs alone, with what all of their poses observe.
+        of: Which of them has the pose of each view of the whole scene.
+    """
+
+    scene: SparseScene
+    chosen: Int[Tensor, " pose"]
+    of: Int[Tensor, " view"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -17,7 +17,7 @@ from pimper_torch.cli.doctor.checks import (
     saturation,
 )
 from pimper_torch.cli.doctor.cost import cost, estimate
-from pimper_torch.cli.doctor.machine import available_gb, machine, total_gb
+from pimper_torch.cli.doctor.findings import available_gb, machine, total_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
 from pimper_torch.cli.doctor.photograph import Photograph, edge_blur_px, of_views, summarize
 from pimper_torch.cli.main import main

@@ -10,7 +10,7 @@ from pimper_torch.priors.at_points import turned, turned_vectors
 from pimper_torch.priors.settled import settled
 from pimper_torch.records import DepthPrior, NormalPrior
 from pimper_torch.records.priors import AXES
-from pimper_torch.records.scene_parts import with_views
+from pimper_torch.records.scene import with_views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 

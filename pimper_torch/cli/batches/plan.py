@@ -14,7 +14,7 @@ from PIL import Image
 from pimper_torch.cli.batches.objects import Object
 from pimper_torch.cli.batches.task import Outcome, Task, is_whole
 from pimper_torch.cli.doctor.cost import estimate
-from pimper_torch.cli.doctor.machine import available_gb
+from pimper_torch.cli.doctor.findings import available_gb
 from pimper_torch.cli.options import check, inputs_of, parse
 from pimper_torch.runtime.cores import usable_cores
 from pimper_torch.runtime.errors import ConfigError, OutputError, PimperError, some

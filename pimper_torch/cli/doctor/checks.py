@@ -7,8 +7,7 @@ from pathlib import Path
 from statistics import median
 
 from pimper_torch.cli.doctor.cost import cost
-from pimper_torch.cli.doctor.findings import Finding
-from pimper_torch.cli.doctor.machine import available_gb
+from pimper_torch.cli.doctor.findings import Finding, available_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
 from pimper_torch.cli.doctor.photograph import Photograph, of_views
 from pimper_torch.doors.io.photographs import load_views

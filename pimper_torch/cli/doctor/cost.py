@@ -38,9 +38,9 @@ def planned(
 ) -> list[tuple[str, float]]:
     """List the stages of the chain from coarse to fine with their estimated seconds on 2 cores.
 
-    Compilation, next to nothing but for an installation's first run, is none of them. Stages that
-    look at photographs grow with all pixels, or where they shrink them with their number, those on
-    the surface with the pixels of one, in the scale's square.
+    Compilation, noticeable only in an installation's first run, is left out. Stages on photographs
+    grow with all pixels, or with the number of photographs where they shrink them; stages on the
+    surface grow with the pixels of one photograph and the square of the scale.
     """
     pairs, one = num_views * (num_views - 1) / 2, megapixels / max(1, num_views)
     if num_views > 66:  # each is matched with 20 that look alike, many of them in both directions
@@ -59,13 +59,14 @@ def planned(
             ("fuse", 0.7 + 22.0 * one * scale**2),
             ("repair", 0.8 * one * scale**2),
         ]
-    finish = [
+    return [
+        *stages,
+        ("extract", 0.5 + 4.0 * one * scales[-1] ** 2),
         ("simplify", 1.7 * one),
         ("relight", 4.0 + 0.5 * one),
         ("texture", 1.5 + 3.7 * one),
         ("write", 3.0 + 2.5 * one),
     ]
-    return [*stages, ("extract", 0.5 + 4.0 * one * scales[-1] ** 2), *finish]
 
 
 def cost(photographs: Sequence["Photograph"], available_gb: float | None) -> Finding:

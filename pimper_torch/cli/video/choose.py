@@ -16,6 +16,7 @@ _WIDTH_PX = 320
 # A frame is compared with one before until it has moved so far, fractions of the width: what noise
 # adds then counts once. A choice, 6 pixels of 320: flow is still sure.
 _STEP = 0.02
+Thumbnail = UInt8[np.ndarray, "height width"]
 
 
 class Scan(NamedTuple):
@@ -53,23 +54,21 @@ def sharpness(luma: UInt8[Tensor, "height width"]) -> float:
     return min(finest)
 
 
-def thumbnail(luma: UInt8[Tensor, "height width"]) -> UInt8[np.ndarray, "height width"]:
-    """Shrink a frame to where motion is measured."""
+def thumbnail(luma: UInt8[Tensor, "height width"]) -> Thumbnail:
+    """Shrink a frame to the size that motion is measured in."""
     height, width = luma.shape
     size = (_WIDTH_PX, max(16, round(height * _WIDTH_PX / width)))
     return cv2.resize(luma.numpy(), size, interpolation=cv2.INTER_AREA)
 
 
-def motion(
-    before: UInt8[np.ndarray, "height width"], after: UInt8[np.ndarray, "height width"]
-) -> float:
-    """Find how far what moves most has moved between thumbnails, as a fraction of their width.
+def motion(before: Thumbnail, after: Thumbnail) -> float:
+    """Measure the largest motion between thumbnails, as a fraction of their width.
 
     Source: Kroeger, Timofte, Dai, Van Gool, Fast optical flow using dense inverse search,
     ECCV 2016, for the flow.
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)
-    # An object that turns before a wall covers a fifth.
+    # An object that turns in front of a wall covers a fifth.
     return float(np.quantile(np.linalg.norm(flow, axis=2), 0.8)) / before.shape[1]
 
 

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from pimper_torch.runtime.errors import InputError, caution
 
+Picture = UInt8[np.ndarray, "height width 3"]
+
 # No list of other files leads out of this one.
 _LOCAL = {"protocol_whitelist": "file"}
 # Transfer characteristics of ITU-T H.273 whose light is not that of a display of standard range.
@@ -41,9 +43,7 @@ def luma_frames(path: Path) -> Iterator[UInt8[Tensor, "height width"]]:
         yield torch.from_numpy(frame.to_ndarray(format="gray"))
 
 
-def frame_pictures(
-    path: Path, numbers: Sequence[int]
-) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+def frame_pictures(path: Path, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
     """Read frames in colour, turned and mirrored as the video says.
 
     Args:
@@ -86,7 +86,7 @@ def _frames(path: Path) -> Iterator[Any]:
         ) from error
 
 
-def _upright(frame: Any) -> UInt8[np.ndarray, "height width 3"]:  # noqa: ANN401 - untyped
+def _upright(frame: Any) -> Picture:  # noqa: ANN401 - untyped
     """Convert a frame to colours, its rows and columns as its display matrix places them."""
     picture: np.ndarray = frame.to_ndarray(format="rgb24")
     matrix = frame.side_data.get("DISPLAYMATRIX")

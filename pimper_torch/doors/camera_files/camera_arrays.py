@@ -11,6 +11,7 @@ from torch import Tensor
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import (
     PosedCamera,
+    Rig,
     SizesOf,
     decompose_projections,
     number_lenses,
@@ -21,7 +22,6 @@ from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.numpy_files import read_npz
 
 Arrays = dict[str, np.ndarray]
-Rig = tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]
 
 _KIND = "an archive of cameras"
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.ground.shapes import Matrix3
+from pimper_torch.ground.shapes import Matrix3, Pose, Vector
 from pimper_torch.runtime.errors import InputError, shortened, some
 
 T = TypeVar("T")
@@ -119,9 +119,7 @@ class DataSetPath(NamedTuple):
         self.expect(ok, f"{count} finite number{plural} as {what}", _shown(value))
         return torch.from_numpy(array.copy())
 
-    def rigid(
-        self, rotation: Matrix3, translation: Float[Tensor, "3"], what: str
-    ) -> Float[Tensor, "4 4"]:
+    def rigid(self, rotation: Matrix3, translation: Vector, what: str) -> Pose:
         """Return the rigid transform of a rotation, made exact, and a translation of the file."""
         U, _, Vh = torch.linalg.svd(rotation)
         nearest = U @ Vh

@@ -8,8 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import PosedCamera, polynomial_lens
+from pimper_torch.doors.camera_files.posed_camera import Distortion, PosedCamera, polynomial_lens
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
+from pimper_torch.ground.shapes import Pose
 from pimper_torch.records import Lens
 from pimper_torch.runtime.errors import some
 
@@ -67,9 +68,7 @@ def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
     return cameras
 
 
-def _cam_from_world(
-    entry: Mapping[str, object], name: str, file: DataSetPath
-) -> Float[Tensor, "4 4"]:
+def _cam_from_world(entry: Mapping[str, object], name: str, file: DataSetPath) -> Pose:
     pose = entry.get("pose")
     transform = pose.get("transform") if isinstance(pose, Mapping) else None
     if not isinstance(transform, Mapping):
@@ -106,8 +105,8 @@ def _lens(
     return Lens(camera=camera, model=model, params=(*pinhole, *params), width=width, height=height)
 
 
-def _distortion(entry: Mapping[str, object], file: DataSetPath) -> tuple[str, tuple[float, ...]]:
-    """Translate a distortion to COLMAP's model and what its parameters are after the centre.
+def _distortion(entry: Mapping[str, object], file: DataSetPath) -> Distortion:
+    """Translate a distortion to COLMAP's model and its parameters after the centre.
 
     AliceVision's Brown model has (k1, k2, k3, t1, t2) and is OpenCV's, its ``fisheye4`` is
     OpenCV's fisheye: so its own exporter to COLMAP has it (``sfmDataIO/colmap.cpp``).

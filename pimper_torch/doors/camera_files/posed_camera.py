@@ -10,8 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.ground.shapes import Pose, Poses
 from pimper_torch.records import Lens, Record
 
+Rig = tuple[Float[Tensor, "view 3 3"], Poses]
+"""Intrinsics and ``cam_from_world``."""
+Distortion = tuple[str, tuple[float, ...]]
+"""COLMAP's model of a lens, and its parameters after those of ``K``."""
 SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
 """Width and height of photographs by their names in a file; ``None`` for those not there."""
 
@@ -27,7 +32,7 @@ class PosedCamera(Record):
     """
 
     name: str
-    cam_from_world: Float[Tensor, "4 4"]
+    cam_from_world: Pose
     lens: Lens
     skew_px: float = 0.0
 
@@ -41,20 +46,13 @@ def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
     ]
 
 
-def polynomial_lens(
-    k1: float, k2: float, p1: float, p2: float, k3: float
-) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's model of a lens with OpenCV's distortion, and its parameters behind ``K``'s.
-
-    Without any distortion it is a pinhole.
-    """
+def polynomial_lens(k1: float, k2: float, p1: float, p2: float, k3: float) -> Distortion:
+    """Return OpenCV's distortion as a model of COLMAP; a pinhole without any."""
     params = (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return ("FULL_OPENCV", params) if any(params) else ("PINHOLE", ())
 
 
-def decompose_projections(
-    projections: Float[Tensor, "view 3 4"],
-) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]:
+def decompose_projections(projections: Float[Tensor, "view 3 4"]) -> Rig:
     r"""Split ``P ~ K [R | t]`` into intrinsics and ``cam_from_world``.
 
     ``P`` is known up to a factor, negative ones included. The left 3x3 block is an upper

@@ -90,19 +90,6 @@ def read_pictures(
     return images, opaque
 
 
-def radiance_of(decoded: Decoded, response: Response, black: Scalar, white: Levels) -> Planes:
-    """Undo the response, so that ``black`` becomes 0 and ``white``, or more, 1.
-
-    Args:
-        black: Fraction of full scale.
-        white: Fractions of full scale, one a colour.
-    """
-    levels = white[:, None, None]
-    dark = response.linear_from_encoded(black.expand_as(levels))
-    span = response.linear_from_encoded(levels) - dark
-    return ((response.linear_from_encoded(decoded.samples) - dark) / span).clamp(0, 1)
-
-
 def resized(planes: Planes, width: int, height: int) -> Float[Tensor, "channel {height} {width}"]:
     """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
     if tuple(planes.shape[-2:]) == (height, width):
@@ -138,12 +125,7 @@ def resized_mask(
 def _fill(
     images: Images, paths: Sequence[Path], sizes_px: Sizes, encoding: Encoding, whites: _Whites
 ) -> tuple[tuple[Mask | None, ...], dict[_Kind, _Tally]]:
-    """Write the radiance of each file into the images, and count its levels.
-
-    Args:
-        whites: Levels of saturation that were found; with some, or a level that is given, none
-            are counted.
-    """
+    """Write the radiance of each file into the images; count its levels unless white is known."""
     given = None if encoding.response == "auto" else response_of(encoding)
 
     def of_file(index: int) -> tuple[Mask | None, _Kind, _Tally | None]:
@@ -154,8 +136,11 @@ def _fill(
             response = Srgb()
         kind = _Kind(decoded.full, decoded.full_told, response)
         black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
-        fitted = _fitted(response, decoded, paths[index])
-        radiance = radiance_of(decoded, fitted, black, white)
+        linear = _fitted(response, decoded, paths[index]).linear_from_encoded
+        # Black becomes 0; the level of saturation, or more, 1.
+        dark = linear(black.expand(len(white), 1, 1))
+        span = linear(white[:, None, None]) - dark
+        radiance = ((linear(decoded.samples) - dark) / span).clamp(0, 1)
         if decoded.colour.srgb_from_file is not None and len(radiance) == 3:
             radiance = in_srgb_primaries(radiance, decoded.colour.srgb_from_file)
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)

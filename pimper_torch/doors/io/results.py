@@ -15,11 +15,11 @@ from pimper_torch.doors.io.meshes import write_glb, write_obj, write_ply, write_
 from pimper_torch.doors.io.thumbnails import thumbnails
 from pimper_torch.doors.outputs.folders import written_whole
 from pimper_torch.doors.size.given import MILLIMETRES
-from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset, from_local
+from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.sfm.sparse_scene import write_model
-from pimper_torch.records import Finished, Reconstruction, Textured
+from pimper_torch.records import Reconstruction, Textured
 from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.asset.placement import Placement, standing
 from pimper_torch.result.asset.usd import write_usdz
@@ -108,7 +108,16 @@ def write_result(
         assert relighting is not None
         whole = result.replace(mesh=ready.mesh)
         with part(0, _PARTS):
-            _write_meshes(ready, files, whole.scene.offset_world, staging)
+            mesh, measured = ready.mesh, None
+            if ready.closed is not None:
+                mesh, measured = ready.closed.mesh, ready.closed.measured
+            offset = whole.scene.offset_world
+            write_ply(mesh, staging / "mesh.ply", offset, measured)
+            write_glb(mesh, staging / "mesh.glb", offset, measured)
+            if "stl" in files.formats:
+                write_stl(mesh, staging / "mesh.stl", offset)
+            if "obj" in files.formats:
+                write_obj(mesh, staging / "mesh.obj", offset, measured)
         with part(1, _PARTS):
             placement = _placement(whole, asset, files, folder.absolute().name, about or {})
             write_asset(asset, staging / "asset.glb", placement, files.texture)
@@ -160,18 +169,6 @@ def _placement(
         metric=unit is not None,
         cameras=(result.scene.views.names, cameras) if files.cameras else None,
     )
-
-
-def _write_meshes(ready: Finished, files: MeshFiles, offset: Offset, folder: Path) -> None:
-    mesh, measured = ready.mesh, None
-    if ready.closed is not None:
-        mesh, measured = ready.closed.mesh, ready.closed.measured
-    write_ply(mesh, folder / "mesh.ply", offset, measured)
-    write_glb(mesh, folder / "mesh.glb", offset, measured)
-    if "stl" in files.formats:
-        write_stl(mesh, folder / "mesh.stl", offset)
-    if "obj" in files.formats:
-        write_obj(mesh, folder / "mesh.obj", offset, measured)
 
 
 def _write_all(result: Reconstruction, config: object, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""The real size of a result, from whatever tells it."""
+"""The real size of a result, from lengths and markers."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -7,8 +7,9 @@ import torch
 
 from pimper_torch.doors.size.given import CameraDistance, ScaleBar, Unit
 from pimper_torch.doors.size.marker_scale import scale_of_markers
-from pimper_torch.doors.size.marks import Vector, place_of, view_of
+from pimper_torch.doors.size.marks import place_of, view_of
 from pimper_torch.doors.size.scale import Length, Scale, fitted, most_accurate
+from pimper_torch.ground.shapes import Vector
 from pimper_torch.records import Reconstruction
 from pimper_torch.runtime.errors import caution
 

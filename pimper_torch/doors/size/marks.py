@@ -12,10 +12,9 @@ from pimper_torch.ground.geometry.lens_models import undistort_pixels
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.ground.shapes import Vector
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
-
-Vector = Float[Tensor, "3"]
 
 # Confidence of a surface below which a warning says that it may be elsewhere. A choice: a half is
 # that of normals which are 8 degrees off.

@@ -46,7 +46,7 @@ from pimper_torch.records import (
     SweptPatches,
     Views,
 )
-from pimper_torch.records.scene_parts import with_views
+from pimper_torch.records.scene import with_views
 from pimper_torch.runtime.config import bytes_of, require
 from pimper_torch.runtime.memory import largest_problem
 from pimper_torch.runtime.reporting import Observer

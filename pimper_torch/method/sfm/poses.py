@@ -14,7 +14,7 @@ from torch import Tensor
 from pimper_torch.ground.shapes import Scalar
 from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.records import Cameras, Prior, SilhouettePrior, SparseScene, Views, pairs_table
-from pimper_torch.records.scene_parts import OneAPose, with_views
+from pimper_torch.records.scene import OneAPose, with_views
 from pimper_torch.runtime.errors import InputError, some
 from pimper_torch.runtime.mapped import by_view
 

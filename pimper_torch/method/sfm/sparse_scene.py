@@ -18,7 +18,7 @@ from pimper_torch.method.sfm.existing import taken
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.undistort import undistort, with_undistorted_priors
 from pimper_torch.records import Cameras, Failure, SparseScene, Views
-from pimper_torch.records.scene_parts import with_points, with_views
+from pimper_torch.records.scene import with_points, with_views
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.ledger import leave_out

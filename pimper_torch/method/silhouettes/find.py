@@ -21,7 +21,7 @@ from pimper_torch.method.silhouettes.reliability import (
 )
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Failure, Silhouettes, SparseScene
-from pimper_torch.records.scene_parts import OneAPose, with_views
+from pimper_torch.records.scene import OneAPose, with_views
 from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.ledger import leave_out

@@ -1,17 +1,15 @@
-"""Where an asset stands in its file: upright on the origin, in metres."""
+"""Position of an asset in its file: upright on the origin, in metres."""
 
 import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
-from pimper_torch.ground.shapes import Vertices
+from pimper_torch.ground.shapes import Pose, Vector, Vertices
 from pimper_torch.records import Cameras, Mesh
 
 
@@ -28,14 +26,14 @@ class Placement:
     """
 
     name: str
-    scene_from_asset: Float[Tensor, "4 4"]
+    scene_from_asset: Pose
     offset_world: Offset = NO_OFFSET
     metric: bool = False
     cameras: tuple[tuple[str, ...], Cameras] | None = None
 
     @property
     def extras(self) -> dict[str, object]:
-        """What undoes the placement: glTF's ``extras``; the matrix is listed by columns."""
+        """Numbers that undo the placement, glTF's ``extras``; the matrix is listed by columns."""
         return {
             "scene_from_asset": self.scene_from_asset.mT.flatten().tolist(),
             "offset_world": list(self.offset_world),
@@ -68,9 +66,7 @@ class Placement:
         return found
 
 
-def standing(
-    mesh: Mesh, cameras: Cameras, reference: int, up: Float[Tensor, " 3"], metre: float | None
-) -> Float[Tensor, "4 4"]:
+def standing(mesh: Mesh, cameras: Cameras, reference: int, up: Vector, metre: float | None) -> Pose:
     """Return ``scene_from_asset`` of a mesh on its base; see :class:`Placement`.
 
     Args:

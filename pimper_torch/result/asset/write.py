@@ -18,6 +18,7 @@ from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.asset.mesh_files import TextureFormat
 from pimper_torch.result.asset.placement import Placement
 
+_Picture = UInt8[Tensor, "height width *channel"]
 _SPECULAR = "KHR_materials_specular"
 # Of JPEG and WebP: colours of the skull are off by 1.6 and 1.8 levels of 255 (root mean square), in
 # 46 % and 23 % of the PNG's bytes.
@@ -31,15 +32,15 @@ def write_asset(
     texture: TextureFormat = "png",
     more: Mapping[str, Float[Tensor, " copy"]] | None = None,
 ) -> None:
-    """Write a GLB whose vertices tell ``_EXPECTED_ERROR`` and ``_SUPPORT`` (confidence), if known.
+    """Write a GLB whose vertices have ``_EXPECTED_ERROR`` and ``_SUPPORT`` (confidence), if known.
 
-    Where albedo is not determined everywhere, the material's ``extras`` name the texture that says
-    where, ``albedo_doubt``: black where it is, grey where it is not, white where it was inpainted.
+    Unless albedo is determined everywhere, the material's ``extras`` name the texture
+    ``albedo_doubt``: black where it is determined, grey where not, white where it was inpainted.
 
     Args:
-        placement: Of the file; without, it is in the frame of the asset's mesh.
-        texture: Of the base colour, which JPEG and WebP take with losses. The other pictures lose
-            nothing: with JPEG they are PNG. Programs need ``EXT_texture_webp`` for WebP.
+        placement: Of the file; without, the file is in the frame of the asset's mesh.
+        texture: Of the base colour, which JPEG and WebP compress with losses. The other pictures
+            are lossless: PNG, or WebP. Programs need ``EXT_texture_webp`` for WebP.
     """
     mesh = asset.mesh
     vertices, normals, along = mesh.vertices_world, asset.normals, asset.tangent[:, :3]
@@ -77,8 +78,8 @@ def write_asset(
 
 def _reflect(
     material: dict[str, Any], reflectance: Float[Tensor, "height width 3"], first: int
-) -> list[UInt8[Tensor, "height width channel"]]:
-    """Put factors, and textures where they differ, in a material; return the pictures of these."""
+) -> list[_Picture]:
+    """Add factors, or textures where they vary, to a material; return the textures' pictures."""
     metallic, roughness, specular = reflectance.unbind(dim=-1)
     strongest = float(specular.max().clamp_min(1))
     surface = material["pbrMetallicRoughness"]
@@ -104,12 +105,7 @@ def _levels(values: Scalars) -> UInt8[Tensor, "*batch"]:
     return (255 * values.clamp(0, 1)).round().to(torch.uint8)
 
 
-def _encoded(
-    picture: UInt8[Tensor, "height width *channel"],
-    texture: TextureFormat,
-    *,
-    lossless: bool = True,
-) -> bytes:
+def _encoded(picture: _Picture, texture: TextureFormat, *, lossless: bool = True) -> bytes:
     """Return a picture's file; JPEG is never lossless."""
     file, image = BytesIO(), Image.fromarray(picture.numpy())
     if texture == "webp":

@@ -78,13 +78,11 @@ class _Trial:
         most = min(3000, max(1, 20_000 // max(1, len(shown))))
         self.observed = [observed[view].thinned(most) for view in shown]
         self.scales = [loss_scale(seen) for seen in self.observed]
-        lights = lights.take(shown)
-        self.incidence = [
-            surface.incidence(seen.pixels, direction[None], closeness[None])
-            for seen, direction, closeness in zip(
-                self.observed, lights.direction_world, lights.closeness, strict=True
-            )
-        ]
+        self.incidence = []
+        for view, seen in zip(shown, self.observed, strict=True):
+            light = lights.take([view])
+            lit = surface.incidence(seen.pixels, light.direction_world, light.closeness)
+            self.incidence.append(lit)
 
     def losses(
         self, cluster: _Clusters, tried: Float[Tensor, "candidate cluster 3"]
@@ -121,11 +119,7 @@ class _Trial:
 
 
 def _agreed(losses: Float[Tensor, "view candidate"]) -> bool:
-    """Return whether the best candidate of either half of the views serves the other half.
-
-    Args:
-        losses: The first candidate is that which the others must be better than.
-    """
+    """Return whether the best candidate of each half of the views beats the first in the other."""
     halves = losses[0::2].double(), losses[1::2].double()
     gains = torch.cat(
         [other[:, 0] - other[:, one.mean(dim=0).argmin()] for one, other in (halves, halves[::-1])]

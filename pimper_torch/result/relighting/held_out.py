@@ -5,17 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.records import (
-    Cameras,
-    Judged,
-    Materials,
-    Mesh,
-    Relighting,
-    Silhouettes,
-    SparseScene,
-    Textured,
-    ViewLights,
-)
+from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
+from pimper_torch.records.finished import Judged, Materials, Relighting, Textured, ViewLights
 from pimper_torch.result.relighting.fit_lights import Observed, lights_of, observe_all
 from pimper_torch.result.relighting.fit_materials import materials_under
 from pimper_torch.result.relighting.lit_surface import (
@@ -111,7 +102,7 @@ class Relight(Stage):
 def judge_textures(
     relighting: Relighting, asset: Textured, scene: SparseScene, silhouettes: Silhouettes | None
 ) -> Relighting:
-    """Judge the textured surface, too, under the same lights."""
+    """Add the errors of the textured surface under the same lights."""
     surface = TexturedSurface(asset)
     observed = observe_all(surface, scene, silhouettes)
     judged, few = relighting.judged, relighting.materials

@@ -34,19 +34,7 @@ def open_server(host: str = HOST, port: int = PORT) -> "ViserServer":
     """
     require_viser()
     require(0 <= port <= 65_535, "port", port, "0 to 65535")
-    _require_own(host)
-    from viser import ViserServer
-
-    with redirect_stdout(StringIO()):
-        server = ViserServer(host=host, port=port, label="pimper_torch", verbose=False)
-    # Any page in the browser could ask for a tunnel through viser's servers.
-    server.request_share_url = lambda *_, **__: None
-    return server
-
-
-def _require_own(host: str) -> None:
-    """Refuse an address that is not this machine's; viser would try it for ever."""
-    try:
+    try:  # viser would try an address that is not this machine's for ever
         family, _, _, _, place = socket.getaddrinfo(host or "?", 0, type=socket.SOCK_STREAM)[0]
         socket.create_server((host, 0), family=family).close()
     except OSError as error:
@@ -58,5 +46,12 @@ def _require_own(host: str) -> None:
         caution(
             f"host is {host}: whoever reaches this machine can see the photographs and the "
             f"surface. {HOST} keeps the viewer to yourself.",
-            stacklevel=3,
+            stacklevel=2,
         )
+    from viser import ViserServer
+
+    with redirect_stdout(StringIO()):
+        server = ViserServer(host=host, port=port, label="pimper_torch", verbose=False)
+    # Any page in the browser could ask for a tunnel through viser's servers.
+    server.request_share_url = lambda *_, **__: None
+    return server

@@ -13,14 +13,9 @@ from pimper_torch.ground.geometry.poisson import reduced
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.ground.shapes import Mask, Vertices
-from pimper_torch.records import (
-    Cameras,
-    CoarseMesh,
-    Reconstruction,
-    Silhouettes,
-    SparseScene,
-    Views,
-)
+from pimper_torch.records import Reconstruction, Silhouettes
+from pimper_torch.records.scene import CoarseMesh, SparseScene
+from pimper_torch.records.views import Cameras, Views
 from pimper_torch.result.viz import tiles
 from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
 from pimper_torch.result.viz.render import bounding_box, crop, frame, rotation, shade
@@ -121,12 +116,7 @@ def headline(result: Reconstruction) -> str:
 def _photograph(
     result: Reconstruction, own: Cameras, panel_px: int
 ) -> tuple[tiles.Picture, tiles.Picture, Float[Tensor, "facet 3 2"]]:
-    """Crop the reference photograph to the object.
-
-    Returns:
-        The picture, the same with the silhouette drawn over it, and the facets' corners in it,
-        pixels.
-    """
+    """Crop the reference photograph: bare, with its silhouette, and the facets' corners in it."""
     reference = result.coarse.reference
     width, height = (int(side) for side in own.sizes_px[0])
     low, high = bounding_box(own, result.mesh.vertices_world, 0.05)

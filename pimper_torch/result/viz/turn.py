@@ -4,9 +4,7 @@ import math
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
 from PIL import Image
-from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
@@ -14,6 +12,7 @@ from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import cast_view
 from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.ground.shapes import Vector
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.result.viz.maps import albedo_scale
 from pimper_torch.result.viz.render import lambertian, tone
@@ -26,7 +25,7 @@ _ELEVATION_DEG, _FOV_DEG, _MARGIN = 15.0, 30.0, 1.03
 _QUALITY, _EXPOSURE = 70, 1.4  # the latter takes albedo under the raking light to its own tones
 
 
-def up_world(cameras: Cameras) -> Float[Tensor, " 3"]:
+def up_world(cameras: Cameras) -> Vector:
     """Return the direction that pictures call up: y, unless photographs were held otherwise.
 
     The frame has y up where a plane or level cameras showed it; otherwise up is that of the
@@ -84,9 +83,7 @@ def draw_turn(
     )
 
 
-def circling(
-    mesh: Mesh, up: Float[Tensor, " 3"], start: Float[Tensor, " 3"], number: int, side_px: int
-) -> Cameras:
+def circling(mesh: Mesh, up: Vector, start: Vector, number: int, side_px: int) -> Cameras:
     """Return square pinholes that look at a mesh from a circle around it.
 
     Args:
