@@ -55,7 +55,8 @@ def collecting(
             yield events
     except BaseException as error:
         warn_of(events)
-        if out_of_memory(error):
+        failed = isinstance(error, RuntimeError) and any(one in str(error) for one in _NO_MEMORY)
+        if failed or isinstance(error, MemoryError | torch.OutOfMemoryError):
             raise OutOfMemoryError(
                 f"Memory did not suffice: {reason_of(error)}. "
                 "Shrink the photographs (`--max-size-px`), take fewer samples "
@@ -141,13 +142,6 @@ def solved_or(
     except NumericalError as error:
         skipped_solver(stage, name, error, done)
     return otherwise()
-
-
-def out_of_memory(error: BaseException) -> bool:
-    """Return whether an allocation failed."""
-    if isinstance(error, MemoryError | torch.OutOfMemoryError):
-        return True
-    return isinstance(error, RuntimeError) and any(text in str(error) for text in _NO_MEMORY)
 
 
 def reason_of(error: BaseException) -> str:

@@ -1,5 +1,6 @@
 """Which file of one list is which of another, by names that programs have rewritten on the way."""
 
+import posixpath
 import re
 import unicodedata
 from collections.abc import Sequence
@@ -53,7 +54,7 @@ def match_files(
 
     paths = [f"{folder}/{name}" if folder else name for name in wanted]
     found: list[int | None] = [None] * len(wanted)
-    for form in (_last, _folded, _without_extension):
+    for form in (posixpath.basename, _folded, _without_extension):
         taken = set(found)
         free: dict[str, list[int]] = {}
         for place, name in enumerate(present):
@@ -65,7 +66,14 @@ def match_files(
                 claims.setdefault(best(paths[index], name, several, present), []).append(index)
         for place, claimants in claims.items():
             found[best(present[place], present[place], claimants, wanted)] = place
-    return _of_one_folder(paths, present, found)
+    # Files of other folders are left out where some are of the wanted ones' folder.
+    others = ["" if place is None else present[place] for place in found]
+    pairs = list(zip(paths, others, strict=True))
+    tied = any(_common(*pair) for pair in pairs)
+    return [
+        None if tied and not _common(*pair) and all(map(_folders, pair)) else place
+        for place, pair in zip(found, pairs, strict=True)
+    ]
 
 
 def match_poses(
@@ -106,23 +114,6 @@ def match_poses(
     of_pose |= {pose: own[pose][0] for pose in lost if len(own[pose]) == 1}
     of_pose |= match(lost, [at for at in range(len(present)) if at not in found.values()])
     return [found.get(name, of_pose.get(pose)) for name, pose in zip(wanted, poses, strict=True)]
-
-
-def _of_one_folder(
-    paths: Sequence[str], present: Sequence[str], found: list[int | None]
-) -> list[int | None]:
-    """Leave out files of other folders where some are of the wanted ones' folder."""
-    others = ["" if place is None else present[place] for place in found]
-    pairs = list(zip(paths, others, strict=True))
-    tied = any(_common(*pair) for pair in pairs)
-    return [
-        None if tied and not _common(*pair) and all(map(_folders, pair)) else place
-        for place, pair in zip(found, pairs, strict=True)
-    ]
-
-
-def _last(name: str) -> str:
-    return name.rpartition("/")[2]
 
 
 def _folded(name: str) -> str:

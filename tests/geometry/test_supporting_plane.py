@@ -2,7 +2,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.supporting_plane import PlaneSearch, fixation, supporting_plane
+from pimper_torch.ground.geometry.supporting_plane import fixation, supporting_plane
 
 
 def cameras(elevation_deg=40.0):
@@ -41,8 +41,16 @@ def test_a_plane_with_points_below_it_supports_nothing(generator):
     found = supporting_plane(points, cameras().centers_world, 3.0)
     assert found is not None
     assert_close(found.offset, torch.tensor(-0.5).double(), atol=1e-6, rtol=0)  # the lower one
-    strict = PlaneSearch(min_on=0.6)
-    assert supporting_plane(points, cameras().centers_world, 3.0, strict) is None
+
+
+def test_a_plane_with_few_of_the_points_supports_nothing(generator):
+    points = torch.randn(500, 3, generator=generator).double()
+    points[:, 1] = points[:, 1].abs() + 0.1
+    for count, is_found in ((30, False), (60, True)):  # 6 and 11 % of all points
+        table = torch.rand(count, 3, generator=generator).double() * 2 - 1
+        table[:, 1] = 0.0
+        found = supporting_plane(torch.cat([table, points]), cameras().centers_world, 3.0)
+        assert (found is not None) is is_found
 
 
 def test_cameras_look_where_they_are_aimed():

@@ -50,9 +50,7 @@ class Captured:
             self.keypoints,
             self.pairs,
             lambda pairs: {pair: rows[self.right(pair, rows)] for pair, rows in pairs.items()},
-            still_px=1.0,
             max_error_px=2.0,
-            fewest=15,
         )
 
 

@@ -41,7 +41,6 @@ def found_in(keypoints, verified, outside):
         outside,
         lambda some: some,
         max_error_px=2.0,
-        fewest=15,
     )
 
 

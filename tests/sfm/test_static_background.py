@@ -24,7 +24,7 @@ def test_a_room_is_at_rest_and_what_turns_is_not(elevation_deg, fraction, genera
         assert resting[thing >= 500].double().mean() > 0.99
     kept = right = 0
     for pair, rows in scene.pairs.items():
-        moving = moving_matches(scene.keypoints, pair, rows, rest, 1.0)
+        moving = moving_matches(scene.keypoints, pair, rows, rest)
         of_room = scene.thing[pair[0]][rows[:, 0]] >= 500
         true = scene.right(pair, rows)
         assert not (moving & of_room & true).any()

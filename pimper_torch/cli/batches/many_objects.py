@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from pimper_torch.cli.batches.objects import Object, read_objects
@@ -15,8 +14,6 @@ from pimper_torch.doors.outputs.files import prepare_file
 from pimper_torch.doors.outputs.stages import locked
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.cores import usable_cores
-
-_INTERRUPTED = partial(Outcome, status="waiting", message="interrupted; the same command goes on.")
 
 
 def batch(
@@ -108,7 +105,11 @@ def batch(
             with ThreadPoolExecutor(jobs) if executor is None else nullcontext(executor) as engine:
                 _carry_out_all(engine, tasks, settle)
         finally:
-            ended = tuple(outcomes.get(one.name, _INTERRUPTED(name=one.name)) for one in found)
+            message = "interrupted; the same command goes on."
+            ended = tuple(
+                outcomes.get(one.name) or Outcome(name=one.name, status="waiting", message=message)
+                for one in found
+            )
             write_table(ended, out, {one.name: one.photos for one in found})
     return ended
 

@@ -168,7 +168,12 @@ def _tried(task: Task, latest: float) -> tuple[Status, str]:
                     child.wait(_LOOK_SECONDS)
             code = child.poll()
         finally:
-            _end(child)
+            if child.poll() is None:
+                child.terminate()
+                with suppress(subprocess.TimeoutExpired):
+                    child.wait(_END_SECONDS)
+            child.kill()
+            child.wait()
         log.seek(begun)
         errors = [json.loads(line) for line in log if line.startswith(b'{"event": "error"')]
     if code == 0:
@@ -197,12 +202,3 @@ def _started(task: Task, log: IO[bytes]) -> "subprocess.Popen[bytes]":
         # Ctrl-C in the driver's terminal is the driver's to pass on.
         start_new_session=True,
     )
-
-
-def _end(child: "subprocess.Popen[bytes]") -> None:
-    if child.poll() is None:
-        child.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            child.wait(_END_SECONDS)
-    child.kill()
-    child.wait()

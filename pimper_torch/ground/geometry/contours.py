@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, map_coordinates
 from scipy.spatial import cKDTree
 from skimage.measure import find_contours
@@ -89,9 +89,9 @@ def _of_view(inside: Map, cameras: Cameras, view: int, per_view: int) -> Contour
     probability = inside[:height, :width].detach().cpu().double().numpy()
     smooth = gaussian_filter(probability, _BLUR_PX, mode="nearest")
     lines = [_resampled(line) for line in find_contours(smooth, 0.5)]
-    lines = [line for line in lines if len(line.points) >= _MIN_LENGTH_PX]
-    stride = max(1.0, sum(len(line.points) for line in lines) / per_view)
-    rows = [_samples(line, smooth, stride) for line in lines]
+    lines = [(points, closed) for points, closed in lines if len(points) >= _MIN_LENGTH_PX]
+    stride = max(1.0, sum(len(points) for points, _ in lines) / per_view)
+    rows = [_samples(points, closed, smooth, stride) for points, closed in lines]
     table = torch.from_numpy(np.concatenate([np.zeros((0, 7)), *rows])).to(like)
     point, along, outward, slope = torch.split(table, [2, 2, 2, 1], dim=1)
     pixels = pixels_from_indices(point)
@@ -112,41 +112,29 @@ def _of_view(inside: Map, cameras: Cameras, view: int, per_view: int) -> Contour
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """A silhouette's points ``(u, v)``, about a pixel apart, that count from 0."""
-
-    points: Array
-    closed: bool
-
-    def shifted(self, values: Array, by: int) -> Array:
-        """Return the values a number of points further on; beyond an open line's end, its last."""
-        at = np.arange(len(values)) + by
-        at = at % len(values) if self.closed else at.clip(0, len(values) - 1)
-        shifted: Array = values[at]
-        return shifted
-
-
-def _resampled(corners: Array) -> _Line:
+def _resampled(corners: Array) -> tuple[Array, bool]:
+    """Return points ``(u, v)``, about a pixel apart from 0 on, and whether their line is closed."""
     steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     length = np.concatenate([[0.0], np.cumsum(steps)])
     closed = bool((corners[0] == corners[-1]).all())
     wanted = np.linspace(0, length[-1], round(length[-1]), endpoint=not closed)
     points = [np.interp(wanted, length, corners[:, axis]) for axis in (1, 0)]
-    return _Line(np.stack(points, axis=1), closed)
+    return np.stack(points, axis=1), closed
 
 
-def _samples(line: _Line, smooth: Array, stride: float) -> Array:
+def _samples(points: Array, closed: bool, smooth: Array, stride: float) -> Array:
     """Return rows of place, tangent and outward direction, two numbers each, and slope."""
-    points = line.points
-    how: Literal["wrap", "nearest"] = "wrap" if line.closed else "nearest"
+    how: Literal["wrap", "nearest"] = "wrap" if closed else "nearest"
     tangent = gaussian_filter1d(points, _TANGENT_PX, axis=0, order=1, mode=how)
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     # The probability falls outward; half a pixel to either side tells how fast.
     across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     rise = _read(smooth, points + 0.5 * across) - _read(smooth, points - 0.5 * across)
     outward = -np.sign(rise)[:, None] * across
-    behind, ahead = line.shifted(tangent, -_CORNER_PX), line.shifted(tangent, _CORNER_PX)
+    behind, ahead = (
+        np.take(tangent, np.arange(len(points)) + by, axis=0, mode="wrap" if closed else "clip")
+        for by in (-_CORNER_PX, _CORNER_PX)
+    )
     rotation = np.degrees(np.arccos((behind * ahead).sum(axis=1).clip(-1, 1)))
     convex = ((ahead - behind) * outward).sum(axis=1) < 0
     most = np.where(convex, _MAX_CONVEX_DEG, _MAX_CONCAVE_DEG)
@@ -239,16 +227,14 @@ class _SignedDistance:
         index = torch.from_numpy(nearest).to(self._points.device)
         offset, normals = positions - self._points[index], self._normals[index]
         height = (offset * normals).sum(dim=1)
-        beside = (offset - height[:, None] * normals).norm(dim=1) - self._radii(index)
-        distance = torch.hypot(height, beside.clamp_min(0))
-        return torch.where(height < -_ALONG_NORMAL * distance, -distance, distance)
-
-    def _radii(self, index: Int[Tensor, " place"]) -> Float[Tensor, " place"]:
         some, place = torch.unique(index, return_inverse=True)
         count = min(_NEIGHBOURS, len(self._points))
         chosen = self._points[some].detach().cpu().double().numpy()
         reach, _ = self._tree.query(chosen, k=[count], workers=num_workers())
-        return torch.from_numpy(np.asarray(reach)[:, 0]).to(self._points)[place]
+        radii = torch.from_numpy(np.asarray(reach)[:, 0]).to(self._points)[place]
+        beside = (offset - height[:, None] * normals).norm(dim=1) - radii
+        distance = torch.hypot(height, beside.clamp_min(0))
+        return torch.where(height < -_ALONG_NORMAL * distance, -distance, distance)
 
 
 def _depths_in_box(

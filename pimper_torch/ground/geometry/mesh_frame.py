@@ -20,20 +20,7 @@ _MAX_RAYS, _SIDE = 4000, 64
 # A point is on the mesh within this fraction of its diagonal: rough meshes are off by as much.
 _NEAR = 0.03
 
-
-class _Rays(NamedTuple):
-    """Rays of the cameras, to points and then through pixels.
-
-    Attributes:
-        directions: To a point, with its distance for length; through a pixel.
-        inside: Whether a pixel's mask has it; true for points.
-        num_points: Of those to points.
-    """
-
-    origins: Float[Tensor, "ray 3"]
-    directions: Float[Tensor, "ray 3"]
-    inside: Bool[Tensor, " ray"]
-    num_points: int
+Rows = Float[Tensor, "ray 3"]
 
 
 def compare_with_scene(
@@ -51,7 +38,7 @@ def compare_with_scene(
         Figures, as far as they are known: median distance of points whose rays meet the mesh in per
         cent of its diagonal, the fraction of these on it, overlap with masks, number of such rays.
     """
-    fit = _fit(mesh, _rays(scene, silhouettes))
+    fit = _fit(mesh, *_rays(scene, silhouettes))
     frame = "in the frame of the cameras, with their axes and their unit"
     # The box around an object is off by less than a tenth of its diagonal.
     if fit.score < 0.1 and not fit.distance < 0.1:
@@ -141,31 +128,36 @@ class _Fit(NamedTuple):
         return ", and ".join(parts)
 
 
-def _fit(mesh: Mesh, rays: _Rays) -> _Fit:
+def _fit(mesh: Mesh, origins: Rows, directions: Rows, inside: Bool[Tensor, " pixel"]) -> _Fit:
+    """Cast the rays of :func:`_rays`."""
+    count = len(origins) - len(inside)
     used = mesh.vertices_world[mesh.faces.flatten()].double()
     diagonal = float((used.amax(dim=0) - used.amin(dim=0)).norm())
-    cast = RayCaster(mesh.vertices_world, mesh.faces).cast(rays.origins, rays.directions)
-    met, length = cast.face >= 0, rays.directions.norm(dim=1)
+    cast = RayCaster(mesh.vertices_world, mesh.faces).cast(origins, directions)
+    met, length = cast.face >= 0, directions.norm(dim=1)
     # Nothing is near in a mesh that the cameras are inside of.
     near = (cast.distance.double() - 1).abs() * length <= _NEAR * length.clamp_max(diagonal)
-    reached, shown = met[: rays.num_points], met[rays.num_points :]
-    inside = rays.inside[rays.num_points :]
+    reached, shown = met[:count], met[count:]
     hits = int(reached.sum())
     distance = on_mesh = overlap = math.nan
     if hits:
-        points = (rays.origins + rays.directions)[: rays.num_points][reached]
+        points = (origins + directions)[:count][reached]
         distance = float(NearestSurface(mesh).query(points).distance.median()) / diagonal
-    if hits >= min(30, max(1, rays.num_points // 4)):  # fewer tell nothing
-        on_mesh = int((near[: rays.num_points] & reached).sum()) / hits
+    if hits >= min(30, max(1, count // 4)):  # fewer tell nothing
+        on_mesh = int((near[:count] & reached).sum()) / hits
     if len(inside):
         overlap = int((shown & inside).sum()) / max(1, int((shown | inside).sum()))
-    return _Fit(rays.num_points, hits, on_mesh, overlap, distance, diagonal)
+    return _Fit(count, hits, on_mesh, overlap, distance, diagonal)
 
 
-def _rays(scene: SparseScene, silhouettes: Silhouettes) -> _Rays:
-    """Return rays to observed points, with masks to those on the object; then through pixels.
+def _rays(
+    scene: SparseScene, silhouettes: Silhouettes
+) -> tuple[Rows, Rows, Bool[Tensor, " pixel"]]:
+    """Return rays to observed points, then through a raster of pixels of every mask.
 
-    Of every photograph that has a mask a raster of pixels is taken.
+    Returns:
+        Origins; directions, which reach from them to the points; and whether pixels are inside the
+        mask. With masks, points are those on the object.
     """
     cameras, masked = scene.cameras, silhouettes.source == "masks"
     masks = silhouettes.inside > 0.5
@@ -178,7 +170,7 @@ def _rays(scene: SparseScene, silhouettes: Silhouettes) -> _Rays:
         point, view = point[drawn], view[drawn]
     centers, poses = cameras.centers_world.detach().double(), cameras.cam_from_world.detach()
     to_points = scene.points_world[point].detach().double() - centers[view]
-    parts = [(centers[view], to_points, torch.ones_like(to_points[:, 0], dtype=torch.bool))]
+    rays, inside = [(centers[view], to_points)], [masks.new_zeros(0)]
     for number in range(cameras.num_views if masked else 0):
         width, height = (int(side) for side in cameras.sizes_px[number])
         step = -(-max(width, height) // _SIDE)
@@ -188,7 +180,8 @@ def _rays(scene: SparseScene, silhouettes: Silhouettes) -> _Rays:
         if bool(silhouettes.reliable[number]) and float(mask.float().mean()) <= 0.95:
             pose, K = poses[number].double(), cameras.intrinsics[number].detach().double()
             pixels = pixel_centers(width, height, like=pose)[raster, raster].reshape(-1, 2)
-            rays = rays_through(pixels, pose, K)
-            parts.append((centers[number].expand_as(rays), rays, mask))
-    origins, directions, inside = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
-    return _Rays(origins, directions, inside, len(point))
+            through = rays_through(pixels, pose, K)
+            rays.append((centers[number].expand_as(through), through))
+            inside.append(mask)
+    origins, directions = (torch.cat(part).cpu() for part in zip(*rays, strict=True))
+    return origins, directions, torch.cat(inside).cpu()

@@ -66,7 +66,10 @@ class NearestSurface:
         """Find the nearest place of the surface for every point."""
         asked = points.detach().cpu().double()
         if len(self._faces):
-            face = self._nearest_faces(asked)
+            found = fcpw.interaction_3D_list()
+            anywhere = np.full(len(asked), np.inf, dtype=np.float32)
+            self._scene.find_closest_points(self._columns(asked), anywhere, found)
+            face = torch.tensor([one.primitive_index for one in found], dtype=torch.long)
             place = closest_on_triangles(asked, self._vertices[self._faces[face]])
         else:
             face = torch.from_numpy(np.asarray(self._tree.query(asked.numpy())[1])).long()
@@ -76,12 +79,6 @@ class NearestSurface:
             points=place.to(points),
             face=face.to(points.device),
         )
-
-    def _nearest_faces(self, points: Points) -> Int[Tensor, " point"]:
-        found = fcpw.interaction_3D_list()
-        anywhere = np.full(len(points), np.inf, dtype=np.float32)
-        self._scene.find_closest_points(self._columns(points), anywhere, found)
-        return torch.tensor([one.primitive_index for one in found], dtype=torch.long)
 
     def _columns(self, points: Points) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
         return np.asfortranarray((points - self._origin).float().numpy())

@@ -32,15 +32,6 @@ def write_cloud(points: Points, normals: Points, path: Path) -> None:
     path.write_bytes(f"{start}{properties}end_header\n".encode("ascii") + rows.tobytes())
 
 
-def read_faces(path: Path) -> tuple[Vertices, Faces]:
-    """Read a triangle mesh that COLMAP wrote; float32."""
-    import trimesh
-
-    mesh = trimesh.load_mesh(path, process=False)
-    vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float32).reshape(-1, 3))
-    return vertices, torch.from_numpy(np.array(mesh.faces, dtype=np.int64).reshape(-1, 3))
-
-
 # COLMAP's octree is dense down to this depth, or to the least that any call of the process asked
 # for: a call with less would change the surfaces of all calls after it.
 _DENSE_DEPTH = 5
@@ -152,13 +143,17 @@ def _oriented(faces: Faces) -> Int[Tensor, "kept 3"]:
 def _made(
     path: Path, what: str, program: Callable[..., object], *arguments: object
 ) -> tuple[Vertices, Faces]:
-    """Run a program of COLMAP's that writes a mesh, and read that."""
+    """Run a program of COLMAP's that writes a mesh, and read that; float32."""
+    import trimesh
+
     try:
         with quiet():
             program(*arguments)
-        return read_faces(path)
+        mesh = trimesh.load_mesh(path, process=False)
     except (ValueError, RuntimeError, OSError) as error:
         raise ReconstructionError(
             f"surface: COLMAP's {what} made no mesh ({error}). Take more photographs of "
             "textured surface, or bring a mesh of your own."
         ) from error
+    vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float32).reshape(-1, 3))
+    return vertices, torch.from_numpy(np.array(mesh.faces, dtype=np.int64).reshape(-1, 3))

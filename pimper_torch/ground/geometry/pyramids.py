@@ -261,7 +261,10 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
         # NaN times a weight of 0 is NaN; zeros are marked as unusable.
         images = by_view(lambda image: torch.where(image.isfinite(), image, 0), images)
     count, _, height, width = images.shape
-    sizes = _sizes(height, width, levels)
+    shapes = [(height, width)]
+    while len(shapes) < levels and min(shapes[-1]) >= 8:
+        shapes.append((shapes[-1][0] // 2, shapes[-1][1] // 2))
+    sizes = tuple(shapes)
     one = partial(_one, views, images, saturation_level, len(sizes))
     parts = side_by_side(one, range(count), tracked=False)
     first = next(parts)
@@ -381,11 +384,3 @@ def _one(
     in_255ths = (255 * row(fractions)).round().to(torch.uint8)
     finest = 255 * unusable[None].to(torch.uint8)
     return row(coloured), gray[0][None], row(gray), finest, in_255ths
-
-
-def _sizes(height: int, width: int, levels: int) -> tuple[tuple[int, int], ...]:
-    sizes = [(height, width)]
-    while len(sizes) < levels and min(sizes[-1]) >= 8:
-        height, width = height // 2, width // 2
-        sizes.append((height, width))
-    return tuple(sizes)

@@ -11,23 +11,11 @@ from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.ground.shapes import Points, Scalar, Scalars, Vectors
 from pimper_torch.records import Record, SparseScene
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlaneSearch:
-    """Criteria for the plane that an object stands on.
-
-    Chosen on the four rendered scenes and the skull (``benchmarks/silhouettes.py``).
-
-    Attributes:
-        tolerance: Distance up to which a point lies on it, as a fraction of the cameras' distance.
-        min_on: Fraction of the points that lie on it.
-        max_below: Fraction of the points that may lie below it.
-    """
-
-    tolerance: float = 0.004
-    min_on: float = 0.08
-    max_below: float = 0.05
-    seed: int = 0
+# Distance up to which a point is on the plane, as a fraction of the cameras' distance; the fraction
+# of the points that must be on it, and that which may be below. Chosen on the four rendered scenes
+# and the skull (benchmarks/silhouettes.py).
+PLANE_TOLERANCE = 0.004
+_MIN_ON, _MAX_BELOW = 0.08, 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -81,18 +69,18 @@ def fixation(cam_from_world: Float[Tensor, "view 4 4"]) -> Fixation:
     )
 
 
-def well_tracked(scene: SparseScene, min_views: int = 3) -> Bool[Tensor, " point"]:
-    """Find points that enough views see."""
-    return scene.observed.sum(dim=1) >= min_views
+def well_tracked(scene: SparseScene) -> Bool[Tensor, " point"]:
+    """Find points that at least three views see."""
+    return scene.observed.sum(dim=1) >= 3
 
 
 def supporting_plane(
-    points_world: Points,
-    eyes_world: Float[Tensor, "view 3"],
-    distance: float,
-    search: PlaneSearch = PlaneSearch(),
+    points_world: Points, eyes_world: Float[Tensor, "view 3"], distance: float
 ) -> Plane | None:
     """Find the plane that the object stands on, by RANSAC.
+
+    Args:
+        distance: Of the cameras from the fixation point, scene units.
 
     Returns:
         ``None`` where no plane has enough points on it and few enough below. Among those that
@@ -101,9 +89,9 @@ def supporting_plane(
     count = len(points_world)
     if count < 20:
         return None
-    tolerance, generator = search.tolerance * distance, torch.Generator()
+    tolerance, generator = PLANE_TOLERANCE * distance, torch.Generator()
     # Three good points of fifteen in a hundred are missed with probability 0.001.
-    drawn = torch.randint(count, (2000, 3), generator=generator.manual_seed(search.seed))
+    drawn = torch.randint(count, (2000, 3), generator=generator.manual_seed(0))
     a, b, c = points_world[drawn.to(points_world.device)].unbind(dim=1)
     normals = normalize(torch.linalg.cross(b - a, c - a), dim=1)
     offsets = (normals * a).sum(dim=1)
@@ -114,18 +102,15 @@ def supporting_plane(
     on = (height.abs() < tolerance).double().mean(dim=0)
     below = (height < -tolerance).double().mean(dim=0)
     drawn_apart = normals.norm(dim=1) > 0.5  # or one was drawn twice, and the rest is rounding
-    fits = drawn_apart & eyes_above & (on >= search.min_on) & (below < search.max_below)
+    fits = drawn_apart & eyes_above & (on >= _MIN_ON) & (below < _MAX_BELOW)
     if not bool(fits.any()):
         return None
     best = torch.where(fits, on, -1).argmax()
     plane = Plane(normal_world=normals[best], offset=offsets[best])
     for _ in range(3):
-        plane = _refitted(points_world[plane.height_of(points_world).abs() < tolerance], plane)
+        close = points_world[plane.height_of(points_world).abs() < tolerance]
+        centre = close.mean(dim=0)
+        normal = torch.linalg.svd(close - centre, full_matrices=False).Vh[2]
+        normal = normal * torch.where(normal @ plane.normal_world < 0, -1.0, 1.0).to(normal)
+        plane = Plane(normal_world=normal, offset=normal @ centre)
     return plane
-
-
-def _refitted(points: Points, plane: Plane) -> Plane:
-    centre = points.mean(dim=0)
-    normal = torch.linalg.svd(points - centre, full_matrices=False).Vh[2]
-    normal = normal * torch.where(normal @ plane.normal_world < 0, -1.0, 1.0).to(normal)
-    return Plane(normal_world=normal, offset=normal @ centre)

@@ -153,24 +153,18 @@ def vertex_fans(faces: Faces, edges: FaceEdges | None = None) -> tuple[Int[Tenso
     >>> vertex_fans(bow_tie)[0]
     tensor([0, 1, 2, 2, 3, 4])
     """
-    label = graph_components(_fan_links(faces, edges), 3 * len(faces)).long()
-    old = torch.empty_like(label[: int(label.max()) + 1]).scatter(0, label, faces.flatten())
-    order = old.argsort(stable=True)
-    rank = torch.empty_like(order).scatter(0, order, torch.arange(len(order)).to(order))
-    return old[order], rank[label].reshape(-1, 3)
-
-
-def _fan_links(faces: Faces, edges: FaceEdges | None) -> Int[Tensor, "link 2"]:
-    """List the corners that two faces have in common, at both ends of every edge of theirs.
-
-    Half as many bits as indices have elsewhere: there are six corners a vertex, and as many links.
-    """
+    # Half as many bits as indices have elsewhere: each vertex has six corners, and as many links.
     corners = _paired(faces, edges)[0].int()
     vertex, first = faces.flatten(), corners - corners % 3
     (one, other), (two, another) = ((first + (corners + by) % 3).unbind(dim=1) for by in (1, 2))
     along = vertex[one] == vertex[other]  # where the faces are oriented differently
     links = one, torch.where(along, other, another), two, torch.where(along, another, other)
-    return torch.stack(links, dim=1).reshape(-1, 2)
+    links_of_corners = torch.stack(links, dim=1).reshape(-1, 2)
+    label = graph_components(links_of_corners, 3 * len(faces)).long()
+    old = torch.empty_like(label[: int(label.max()) + 1]).scatter(0, label, faces.flatten())
+    order = old.argsort(stable=True)
+    rank = torch.empty_like(order).scatter(0, order, torch.arange(len(order)).to(order))
+    return old[order], rank[label].reshape(-1, 3)
 
 
 def boundary_loops(faces: Faces, bare: Pairs | None = None) -> tuple[Ends, Int[Tensor, " edge"]]:

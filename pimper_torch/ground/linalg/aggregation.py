@@ -21,7 +21,7 @@ assignment of light unknowns is ours, measured in ``benchmarks/linear_systems.py
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.sparse import csr_array
 
 from pimper_torch.runtime.parallel import over_rows
@@ -69,7 +69,9 @@ def prolongation(matrix: csr_array) -> csr_array:
     strong, label = np.empty(len(parts[1]), np.bool_), np.empty(size, np.int32)
     connections = scale, largest, coupled
     over_rows(kernels.strong_connections, size, *parts, *connections, _STRONG, _COUPLED, strong)
-    count = kernels.roots(*parts[:2], strong, _order(size), label)
+    within = np.random.default_rng(0).permutation(min(size, _BLOCK))
+    order = (np.arange(0, size, _BLOCK)[:, None] + within).ravel() if size else within
+    count = kernels.roots(*parts[:2], strong, order[order < size], label)
     other = np.empty_like(label)
     for _ in range(2):
         over_rows(kernels.assigned, size, *parts, scale, strong, label, other)
@@ -115,10 +117,3 @@ def _concatenated(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width:
     starts = np.zeros(len(counts) + 1, np.int32)
     np.cumsum(counts, out=starts[1:])
     return csr_array((entries, columns, starts), shape=(len(counts), width))
-
-
-def _order(size: int) -> Int[np.ndarray, " unknown"]:
-    """Return the order in which roots are chosen: random within blocks."""
-    within = np.random.default_rng(0).permutation(min(size, _BLOCK))
-    order = (np.arange(0, size, _BLOCK)[:, None] + within).ravel() if size else within
-    return order[order < size]

@@ -65,34 +65,24 @@ def compressed_equations(
     size = len(damping)
     each = torch.arange(size)[:, None]
     prior = (each, torch.ones(size, 1, dtype=start.dtype), start, damping)
-    sets = [_arrays(*kind) for kind in (prior, *kinds) if len(kind[0])]
+    sets = []
+    for unknowns, coefficients, targets, weights in (prior, *kinds):
+        if len(unknowns):
+            real = torch.promote_types(coefficients.dtype, targets.dtype)
+            values = as_array(coefficients, real), as_array(targets, real)
+            sets.append((as_array(unknowns), *values, as_array(weights, torch.float64)))
     counts, side = np.zeros(size, np.int32), np.zeros(size)
-    for unknowns, coefficients, targets, weights in sets:
-        kernels.count(unknowns, counts)
-        kernels.add_sides(unknowns, coefficients, targets, weights, side)
+    for index, factors, wanted, weight in sets:
+        kernels.count(index, counts)
+        kernels.add_sides(index, factors, wanted, weight, side)
     starts = np.zeros(size, np.int32)
     np.cumsum(counts[:-1], out=starts[1:])
     total = int(counts.sum(dtype=np.int64))
     ends, columns, entries = starts.copy(), np.empty(total, np.int32), np.empty(total)
-    for unknowns, coefficients, _, weights in sets:
-        kernels.fill(unknowns, coefficients, weights, ends, columns, entries)
+    for index, factors, _, weight in sets:
+        kernels.fill(index, factors, weight, ends, columns, entries)
     first = kernels.merge(starts, ends, columns, entries)
     for array in (columns, entries):  # what duplicates took is given back, without a copy
         array.resize(first[-1], refcheck=False)
     matrix = csr_array((entries, columns, first), shape=(size, size))
     return matrix, torch.from_numpy(side)
-
-
-def _arrays(
-    unknowns: Int[Tensor, "equation term"],
-    coefficients: Float[Tensor, "equation term"],
-    targets: Float[Tensor, " equation"],
-    weights: Float[Tensor, " equation"],
-) -> tuple[np.ndarray, ...]:
-    real = torch.promote_types(coefficients.dtype, targets.dtype)
-    return (
-        as_array(unknowns),
-        as_array(coefficients, real),
-        as_array(targets, real),
-        as_array(weights, torch.float64),
-    )

@@ -1,7 +1,5 @@
 """Conjugate gradients preconditioned by multigrid, with the interface of sparse Cholesky."""
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from scipy.sparse import csr_array
@@ -15,18 +13,6 @@ from pimper_torch.ground.linalg.prepared import WORST_RESIDUAL, PreparedMatrix, 
 _MAX_CYCLES = 300
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Iterate:
-    """A solution and its iterations.
-
-    Attributes:
-        values: The solution, float64; one column a right-hand side where there are several.
-    """
-
-    values: Float[Tensor, "unknown ..."]
-    iterations: int
-
-
 def solve_by_cycles(
     matrix: csr_array,
     hierarchy: Hierarchy,
@@ -35,7 +21,7 @@ def solve_by_cycles(
     tolerance: float,
     what: str,
     start: Float[Tensor, "unknown side"] | None = None,
-) -> Iterate:
+) -> tuple[Float[Tensor, "unknown side"], int]:
     """Solve A x = b in float64 by conjugate gradients, for all right-hand sides at once.
 
     Args:
@@ -44,6 +30,9 @@ def solve_by_cycles(
         tolerance: Of the error's energy norm, as the hierarchy estimates it, relative to that of
             the solution.
         start: Where to begin; zero if not given.
+
+    Returns:
+        The solution, and the number of iterations.
 
     Raises:
         SingularSystemError: No convergence, with the iterations and the residual reached.
@@ -66,7 +55,7 @@ def solve_by_cycles(
             "unknowns are determined by (nearly) no equation, or the matrix is not positive "
             "definite: anchor them, raise the weight of the prior, or solve by Cholesky."
         )
-    return Iterate(values=found, iterations=cycles)
+    return found, cycles
 
 
 class Multigrid(PreparedMatrix):
@@ -87,13 +76,15 @@ class Multigrid(PreparedMatrix):
         self._tolerance = tolerance
         self._hierarchy = Hierarchy(self._matrix)
 
-    def iterate(self, rhs: Float[Tensor, "unknown ..."]) -> Iterate:
-        """Solve and report the iterations; not differentiable, and on the CPU."""
+    def iterate(
+        self, rhs: Float[Tensor, "unknown ..."]
+    ) -> tuple[Float[Tensor, "unknown ..."], int]:
+        """Solve and count the iterations; not differentiable, in float64 on the CPU."""
         columns = rhs.detach().cpu().double().reshape(len(rhs), -1).contiguous()
         given = self._matrix, self._hierarchy, self._diagonal, columns
-        found = solve_by_cycles(*given, self._tolerance, self._what)
-        return Iterate(values=found.values.reshape(rhs.shape), iterations=found.iterations)
+        found, cycles = solve_by_cycles(*given, self._tolerance, self._what)
+        return found.reshape(rhs.shape), cycles
 
     def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
         """Solve; constant to autograd."""
-        return rhs.clone() if rhs.numel() == 0 else self.iterate(rhs).values.to(rhs)
+        return rhs.clone() if rhs.numel() == 0 else self.iterate(rhs)[0].to(rhs)

@@ -77,8 +77,7 @@ class PreparedMatrix(ABC):
         self._prepare(tolerance)
 
     @abstractmethod
-    def _prepare(self, tolerance: float) -> None:
-        """Do once what all solves need."""
+    def _prepare(self, tolerance: float) -> None: ...
 
     def solve(self, rhs: Unknowns) -> Unknowns:
         """Solve for one right-hand side or several at once.

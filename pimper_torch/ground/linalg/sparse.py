@@ -45,7 +45,18 @@ class SparseCholesky(PreparedMatrix):
         self._scaled = scaled = coo_array(self._matrix)
         scale, size = self._scale.numpy(), len(self._scale)
         scaled.data *= scale[scaled.row] * scale[scaled.col]
-        self._solver = self._factor(scaled) if size else None
+        self._solver = None
+        if size:
+            lower = scaled.row >= scaled.col
+            parts = (part[lower] for part in (scaled.row, scaled.col, scaled.data))
+            try:
+                self._solver = CholeskySolverD(size, *parts, MatrixType.COO)
+            except ValueError as error:
+                raise SingularSystemError(
+                    f"{self._what} ({size} unknowns) is not positive definite: {error} Its "
+                    "equations contradict least squares or leave unknowns free. Anchor the "
+                    "unknowns, or raise the weight of the prior."
+                ) from error
         _ALIVE.add(self)
         # The condition is estimated from the solution for a generic right-hand side.
         probe = torch.cos(torch.arange(size, dtype=torch.float64) ** 2)  # no structure to fit
@@ -56,18 +67,6 @@ class SparseCholesky(PreparedMatrix):
                 f"below {_WORST_CONDITION:.0e} is needed. Some unknowns are determined by no "
                 "equation: anchor them, or raise the weight of the prior."
             )
-
-    def _factor(self, matrix: coo_array) -> CholeskySolverD:
-        lower = matrix.row >= matrix.col
-        parts = (part[lower] for part in (matrix.row, matrix.col, matrix.data))
-        try:
-            return CholeskySolverD(matrix.shape[0], *parts, MatrixType.COO)
-        except ValueError as error:
-            raise SingularSystemError(
-                f"{self._what} ({matrix.shape[0]} unknowns) is not positive definite: {error} Its "
-                "equations contradict least squares or leave unknowns free. Anchor the "
-                "unknowns, or raise the weight of the prior."
-            ) from error
 
     def _substitute(self, scaled_rhs: Unknowns) -> Unknowns:
         answer = np.zeros(scaled_rhs.shape)

@@ -108,9 +108,8 @@ def solve_compressed(
             refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
             try:
                 levels = Hierarchy(matrix, torch.float32)
-                return solve_by_cycles(
-                    matrix, levels, diagonal, sides, tolerance, what, start
-                ).values
+                given = matrix, levels, diagonal, sides
+                return solve_by_cycles(*given, tolerance, what, start)[0]
             except SingularSystemError as error:
                 _by_factor(what, error)
     rows = np.repeat(np.arange(len(sides)), np.diff(matrix.indptr))

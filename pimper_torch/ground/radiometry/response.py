@@ -135,7 +135,12 @@ class Curve:
             )
         for part, row in zip(parts, self.radiance, strict=True):
             given, wanted = (row, self.encoded) if inverse else (self.encoded, row)
-            found.append(_interpolate(part, given.to(part), wanted.to(part)))
+            given, wanted = given.to(part), wanted.to(part)
+            inside = part.clamp(given[0], given[-1])
+            upper = torch.searchsorted(given, inside.detach().contiguous())
+            upper = upper.clamp(1, len(given) - 1)
+            slope = wanted.diff() / given.diff()
+            found.append(wanted[upper - 1] + slope[upper - 1] * (inside - given[upper - 1]))
         return found[0] if rows == 1 else torch.stack(found, dim=-3)
 
 
@@ -192,10 +197,3 @@ def _require_rising(values: PerEntry, levels: PerEntry, what: str) -> None:
             f"{float(levels[at]):g} ({float(values[at]):g}, then {float(values[at + 1]):g}); "
             "needed: a curve that rises from entry to entry. Smooth it, or leave entries out."
         )
-
-
-def _interpolate(values: Scalars, given: PerEntry, wanted: PerEntry) -> Scalars:
-    inside = values.clamp(given[0], given[-1])
-    upper = torch.searchsorted(given, inside.detach().contiguous()).clamp(1, len(given) - 1)
-    slope = wanted.diff() / given.diff()
-    return wanted[upper - 1] + slope[upper - 1] * (inside - given[upper - 1])

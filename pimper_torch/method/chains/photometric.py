@@ -1,6 +1,6 @@
 """What the method does on each patch by itself: samples, normals under the light, and heights."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
 
 from pimper_torch.ground.geometry.pyramids import Sources
@@ -86,21 +86,16 @@ class Photometric(Stage):
             with part("sweep"):
                 return self.sweep(views, cameras, seen, photometric, sources)
 
-        swept = _joined(patches, list(side_by_side(of_bucket, patches.buckets)))
+        parts = list(side_by_side(of_bucket, patches.buckets))
+        lit = tuple(one for each in parts for one in each.photometric.buckets)
+        swept = SweptPatches(
+            photometric=PhotometricPatches(patches=patches, buckets=lit),
+            buckets=tuple(one for each in parts for one in each.buckets),
+            averaged=parts[0].averaged,
+        )
         warn_of_priors(figures(swept))
         release_memory()
         return swept
-
-
-def _joined(patches: PatchSet, parts: Sequence[SweptPatches]) -> SweptPatches:
-    photometric = PhotometricPatches(
-        patches=patches, buckets=tuple(one for each in parts for one in each.photometric.buckets)
-    )
-    return SweptPatches(
-        photometric=photometric,
-        buckets=tuple(one for each in parts for one in each.buckets),
-        averaged=parts[0].averaged,
-    )
 
 
 def warn_of_priors(told: Mapping[str, int | float]) -> None:

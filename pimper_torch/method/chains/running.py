@@ -89,16 +89,12 @@ class Running:
         if hashed is None:
             return make()
         record, _ = kept(self.store, f"{name}-{hashed}", cls, make)
-        return _beside(record, inputs)
+        records = [value for value in inputs if isinstance(value, Record)]
+        tensors = [leaf for leaf in pytree.tree_leaves(records) if isinstance(leaf, Tensor)]
+        return record.to(tensors[0].device) if tensors else record
 
 
 def _returns(call: Callable[..., object]) -> type[Record] | None:
     function = call.forward if isinstance(call, nn.Module) else call
     cls: Any = typing.get_type_hints(function).get("return")
     return cls if isinstance(cls, type) and issubclass(cls, Record) else None
-
-
-def _beside(record: Record, inputs: tuple[object, ...]) -> Record:
-    records = [value for value in inputs if isinstance(value, Record)]
-    tensors = [leaf for leaf in pytree.tree_leaves(records) if isinstance(leaf, Tensor)]
-    return record.to(tensors[0].device) if tensors else record

@@ -178,19 +178,16 @@ def following_fraction(model: SparseModel) -> float:
         fractions = []
         for view in range(model.num_views):
             if view != reference:
-                here, there = _same(points[reference], points[view])
+                others = points[view]
+                here = torch.nonzero(torch.isin(points[reference], others))[:, 0]
+                order = others.argsort()
+                there = order[torch.searchsorted(others[order], points[reference][here])]
                 ends = pixels[view][there], pixels[reference][here]
                 follows = follows_camera_in_place(*ends, centre, max_error_px, generator)
                 enough = int(follows.sum()) >= MIN_MATCHES
                 fractions.append(float(follows.double().mean()) if enough else 0.0)
         best = max(best, float(torch.tensor(fractions or [0.0]).median()))
     return best
-
-
-def _same(points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
-    here = torch.nonzero(torch.isin(points, others))[:, 0]
-    order = others.argsort()
-    return here, order[torch.searchsorted(others[order], points[here])]
 
 
 # Fraction of the matches in a view's 3 strongest pairs that must agree with the model: 91 to 100 %

@@ -150,19 +150,17 @@ def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[
     """Return the sizes of photographs in their files, which others' programs count pixels of."""
     where = place(path)
     found = match_poses(views.names, names, folder=views.folder, where=where, what="camera")
-    sizes = {at: _stored_size(views, view) for view, at in enumerate(found) if at is not None}
-    return [sizes.get(at) for at in range(len(names))]
-
-
-def _stored_size(views: Views, view: int) -> tuple[int, int]:
-    """Return a photograph's size in its file; that which it was read at where there is none."""
-    width, height = (int(side) for side in views.sizes_px[view])
-    with suppress(OSError, ValueError, Image.DecompressionBombError):
-        if views.folder:
-            with Image.open(Path(views.folder) / views.names[view]) as picture:
-                if max(picture.size) >= max(width, height):  # in camera raw it may be the preview
-                    return picture.size
-    return width, height
+    sizes: list[tuple[int, int] | None] = [None] * len(names)
+    for name, at, (width, height) in zip(views.names, found, views.sizes_px.tolist(), strict=True):
+        if at is not None:
+            sizes[at] = width, height  # as they were read, where there is no file
+            with suppress(OSError, ValueError, Image.DecompressionBombError):
+                if views.folder:
+                    with Image.open(Path(views.folder) / name) as picture:
+                        # The picture in a file of camera raw may be its preview.
+                        if max(picture.size) >= max(width, height):
+                            sizes[at] = picture.size
+    return sizes
 
 
 def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:

@@ -64,9 +64,7 @@ def find_moved_object(
     verified: Matches,
     outside: Matches,
     verify: matching.Verify,
-    *,
     max_error_px: float,
-    fewest: int,
 ) -> MovedObject:
     """Divide the photographs into capture sessions, linked by matches of the object.
 
@@ -101,7 +99,7 @@ def find_moved_object(
                 own[pair] = rows  # without a second geometry it stays as it is
     own |= verify({pair: rows for pair, rows in around_it.items() if pair not in seconds})
     own |= {pair: seconds[pair] for pair in around_it if pair in seconds}
-    tying = {pair: rows for pair, rows in own.items() if len(rows) >= fewest}
+    tying = {pair: rows for pair, rows in own.items() if len(rows) >= MIN_MATCHES}
     dropped = [pair for pair in own if pair not in tying]
     every = {
         pair: torch.cat([rows, seconds.get(pair, rows[:0])]) for pair, rows in verified.items()
@@ -228,8 +226,7 @@ def tie_series(database: Path, settings: ReconstructConfig) -> tuple[matching.Ve
             verified,
             outside,
             verifier,
-            max_error_px=settings.max_error_px,
-            fewest=MIN_MATCHES,
+            settings.max_error_px,
         )
         for pair, rows in found.tying.items():
             if not torch.equal(rows, verified[pair]):

@@ -121,11 +121,7 @@ def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPos
 
 
 def _with_leads(prior: Prior, names: Sequence[str], lead: Int[Tensor, " view"]) -> Prior:
-    """Carry silhouettes of any photograph of a pose to the one that is kept, unless it has its own.
-
-    Args:
-        lead: Of every view, the one that is kept of its pose.
-    """
+    """Carry silhouettes of a pose's photographs to its ``lead``, unless that has one of its own."""
     if not isinstance(prior, SilhouettePrior):
         return prior
     leads = dict(zip(names, (names[one] for one in lead.tolist()), strict=True))

@@ -1,13 +1,12 @@
 """Tracks found again in the photographs, and cameras adjusted to them."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.pixels import homogeneous
 from pimper_torch.ground.radiometry import SATURATED
-from pimper_torch.ground.shapes import Pixels
 from pimper_torch.method.sfm import track_observations as tracks
 from pimper_torch.method.sfm.colmap import bundle, observation_errors
 from pimper_torch.method.sfm.model import SparseModel, longest_tracks
@@ -107,7 +106,12 @@ def _renewed(
     often = torch.bincount(found.point, minlength=len(model.points_world)) >= 3
     kept = often[found.point]
     point, view = found.point[kept], found.view[kept]
-    pixels = _photographed(found.pixels[kept], view, cameras, model)
+    ends = homogeneous(found.pixels[kept])
+    pixels = torch.empty_like(ends[:, :2])
+    for index, lens in enumerate(model.lenses):
+        here = view == index
+        rays = torch.linalg.solve(cameras.intrinsics[index], ends[here].mT).mT
+        pixels[here] = distort(lens, rays)
     poor = torch.bincount(view, minlength=model.num_views) < MIN_POINTS
     seen = pairs_table(point, view, (len(often), model.num_views))
     theirs = model.observation_point, model.observation_view
@@ -124,18 +128,6 @@ def _renewed(
     return renewed, order < int(kept.sum())
 
 
-def _photographed(
-    pixels: Pixels, view: Int[Tensor, " sighting"], cameras: Cameras, model: SparseModel
-) -> Pixels:
-    ends = homogeneous(pixels)
-    found = torch.empty_like(pixels)
-    for index, lens in enumerate(model.lenses):
-        here = view == index
-        rays = torch.linalg.solve(cameras.intrinsics[index], ends[here].mT).mT
-        found[here] = distort(lens, rays)
-    return found
-
-
 def _adjusted(
     model: SparseModel, aligned: Bool[Tensor, " observation"], *, cameras: bool
 ) -> tuple[SparseModel, Bool[Tensor, " point"], float]:
@@ -144,7 +136,10 @@ def _adjusted(
     Returns:
         The model of the leading points, which points these are, and the scale of the residuals.
     """
-    points = _leading(model, aligned)
+    # Points that are aligned lead, and all points of views that show few of those.
+    counts = torch.bincount(model.observation_view[aligned], minlength=model.num_views)
+    weighty = aligned | (counts < MIN_POINTS)[model.observation_view]
+    points = torch.bincount(model.observation_point[weighty], minlength=len(model.points_world)) > 0
     leading = points[model.observation_point]
     tied = model.without(~leading)
     tied = bundle(tied, _FIRST_SCALE_PX, cameras=cameras, tolerance=_FIRST_TOLERANCE)
@@ -167,11 +162,3 @@ def _with_others(
             others = bundle(others, scale, cameras=False, tolerance=tolerance)
         points[~leading] = others.points_world
     return model.replace(points_world=points)
-
-
-def _leading(model: SparseModel, aligned: Bool[Tensor, " observation"]) -> Bool[Tensor, " point"]:
-    """Find the points that tell cameras: those aligned, and all in views that show few of them."""
-    counts = torch.bincount(model.observation_view[aligned], minlength=model.num_views)
-    leading = aligned | (counts < MIN_POINTS)[model.observation_view]
-    points = model.observation_point[leading]
-    return torch.bincount(points, minlength=len(model.points_world)) > 0

@@ -88,14 +88,8 @@ def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackgro
     with quiet(), loaded().Database.open(database) as stored:
         matched = matching.read_matched(stored)
         verifier = matching.Verifier(matched=matched, settings=settings)
-        rest = find_static_background(
-            matched.keypoints,
-            matched.pairs,
-            verifier,
-            still_px=_STILL_PX,
-            max_error_px=settings.max_error_px,
-            fewest=MIN_MATCHES,
-        )
+        limit = settings.max_error_px
+        rest = find_static_background(matched.keypoints, matched.pairs, verifier, limit)
         if rest.room:
             geometries = matching.read_geometries(stored, matched.ids) | verifier.geometries
             _keep_moving(stored, matched, rest, geometries)
@@ -111,13 +105,7 @@ def enter_room(rest: StaticBackground) -> tuple[int, int]:
 
 
 def find_static_background(
-    keypoints: Keypoints,
-    pairs: matching.Matches,
-    verify: matching.Verify,
-    *,
-    still_px: float,
-    max_error_px: float,
-    fewest: int,
+    keypoints: Keypoints, pairs: matching.Matches, verify: matching.Verify, max_error_px: float
 ) -> StaticBackground:
     """Separate features of the static background from those of the moving object.
 
@@ -129,16 +117,16 @@ def find_static_background(
     """
     votes = [torch.zeros(len(one), dtype=torch.long) for one in keypoints]  # for rest
     num_moving = num_violating = moving_pairs = 0
-    split = {pair: _split(keypoints, pair, rows, still_px) for pair, rows in pairs.items()}
+    split = {pair: _split(keypoints, pair, rows) for pair, rows in pairs.items()}
     shown = {pair: min(map(len, both)) for pair, both in split.items()}
     order = sorted(split, key=shown.__getitem__, reverse=True)
-    telling = [pair for pair in order if shown[pair] >= fewest]
+    telling = [pair for pair in order if shown[pair] >= MIN_MATCHES]
     # The first pairs, which show most of both, must contradict one geometry: else no more are
     # verified.
     for start in track(range(0, len(telling), 24)):
         group = telling[start : start + 24]
         for pair, moving in verify({pair: split[pair][1] for pair in group}).items():
-            if len(moving) < fewest:
+            if len(moving) < MIN_MATCHES:
                 continue
             resting = split[pair][0]
             still, ends = (matching.pixels_of(keypoints, pair, some) for some in (resting, moving))
@@ -161,22 +149,20 @@ def find_static_background(
 
 
 def moving_matches(
-    keypoints: Keypoints, pair: PhotographPair, rows: Rows, rest: StaticBackground, still_px: float
+    keypoints: Keypoints, pair: PhotographPair, rows: Rows, rest: StaticBackground
 ) -> Bool[Tensor, " match"]:
     """Find matches that are neither still nor of a feature at rest."""
     touched = rest.features[pair[0]][rows[:, 0]] | rest.features[pair[1]][rows[:, 1]]
     first, second = matching.pixels_of(keypoints, pair, rows)
-    return ~touched & ((first - second).norm(dim=-1) >= still_px)
+    return ~touched & ((first - second).norm(dim=-1) >= _STILL_PX)
 
 
-def _split(
-    keypoints: Keypoints, pair: PhotographPair, rows: Rows, still_px: float
-) -> tuple[Rows, Rows]:
+def _split(keypoints: Keypoints, pair: PhotographPair, rows: Rows) -> tuple[Rows, Rows]:
     """Return a pair's still matches, and those that clearly move."""
     first, second = matching.pixels_of(keypoints, pair, rows)
     length = (first - second).norm(dim=-1)
     # Features at rest that were found less exactly do not show motion.
-    return rows[length < still_px], rows[length >= 4 * still_px]
+    return rows[length < _STILL_PX], rows[length >= 4 * _STILL_PX]
 
 
 def _keep_moving(
@@ -195,7 +181,7 @@ def _keep_moving(
     number = [torch.cumsum(~resting, dim=0) - 1 for resting in rest.features]
 
     def moving(pair: PhotographPair, rows: Rows) -> np.ndarray:
-        rows = rows[moving_matches(matched.keypoints, pair, rows, rest, _STILL_PX)]
+        rows = rows[moving_matches(matched.keypoints, pair, rows, rest)]
         ends = [number[view][rows[:, side]] for side, view in enumerate(pair)]
         return torch.stack(ends, dim=1).numpy().astype(np.uint32)
 

@@ -63,9 +63,22 @@ def undistorted(views: Views, lenses: tuple[Lens, ...]) -> Iterator[tuple[Pictur
     """Undistort photographs one by one, as :func:`undistort` does, without padding."""
     shared = source_grid(lenses[0], like=views.images) if len(set(lenses)) == 1 else None
 
-    def one(index: int) -> tuple[Tensor, Tensor]:
-        grid = shared or source_grid(lenses[index], like=views.images)
-        return _undistort_image(views, index, lenses[index], grid)
+    def one(index: int) -> tuple[Picture, Mask]:
+        lens = lenses[index]
+        image = views.images[index, :, : lens.height, : lens.width]
+        mask = None if views.masks is None else views.masks[index, : lens.height, : lens.width]
+        grid = shared or source_grid(lens, like=views.images)
+        if grid is None:  # a lens without distortion
+            return image, torch.ones_like(image[0], dtype=torch.bool) if mask is None else mask
+        places, inside = grid
+        radiance = _sampled(image, places).masked_fill_(~inside, 0)
+        saturated = image >= SATURATED
+        if bool(saturated.any()):
+            touched = _sampled(saturated.to(image), places) > 1e-3  # the rounding of weights
+            radiance = torch.where(touched & inside, radiance.clamp_min(1), radiance)
+        if mask is not None:
+            inside = inside & (_sampled(mask[None].to(image), places)[0] > 0.5)
+        return radiance, inside
 
     yield from side_by_side(one, range(views.num_views))
     release_memory()  # of the photographs, and of their grids
@@ -77,10 +90,9 @@ def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
     return torch.stack([found[lens] for lens in lenses])
 
 
-_Grid = tuple[Places, Mask]
-
-
-def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _Grid | None:
+def source_grid(
+    lens: Lens, like: Tensor, width: int = 0, height: int = 0
+) -> tuple[Places, Mask] | None:
     """Return where pixels of the pinhole image are in the photograph, and which are in it at all.
 
     Args:
@@ -99,25 +111,6 @@ def source_grid(lens: Lens, like: Tensor, width: int = 0, height: int = 0) -> _G
     # Half a pixel from the edge on, the edge's own pixel continues.
     sources = torch.where(within[..., None], sources, 0.5).clamp_min(0.5)
     return grid_from_pixels(torch.minimum(sources, size - 0.5), width, height)[None], within
-
-
-def _undistort_image(
-    views: Views, index: int, lens: Lens, grid: _Grid | None
-) -> tuple[Picture, Mask]:
-    """Undistort one photograph, without padding; no grid for a lens without distortion."""
-    image = views.images[index, :, : lens.height, : lens.width]
-    mask = None if views.masks is None else views.masks[index, : lens.height, : lens.width]
-    if grid is None:
-        return image, torch.ones_like(image[0], dtype=torch.bool) if mask is None else mask
-    places, inside = grid
-    radiance = _sampled(image, places).masked_fill_(~inside, 0)
-    saturated = image >= SATURATED
-    if bool(saturated.any()):
-        touched = _sampled(saturated.to(image), places) > 1e-3  # the rounding of weights
-        radiance = torch.where(touched & inside, radiance.clamp_min(1), radiance)
-    if mask is not None:
-        inside = inside & (_sampled(mask[None].to(image), places)[0] > 0.5)
-    return radiance, inside
 
 
 def _sampled(raster: Picture, grid: Places) -> Picture:

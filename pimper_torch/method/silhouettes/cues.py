@@ -13,9 +13,9 @@ from torch.nn.functional import interpolate, normalize
 from pimper_torch.ground.geometry.opencv import convex_hull_of
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.supporting_plane import (
+    PLANE_TOLERANCE,
     Fixation,
     Plane,
-    PlaneSearch,
     fixation,
     supporting_plane,
     well_tracked,
@@ -238,7 +238,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
     distance = float(focus.distance)
     tracked = points[well_tracked(scene)]
     plane = supporting_plane(tracked, cameras.centers_world, distance)
-    tolerance = PlaneSearch().tolerance * distance
+    tolerance = PLANE_TOLERANCE * distance
     region = _region(scene, config.region) if config.region else None
     on_object, background = split_cloud(scene, focus, plane, tolerance, region)
     half, centre = _BOX * focus.distance, focus.fixation_world

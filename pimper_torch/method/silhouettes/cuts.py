@@ -103,7 +103,9 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
     Returns:
         ``None`` where the cuts have nothing in common.
     """
-    masks, unknown = _first(cues), _unknown(cues)
+    masks, unknown = _first(cues), torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
+    if cues.agreement is not None and not cues.has_points:
+        unknown = by_view(Tensor.isnan, cues.agreement)  # as beyond the plane
     doubted = _doubted(cues, masks)
     cues, voting = cues.without(doubted)
     for _ in range(_ITERATIONS):
@@ -117,8 +119,10 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
         masks, unknown = _again(cues, masks, seen, unknown), torch.zeros_like(unknown)
     cues = cues.relearned(masks)
     masks = _filled(cues, masks)
-    hidden = _in_front(cues, masks)
-    seen = _voted(cues, by_view(_abstaining, _doubting(cues, masks), hidden))
+    hidden, shown = _in_front(cues, masks), masks.float()  # the probability of the object
+    if cues.agreement is not None:
+        shown = by_view(lambda mask, at: torch.where(mask, 1, doubt_of(at)), masks, cues.agreement)
+    seen = _voted(cues, by_view(_abstaining, shown, hidden))
     if seen is None:
         return None
     masks = repaired(masks, seen, None if cues.plane is None else cues.pictures.grey)
@@ -151,16 +155,15 @@ def repaired(masks: Masks, margins_px: Maps, grey: Maps | None) -> Masks:
         grey: Logarithm of the mean radiance; ``None`` without a plane.
     """
     if grey is None:
-        return by_view(_without_holes, masks, margins_px)
+        # Next to a skull's cheek bone views see through what is half as deep.
+        return by_view(
+            lambda mask, margin: mask | blind_holes(mask, ~is_deep(margin / 2.0), 0.2),
+            masks,
+            margins_px,
+        )
     found = by_view(_without_shadow, masks, margins_px, grey)
     leave_out("silhouettes.shadows", masks & ~found)
     return found
-
-
-def _without_holes(mask: Mask, margin: Map) -> Mask:
-    """Fill holes deep inside the projection, as a highlight makes them in a single view."""
-    # Beside a skull's cheek bone views see through what is half as deep.
-    return mask | blind_holes(mask, ~is_deep(margin / 2.0), 0.2)
 
 
 def _without_shadow(mask: Mask, margin: Map, grey: Map) -> Mask:
@@ -221,9 +224,8 @@ def _again(cues: Cues, masks: Masks, seen: Maps, unknown: Masks) -> Masks:
     """Cut from the last cut and the hull; drop what does not meet the hull."""
 
     def again(view: int) -> Mask:
-        object_px = cues.object_px[view]
-        agreement = cues.agreement_in(view)
-        labels = labels_from_hull(seen[view], masks[view], object_px, agreement, unknown[view])
+        points = cues.object_px[view], cues.agreement_in(view)
+        labels = labels_from_hull(seen[view], masks[view], *points, unknown[view])
         if cues.soft is not None and cues.soft.given[view]:
             labels = labels_from_soft(labels, cues.soft.masks[view], seen[view])
         cut = _cut(grab_cut, cues, view, labels, seen[view])
@@ -264,24 +266,10 @@ def _doubted(cues: Cues, masks: Masks) -> ViewMask:
     return given
 
 
-def _unknown(cues: Cues) -> Masks:
-    """Find what a first cut by parallax knows nothing of, as beyond the plane."""
-    if cues.agreement is None or cues.has_points:
-        return torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
-    return by_view(Tensor.isnan, cues.agreement)
-
-
 def doubt_of(agreement: Map) -> Map:
     """Return the probability that a pixel shows the object though its cut lacks it."""
     doubt = torch.where(agreement > _ON_PLANE, 0.0, _DOUBT)
     return torch.where(agreement < _OFF_PLANE, DOUBT_OFF_PLANE, doubt)
-
-
-def _doubting(cues: Cues, masks: Masks) -> Maps:
-    """Return the probability that pixels show the object, by the cuts and what they lack."""
-    if cues.agreement is None:
-        return masks.float()
-    return by_view(lambda mask, at: torch.where(mask, 1, doubt_of(at)), masks, cues.agreement)
 
 
 def _abstaining(inside: Map, unknown: Mask) -> Map:

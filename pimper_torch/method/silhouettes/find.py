@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.ndimage import label
 from torch import Tensor
 
-from pimper_torch.ground.geometry.supporting_plane import PlaneSearch
+from pimper_torch.ground.geometry.supporting_plane import PLANE_TOLERANCE
 from pimper_torch.ground.geometry.visual_hull import box_round, margins, visual_hull
 from pimper_torch.ground.shapes import ViewMask
 from pimper_torch.method.silhouettes.cues import Cues, cues_of
@@ -159,7 +159,7 @@ def _top(cues: Cues) -> Float[Tensor, "plane 4"] | None:
     """Return the upper side of the supporting plane, as thick as its points are rough."""
     if cues.plane is None:
         return None
-    thickness = PlaneSearch().tolerance * cues.fixation.distance
+    thickness = PLANE_TOLERANCE * cues.fixation.distance
     height = cues.plane.offset + thickness
     return torch.cat([cues.plane.normal_world, -height.reshape(1)])[None]
 
