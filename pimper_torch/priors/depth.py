@@ -4,7 +4,6 @@ A reading says how values ``d`` of a map belong to depth ``t`` of the points tha
 observes: ``t = a d + b`` with ``a`` above 0, where ``t`` is depth, distance, or one over either.
 """
 
-import math
 from typing import Literal
 
 import torch
@@ -13,8 +12,9 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.ground.shapes import Scalar
 from pimper_torch.priors.at_points import AtPoints, at_points, layouts, means_by, turned
-from pimper_torch.priors.choice import surely_better
+from pimper_torch.priors.choice import better_otherwise, surely_better
 from pimper_torch.records import DepthPrior, SparseScene
 from pimper_torch.runtime.errors import InputError, caution, some
 
@@ -36,8 +36,6 @@ _OURS = (False, "axis", "scene")
 # median error must grow for a stated gauge to be wrong; relative depth of a relief that estimators
 # are too coarse for; relative depth that clouds are good to at best.
 _FEWEST, _STEPS, _WORSE, _FLAT, _ROUGH = 8, 20, 2.0, 0.03, 3e-4
-# By how much the median error must fall for maps to be refused as turned: a choice.
-_TURNED = 1.2
 
 
 def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
@@ -69,7 +67,7 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
 
     if not told and (prior.inverse, prior.along, prior.gauge) == _OURS:
         return prior
-    if what := _better_turned(prior.detach(), scene):
+    if what := _better_turned(prior.detach(), scene, size):
         raise InputError(f"{where} is {what}: the cloud shows it. Turn maps like the photographs.")
     helps = told and surely_better(worth[best, -1], worth[-1, -1])
     if medians[-1, -1] > _FLAT and not helps:
@@ -183,31 +181,28 @@ def _compared(
 
 
 @torch.no_grad()
-def _better_turned(prior: DepthPrior, scene: SparseScene) -> str:
-    """State how maps fit the cloud surely better if they are turned, up to factor and offset."""
+def _better_turned(prior: DepthPrior, scene: SparseScene, size: Scalar) -> str:
+    """Name the turn with which maps surely fit the cloud better, up to factor and offset.
+
+    Args:
+        size: Relative error that scores a half.
+    """
     seen = at_points(prior, torch.ones_like(prior.depth, dtype=torch.bool), scene)
     maps, axis = seen.place[:, 0], seen.depth.double()
 
-    def errors(tags: Int[Tensor, " map"]) -> tuple[float, Float[Tensor, " observation"]]:
+    def worth(tags: Int[Tensor, " map"]) -> Float[Tensor, "reading point"]:
         place = turned(seen.place, prior, tags).unbind(dim=-1)
         values, known = prior.depth[place].double(), prior.variance[place].isfinite()
-        fits = []
+        scores = []
         for truth in (axis, 1 / axis):
             lines = _lines(values[known], truth[known], maps[known], len(prior.names), True)[maps]
             error = (lines[:, 0] * values + lines[:, 1] - truth).abs() / truth
-            error = torch.where(known & error.isfinite(), error, torch.inf)
-            told = error[error.isfinite()]
-            fits.append((float(told.median()) if len(told) else math.inf, error))
-        return min(fits, key=lambda one: one[0])
+            scores.append(torch.where(known, size / (size + error), 0).nan_to_num(0))
+        return means_by(torch.stack(scores), seen.point)
 
-    plain, found = errors(torch.ones(len(prior.names), dtype=torch.long)), ""
-    for what, tags in layouts(prior, scene):
-        one = errors(tags)
-        size = max(min(plain[0], one[0]), _ROUGH)
-        worth = [means_by(size / (size + error), seen.point) for _, error in (one, plain)]
-        if one[0] < plain[0] / _TURNED and surely_better(*worth):
-            plain, found = one, what
-    return found
+    plain = worth(torch.ones(len(prior.names), dtype=torch.long))
+    turns = [(what, worth(tags)) for what, tags in layouts(prior, scene)]
+    return better_otherwise(plain[plain.mean(dim=1).argmax()], turns)
 
 
 def _lines(

@@ -6,9 +6,9 @@ reading of the normals is worth, of a point of the cloud, 1 less twice the mean 
 or -1 where they face away; of a place on an outline, the cosine between normal and outward.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,7 +18,6 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.contours import contour_rays
 from pimper_torch.ground.shapes import Points
 from pimper_torch.priors.at_points import (
-    AtPoints,
     at_points,
     layouts,
     means_by,
@@ -26,8 +25,8 @@ from pimper_torch.priors.at_points import (
     turned,
     turned_vectors,
 )
-from pimper_torch.priors.choice import surely_better
-from pimper_torch.records import NormalPrior, Silhouettes, SparseScene
+from pimper_torch.priors.choice import better_otherwise, surely_better
+from pimper_torch.records import NormalPrior, Record, Silhouettes, SparseScene
 from pimper_torch.records.priors import AXES
 from pimper_torch.runtime.errors import InputError, caution, some
 
@@ -54,39 +53,27 @@ _POINTS, _NEIGHBOURS, _RIM, _INSIDE = 600, 8, 64, 2.0
 # of 160x120) have 0.66 to 0.83, with 30 degrees of noise 0.31 to 0.70; world normals of another
 # world 0.10 at most.
 _LEAST = 0.2
-# How much more maps must be worth, turned or with channels exchanged, than as they are: a choice.
-# Of the same scenes without noise and with 25 degrees, maps of the object alone included, mirrored,
-# half turned and exchanged ones are found so, but for those of a jar that is its own mirror image.
-_MORE = 0.05
 _BGR = "red and blue exchanged, as OpenCV writes pictures"
 
 
-class _Samples(NamedTuple):
-    """Where the scene tells normals: points of the cloud in views, and places inside outlines.
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class _Samples(Record):
+    """Places of maps where the scene shows normals: points of the cloud, and insides of outlines.
 
     Attributes:
-        seen: Observations of the points.
-        ways: To the neighbours of each observation's point.
-        rays: To it.
-        poses: Rotations of the observing cameras.
-        rim: Map, row and column of each place inside an outline.
-        outward: Normals there, world.
-        rim_poses: Rotations of its cameras.
+        point: Number of the point; each place inside an outline has a number of its own.
+        place: Map, row and column.
+        pose: Rotation of the camera.
+        towards: The ray to a point; the outward normal of an outline, world.
+        ways: To the neighbours of a point.
     """
 
-    seen: AtPoints
-    ways: Float[Tensor, "observation neighbour 3"]
-    rays: Float[Tensor, "observation 3"]
-    poses: Float[Tensor, "observation 3 3"]
-    rim: Int[Tensor, "rim 3"]
-    outward: Float[Tensor, "rim 3"]
-    rim_poses: Float[Tensor, "rim 3 3"]
-
-    def where(self, known: Bool[Tensor, "map height width"]) -> "_Samples":
-        """Keep those at which maps say something."""
-        here, rim = known[self.seen.place.unbind(dim=-1)], known[self.rim.unbind(dim=-1)]
-        of_points = self.seen.take(here), self.ways[here], self.rays[here], self.poses[here]
-        return _Samples(*of_points, self.rim[rim], self.outward[rim], self.rim_poses[rim])
+    point: Int[Tensor, " sample"]
+    place: Int[Tensor, "sample 3"]
+    pose: Float[Tensor, "sample 3 3"]
+    towards: Float[Tensor, "sample 3"]
+    ways: Float[Tensor, "sample neighbour 3"]
+    on_outline: Bool[Tensor, " sample"]
 
 
 def settled_normals(
@@ -108,7 +95,7 @@ def settled_normals(
     where = f"The normals of {len(prior.names)} photographs ({some(prior.names, most=1)})"
     bare = prior.detach()
     every = _samples(bare, scene, silhouettes)
-    at = every.where(bare.variance.isfinite())
+    at = every.take(bare.variance.isfinite()[every.place.unbind(dim=-1)])
     worth = _worth(bare, at)
     means = worth.mean(dim=1) if worth.shape[1] else worth.new_zeros(len(_READINGS))
     best = int(means.argmax())
@@ -123,7 +110,12 @@ def settled_normals(
         found = "fit in no axes, yet agree between views as they stand: they are world normals of "
         needed = "Give camera normals, or the cameras of that world with `--sparse`."
         raise refused(f"{found}another world", needed)
-    if what := _better_otherwise(bare, every, best, dict(layouts(bare, scene))):
+    others = [(_BGR, _worth(bare, every, change=lambda normals, _: normals.flip(-1)))]
+    for what, tags in layouts(bare, scene):
+        # The network saw the picture as it lay, or pixels were turned and vectors were not.
+        others += [(what, _worth(bare, every, tags, turned_vectors))]
+        others += [(what, _worth(bare, every, tags))]
+    if what := better_otherwise(_worth(bare, every)[best], others, _LEAST):
         if what != _BGR:
             raise refused(f"are {what}", "Turn maps and vectors like the photographs.")
         caution(f"{where} have {_BGR}; they are exchanged back.", stacklevel=4)
@@ -136,12 +128,12 @@ def settled_normals(
         raise refused(f"are {_MEANINGS[best]}, {given}", "State `axes`, or turn them.")
     doubt = float(means[index]) < _LEAST
     if prior.axes is None:
-        others = [one for one in range(_WORLD + 1) if one != index]
-        unsure = [_MEANINGS[one] for one in others if not far_better(index, one)]
+        rest = [one for one in range(_WORLD + 1) if one != index]
+        unsure = [_MEANINGS[one] for one in rest if not far_better(index, one)]
         if unsure or doubt:
             what = f"are {_MEANINGS[index]} or {unsure[0]}" if unsure else "fit in any axes"
             raise InputError(f"{where}: nothing tells whether they {what}. State `axes`.")
-        fit, next_best = float(means[index]), float(means[others].max())
+        fit, next_best = float(means[index]), float(means[rest].max())
         caution(
             f"{where} are taken to be {_MEANINGS[index]}: they fit cloud, outlines and cameras to "
             f"{fit:.2f} of 1, other readings to {next_best:.2f}. If that is wrong, state `axes`.",
@@ -170,44 +162,37 @@ def _read(
     return torch.stack(found)
 
 
-def _better_otherwise(
-    prior: NormalPrior, at: _Samples, best: int, turns: Mapping[str, Int[Tensor, " map"]]
-) -> str:
-    """State how maps fit surely better than as they are, turned or with channels exchanged.
-
-    Args:
-        best: The reading of the maps as they are.
-        turns: Ways of turning maps, as numbers of EXIF.
-    """
-    others = [(_BGR, _worth(prior, at, change=lambda normals, _: normals.flip(-1)))]
-    for what, tags in turns.items():
-        # A network saw the picture as it lay, or vectors were turned and pixels were not.
-        others += [(what, _worth(prior, at, tags, turned_vectors)), (what, _worth(prior, at, tags))]
-    if not others[0][1].shape[1]:
-        return ""
-    fits = [(what, one[one.mean(dim=1).argmax()]) for what, one in others]
-    what, fit = max(fits, key=lambda one: float(one[1].mean()))
-    plain, share = _worth(prior, at)[best], float((fit != 0).float().mean())
-    least = max(_LEAST * share, float(plain.mean()) + _MORE * share)
-    return what if float(fit.mean()) > least and surely_better(fit, plain) else ""
-
-
 @torch.no_grad()
 def _samples(prior: NormalPrior, scene: SparseScene, silhouettes: Silhouettes | None) -> _Samples:
     points, everywhere = scene.points_world, torch.ones_like(prior.variance, dtype=torch.bool)
+    rotations, centers = scene.cameras.cam_from_world[:, :3, :3], scene.cameras.centers_world
     seen, ways = at_points(prior, everywhere, scene), _ways(points)
     seen = seen.take(ways[seen.point].isfinite().flatten(1).all(dim=1))
-    rotations = scene.cameras.cam_from_world[:, :3, :3]
-    rays = points[seen.point] - scene.cameras.centers_world[seen.view]
-    rim, outward, view = seen.place[:0], rays[:0], seen.view[:0]
-    if silhouettes is not None:  # where these are everything, they have no outlines
-        found = contour_rays(silhouettes, scene.cameras, _RIM)
-        turned_out = (rotations[found.view] @ found.normals_world[..., None])[:, :2, 0]
-        pixels = found.pixels - _INSIDE * normalize(turned_out, dim=-1)
-        rim, within = places(prior, scene, found.view, pixels)
-        rim, outward, view = rim[within], found.normals_world[within], found.view[within]
-    poses = rotations[seen.view]
-    return _Samples(seen, ways[seen.point], rays, poses, rim, outward, rotations[view])
+    samples = _Samples(
+        point=seen.point,
+        place=seen.place,
+        pose=rotations[seen.view],
+        towards=points[seen.point] - centers[seen.view],
+        ways=ways[seen.point],
+        on_outline=torch.zeros_like(seen.point, dtype=torch.bool),
+    )
+    if silhouettes is None:
+        return samples
+    # Silhouettes that are everything have no outlines.
+    found = contour_rays(silhouettes, scene.cameras, _RIM)
+    turned_out = (rotations[found.view] @ found.normals_world[..., None])[:, :2, 0]
+    pixels = found.pixels - _INSIDE * normalize(turned_out, dim=-1)
+    place, within = places(prior, scene, found.view, pixels)
+    number = torch.arange(len(place), device=place.device)
+    outlines = _Samples(
+        point=len(points) + number,
+        place=place,
+        pose=rotations[found.view],
+        towards=found.normals_world,
+        ways=points.new_zeros(len(place), _NEIGHBOURS, 3),
+        on_outline=number >= 0,
+    )
+    return _Samples.cat([samples, outlines.take(within)])
 
 
 @torch.no_grad()
@@ -216,34 +201,29 @@ def _worth(
     at: _Samples,
     tags: Int[Tensor, " map"] | None = None,
     change: Callable[[Tensor, Tensor], Tensor] = lambda normals, _: normals,
-) -> Float[Tensor, "reading sample"]:
-    """Return what readings are worth at points and outlines; 0 where maps say nothing.
+) -> Float[Tensor, "reading place"]:
+    """Return the worth of readings at points and outlines; 0 where maps say nothing.
 
     Args:
         tags: Numbers of EXIF by which maps are to be turned.
         change: From normals, and the tags of their maps, to those that are looked at.
     """
     tags = torch.ones_like(prior.sizes_px[:, 0]) if tags is None else tags
-
-    def looked_up(place: Int[Tensor, "sample 3"]) -> tuple[Tensor, Tensor]:
-        there = turned(place, prior, tags).unbind(dim=-1)
-        normals = change(prior.normals[there].to(at.ways), tags.to(place)[place[:, 0]])
-        return normals, prior.variance[there].isfinite()
-
-    (normals, known), (rims, rim_known) = looked_up(at.seen.place), looked_up(at.rim)
-    found = _read(normals, at.poses)
+    there = turned(at.place, prior, tags).unbind(dim=-1)
+    normals = change(prior.normals[there].to(at.ways), tags.to(at.place)[at.place[:, 0]])
+    found = _read(normals, at.pose)
+    along = (found * at.towards).sum(dim=-1)
     flat = 1 - 2 * (found[:, :, None] * at.ways).sum(dim=-1).abs().mean(dim=-1)
-    faces = (found * at.rays).sum(dim=-1) < 0
-    worth = torch.where(known, torch.where(faces, flat, -1), 0)
-    along = (_read(rims, at.rim_poses) * at.outward).sum(dim=-1)
-    return torch.cat([means_by(worth, at.seen.point), torch.where(rim_known, along, 0)], dim=1)
+    worth = torch.where(at.on_outline, along, torch.where(along < 0, flat, -1))
+    return means_by(torch.where(prior.variance[there].isfinite(), worth, 0), at.point)
 
 
 @torch.no_grad()
 def _of_other_world(prior: NormalPrior, at: _Samples) -> bool:
     """Return whether normals agree between views as they stand, and better than most readings."""
-    found = _read(prior.normals[at.seen.place.unbind(dim=-1)].to(at.ways), at.poses)
-    agree = means_by(found.movedim(-1, 1), at.seen.point).norm(dim=1).mean(dim=-1)
+    at = at.take(~at.on_outline)
+    found = _read(prior.normals[at.place.unbind(dim=-1)].to(at.ways), at.pose)
+    agree = means_by(found.movedim(-1, 1), at.point).norm(dim=1).mean(dim=-1)
     world, second = agree[_WORLD], agree.sort().values[-2]
     # A mean of length 0.9: normals are within 25 degrees of it.
     return bool(world > max(float(second), 0.9))
