@@ -72,7 +72,8 @@ RUNS = {
         "{true_mesh} {scene} -o {out}.json --truth-layout rendered --samples 500 --seed 2 --views "
         "view_000 view_001 --thresholds-percent 0.5 1 --seen-from 2 --alignment icp "
         "--trimmed-fraction 0.1",
-        "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500",
+        "{ball} {dtu} --out {out}.json --truth-layout dtu-mvs --scan 9 --samples 500 "
+        "--alignment icp",
         "{result} {scene} --samples 500 --report {out}.html --overwrite",
     ],
     "bench": [

@@ -135,12 +135,11 @@ def ball():
         normals_world=-vertices,
         albedo=0.5 + 0.4 * vertices,
         confidence=known,
-        expected_error=known.square(),
+        expected_error=known.square(),  # unlike its confidence
     )
 
 
 def test_layers_are_those_that_the_newest_surface_has(viewer, ball):
-    ball = ball.replace(expected_error=ball.expected_error**2)  # unlike its confidence
     viewer.add_pass("ball", ball)
     names = ("lit", "shape", "albedo", "normals", "expected error", "support")
     assert viewer._layer.options == names
