@@ -99,9 +99,7 @@ def match_poses(
     def match(names: Sequence[str], places: Sequence[int]) -> dict[str, int]:
         files = [present[place] for place in places]
         matched = match_files(names, files, folder=folder, where=where, what=what)
-        return {
-            name: places[at] for name, at in zip(names, matched, strict=True) if at is not None
-        }
+        return {name: places[at] for name, at in zip(names, matched, strict=True) if at is not None}
 
     found = {} if any(own.values()) else match(wanted, range(len(present)))
     for pose, places in own.items():
