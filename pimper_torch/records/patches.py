@@ -584,6 +584,13 @@ class Depths(Record):
         """List depths that are nowhere."""
         yield from faults_in("depth", "finite where valid", not_finite, self.depth, self.valid)
 
+    @property
+    def aligned(self) -> Bool[Tensor, " patch"]:
+        """Whether the height field meets a neighbour's; false before alignment."""
+        if self.status is None:
+            return torch.zeros_like(self.transform[:, 0], dtype=torch.bool)
+        return self.status == int(AlignStatus.ALIGNED)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DepthPatches(OverPhotometry):
