@@ -12,7 +12,7 @@ from pimper_torch.records import StageReport
 
 
 class Bars:
-    """An observer with a bar for every stage, and beside it the time left for the run.
+    """An observer with a bar for every stage, and next to it the time left for the run.
 
     Where the output is no terminal, it writes lines instead: one when a stage ends, and in a long
     stage one for each tenth that is done.
@@ -47,7 +47,7 @@ class Bars:
         self._progress.stop()
 
     def started(self, stage: str) -> None:
-        """Begin a bar; it moves to and fro until the stage tells how far it has come."""
+        """Begin a bar; it moves to and fro until the stage reports progress."""
         self._forecast.started(stage)
         self._tenths, self._last = 0, time.perf_counter()
         self._task = self._progress.add_task(stage, total=None, found=self._left())

@@ -47,7 +47,6 @@ CameraDistances = Annotated[
 ]
 Markers = Annotated[Literal["auto", "off"] | float, tyro.conf.arg(metavar="auto|off|MM")]
 
-
 # The demo keeps 0.5 GB. A choice: a few runs of twice as large photographs.
 MAX_KEPT = "8GB"
 

@@ -67,11 +67,8 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
             bars = bars_in_files(job, views)
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
-        store = Store(
-            folder=common.cache or job.out / STAGES,
-            max_bytes=bytes_of(common.max_kept),
-            fresh=common.fresh,
-        )
+        folder, limit = common.cache or job.out / STAGES, bytes_of(common.max_kept)
+        store = Store(folder=folder, max_bytes=limit, fresh=common.fresh)
         chain = make_chain(job.config, observer, store)
         chain.needed = tuple(given.measured_in(job.inputs.bars, job.inputs.distances))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
@@ -223,7 +220,7 @@ def bars_in_files(job: Job, views: Views) -> tuple[given.ScaleBar, ...]:
 def sized(
     job: Job, bars: tuple[given.ScaleBar, ...], result: Reconstruction
 ) -> tuple[Reconstruction, Scale | None]:
-    """Scale a result to its real size, as far as anything tells it."""
+    """Scale a result to its real size, if that is known."""
     inputs = job.inputs
     scale = find_scale(
         result,

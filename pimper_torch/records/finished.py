@@ -1,4 +1,4 @@
-"""A surface that is ready to be written, and what it is worth beside photographs."""
+"""A surface that is ready to be written, and its errors against photographs."""
 
 from dataclasses import dataclass
 

@@ -67,7 +67,7 @@ class Templates(Record):
     views: Bool[Tensor, " view"] | None = None
 
     def rows(self, num_views: int) -> Int[Tensor, " row"]:
-        """Return the numbers of the views that the bucket is seen in; of all, they are so many."""
+        """Return the numbers of the views, of ``num_views``, that the bucket is seen in."""
         if self.views is None:
             return torch.arange(num_views, device=self.facet.device)
         return self.views.nonzero()[:, 0]
@@ -172,8 +172,7 @@ class PatchSet(OverPatches):
     """The decomposition: every facet of the coarse mesh has one template.
 
     Attributes:
-        surface: What the templates carry, and what hides what; ``None`` for the facets
-            themselves.
+        surface: Surface that the templates carry and that occludes; ``None`` for the facets.
     """
 
     coarse: CoarseMesh
@@ -209,7 +208,7 @@ class PatchPriors(Record):
     Attributes:
         normals_patch: Unit, in the patch frame; anything where the information is 0.
         normal_information: Inverse variance of the normals, one over squared radians.
-        offset: How far outside the template the surface lies, along the outward normal of what the
+        offset: How far outside the template the surface is, along the outward normal of what the
             template carries; scene units.
         offset_information: Inverse variance of the offset, one over scene units squared.
         albedo: Gray, up to a factor; 0 where nothing is guessed.
@@ -514,11 +513,10 @@ class Heights(Record):
     """A bucket of patches swept for height under their light.
 
     Attributes:
-        offset: How far outside the template the surface lies at every sample, along the
-            outward normal of what the template carries; scene units, 0 where nothing tells.
-        information: Inverse variance of the offset, one over scene units squared; 0 where
-            nothing tells. A sample's own share: neighbours that were averaged with it have
-            theirs.
+        offset: How far outside the template the surface is at every sample, along the outward
+            normal of what the template carries; scene units, 0 where unknown.
+        information: Inverse variance of the offset, one over scene units squared; 0 where unknown.
+            A sample's own share: neighbours that were averaged with it have theirs.
         num_views: In how many views a sample of the patch shows, lit or not.
         priors: What was guessed of the photographs, if anything.
     """
@@ -552,7 +550,7 @@ class AlignStatus(IntEnum):
     ALIGNED = 0
     """Moved to where it agrees best with its neighbours."""
     ALONE = 1
-    """No neighbour's height field lies over its own: it stays on the mesh."""
+    """No neighbour's height field overlaps its own: it stays on the mesh."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

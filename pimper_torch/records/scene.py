@@ -22,8 +22,7 @@ class Lens(Record):
         camera: Number of the camera; views taken by one camera share it.
         model: COLMAP's name of the camera model, such as ``SIMPLE_RADIAL``.
         params: The model's parameters in COLMAP's order.
-        width: Pixels.
-        height: Pixels.
+        width: Pixels, as is the height.
     """
 
     camera: int

@@ -12,7 +12,6 @@ from pimper_torch.ground.shapes import Vectors
 
 _sound: Any = WeakIdKeyDictionary()  # torch does not type it
 
-
 Faults = Iterator[tuple[str, str, str]]
 """What is wrong with a record: the field, what was found, what is needed."""
 

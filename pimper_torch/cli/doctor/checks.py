@@ -16,7 +16,7 @@ from pimper_torch.records import Views
 from pimper_torch.runtime.errors import some
 
 # 24 photographs of the demo and rendered scenes are within these and the other limits.
-_BLUR_PX, _BLUR_RATIO = 1.5, 1.6  # absolute, and beside the median of the folder
+_BLUR_PX, _BLUR_RATIO = 1.5, 1.6  # absolute, and relative to the median of the folder
 
 
 def examine_folder(
@@ -64,7 +64,7 @@ def number(photographs: Sequence[Photograph]) -> Finding:
 
 
 def blur(photographs: Sequence[Photograph]) -> Finding | None:
-    """Find photographs that are blurred, in pixels and beside the others."""
+    """Find photographs that are blurred, in pixels and relative to the others."""
     known = [one for one in photographs if not math.isnan(one.blur_px)]
     if not known:
         return None

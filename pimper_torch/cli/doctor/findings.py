@@ -55,7 +55,7 @@ def machine() -> Iterator[Finding]:
 
 
 def available_gb() -> float | None:
-    """Return the memory that a process may still take; ``None`` where the system does not tell."""
+    """Return the memory that a process may still take; ``None`` where it is not known."""
     free = None
     with suppress(OSError, IndexError, ValueError):
         fields = Path("/proc/meminfo").read_text(encoding="ascii")
@@ -69,7 +69,7 @@ def available_gb() -> float | None:
 
 
 def total_gb() -> float | None:
-    """Return the memory of the machine; ``None`` where the system does not tell."""
+    """Return the memory of the machine; ``None`` where it is not known."""
     with suppress(AttributeError, OSError, ValueError):
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     return None

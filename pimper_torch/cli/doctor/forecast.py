@@ -13,7 +13,7 @@ class Forecast:
     by the one under way where it takes longer than planned.
 
     Attributes:
-        plan: Stages to come, in order, with their seconds on some machine; none tells nothing.
+        plan: Stages to come, in order, with their seconds on some machine; may be empty.
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class Forecast:
         """Return real over planned seconds: of the pass before, or of all stages."""
         if own := [real / planned for one, planned, real in self._ended if one == name]:
             return own[-1]
-        # What the plan's own scale is worth, beside what this machine took so far.
+        # Weight of the plan's own scale against the times of this machine so far.
         weight = 0.05 * sum(seconds for _, seconds in self.plan)
         planned = sum(seconds for _, seconds, _ in taken)
         return (weight + sum(real for *_, real in taken)) / (weight + planned)

@@ -33,7 +33,7 @@ def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[Verifi
         focals_px=torch.full((count,), torch.nan),
     )
     settings = ReconstructConfig(peak_threshold=0.004, max_features=1500, affine_shape=False)
-    # Those next to one another first: round a turntable the last is by the first.
+    # Neighbours first: on a turntable the last photograph is next to the first.
     pairs = sorted(
         all_pairs(count), key=lambda pair: min(pair[1] - pair[0], count - pair[1] + pair[0])
     )

@@ -15,7 +15,7 @@ from pimper_torch.ground.shapes import Map, Mask
 from pimper_torch.records import Record, Views
 from pimper_torch.runtime.parallel import side_by_side
 
-# Smoothing before the two gradients that are compared: enough for noise, little beside the blur
+# Smoothing before the two gradients that are compared: enough for noise, little against the blur
 # that is to be found.
 _FINE, _WIDE = 1.0, 2.0
 
@@ -30,7 +30,7 @@ def edge_blur_px(grey: Map) -> float:
     across it alone.
 
     Returns:
-        NaN where there are no edges to tell it.
+        NaN where there are no edges.
 
     Source: Zhuo & Sim, Defocus map estimation from a single image, Pattern Recognition 44, 2011.
     """

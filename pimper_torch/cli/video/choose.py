@@ -1,4 +1,4 @@
-"""Which frames of a video are photographs: the sharpest ones, at equal distances along the way."""
+"""Choice of frames of a video: the sharpest ones, at equal distances along the way."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -27,9 +27,8 @@ class Scan(NamedTuple):
 
 
 def scanned(frames: Iterable[UInt8[Tensor, "height width"]]) -> Scan:
-    """Look at every frame of a video once, in their order; the way is in widths of the frame."""
-    sharp: list[float] = []
-    way: list[float] = []
+    """Measure every frame of a video, in order; the way is in widths of the frame."""
+    sharp, way = list[float](), list[float]()
     anchor, walked = None, 0.0
     for luma in frames:
         small = thumbnail(luma)

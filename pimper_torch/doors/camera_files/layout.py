@@ -84,7 +84,7 @@ class DataSetPath(NamedTuple):
     def inside(self, name: str) -> Path:
         """Join a path that a file of the data set names to its folder.
 
-        Links that lie in the folder are followed wherever they lead: who put them there wants that.
+        Links in the folder are followed wherever they lead: whoever put them there wants that.
 
         Raises:
             InputError: The path is absolute, leads out by ``..``, or is no path.
@@ -104,7 +104,7 @@ class DataSetPath(NamedTuple):
         return entries
 
     def numbers(self, value: object, count: int, what: str) -> Float[Tensor, " number"]:
-        """Return a value of the file as so many finite numbers in float64; refuse anything else.
+        """Return a value of the file as ``count`` finite numbers in float64; refuse others.
 
         Args:
             value: Numbers, or texts of numbers, in a list, a list of lists, one text or alone.

@@ -25,7 +25,7 @@ def read_metashape_cameras(path: Path) -> list[PosedCamera]:
     there to the world, applied where there is one; for a georeferenced chunk that world is
     geocentric. The manual's appendix "Camera models" defines the lens: ``f``, with ``b1``
     added along x; ``cx``, ``cy`` from (width / 2, height / 2) in a frame whose top-left pixel
-    has its centre at (0.5, 0.5), as ours; ``p1`` and ``p2`` the other way round than OpenCV.
+    has its centre at (0.5, 0.5), as ours; ``p1`` and ``p2`` swapped against OpenCV.
 
     Cameras without a transform are not aligned and left out, as are those switched off. Chunks, and
     components of one, have frames of their own: of several chunks with such cameras one has to be

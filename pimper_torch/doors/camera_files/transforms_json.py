@@ -50,7 +50,7 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
     ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
     The focal length is ``fl_x``, ``fl_y`` in pixels, or follows from ``camera_angle_x``; the
     principal point ``cx``, ``cy`` is the centre of the image unless given. All of these, and
-    ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may stand in the file
+    ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may be in the file
     or in a frame. instant-ngp and nerfstudio take them from COLMAP and cast rays through
     x + 0.5 (nerfstudio, "Data conventions" and ``Cameras.get_image_coords``), and Blender's
     centre is that of the image's area: their pixels are ours.
@@ -59,7 +59,7 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
         sizes_of: Of photographs, by ``file_path``.
 
     Returns:
-        In the file's order; without frames whose size nothing tells.
+        In the file's order; without frames whose size is not known.
     """
     frames = read_frames(path)
     names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]

@@ -1,12 +1,9 @@
-"""The workspace of COLMAP's dense stereo: photographs beside a model, with maps."""
+"""The workspace of COLMAP's dense stereo: photographs, a model, and maps."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from pimper_torch.doors.exchange.picture_files import write_pictures
 from pimper_torch.doors.exchange.result import Result
@@ -27,9 +24,9 @@ def write_workspace(result: Result, folder: Path) -> None:
 
     The undistorter itself is not run: it would resample the photographs once more.
 
-    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with another
-    ``.png`` behind, ``sparse/`` the model with its tracks. Depths are along the camera's z, normals
-    in its frame (x right, y down, z forward), both 0 where a view does not see the surface:
+    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with ``.png``
+    appended, ``sparse/`` the model with its tracks. Depths are along the camera's z, normals in its
+    frame (x right, y down, z forward), both 0 where a view does not see the surface:
     ``stereo_fusion`` and the meshers run on them.
     """
     scene = result.scene
@@ -47,7 +44,11 @@ def write_workspace(result: Result, folder: Path) -> None:
             maps = view_maps(result.mesh, scene.cameras, view)
             depths = maps.depth.nan_to_num(0)[..., None]
             for kind, values in zip(_KINDS, (depths, maps.normals_cam), strict=False):
-                _write_array(values, stereo / kind / f"{file}.geometric.bin")
+                height, width, channels = values.shape
+                # COLMAP's arrays of float32: row by row, channel after channel (``mvs/mat.h``).
+                planes = values.movedim(-1, 0).contiguous().numpy().astype("<f4")
+                head = f"{width}&{height}&{channels}&".encode("ascii")
+                (stereo / kind / f"{file}.geometric.bin").write_bytes(head + planes.tobytes())
 
 
 def write_pinholes(
@@ -74,10 +75,3 @@ def write_pinholes(
     )
     tied = (model.observed.sum(dim=1) >= 2).to(scene.points_world.device)
     write_binary(select_views(model, range(model.num_views)), point_colors(scene)[tied], folder)
-
-
-def _write_array(values: Float[Tensor, "height width channel"], path: Path) -> None:
-    """Write COLMAP's array of float32, row by row and channel after channel (``mvs/mat.h``)."""
-    height, width, channels = values.shape
-    planes = values.movedim(-1, 0).contiguous().numpy().astype("<f4")
-    path.write_bytes(f"{width}&{height}&{channels}&".encode("ascii") + np.asarray(planes).tobytes())

@@ -38,7 +38,7 @@ def write_exr(values: np.ndarray, path: Path | str, comment: str = "") -> None:
     ):
         header += f"{name}\0{kind}\0".encode() + struct.pack("<I", len(data)) + data
     header += b"\0"
-    # In a line, one channel lies after the other.
+    # In a line, one channel follows the other.
     lines = values[..., [index for _, index in channels]].transpose(0, 2, 1).astype("<f4")
     blocks = [
         struct.pack("<i", first) + _packed(lines[first : first + _LINES].tobytes())
@@ -112,7 +112,7 @@ def _listed(channels: bytes) -> Iterator[tuple[str, str]]:
 
 
 def _unpacked(packed: bytes, size: int) -> bytes:
-    """Undo :func:`_packed`, of a block of so many bytes."""
+    """Undo :func:`_packed` of a block of ``size`` bytes."""
     halves = np.frombuffer(zlib.decompressobj().decompress(packed, size), np.uint8).copy()
     halves[1:] -= np.uint8(128)
     halves = np.cumsum(halves, dtype=np.uint8)
@@ -128,5 +128,5 @@ def _packed(raw: bytes) -> bytes:
     halves = np.concatenate([plain[::2], plain[1::2]])
     halves[1:] = np.diff(halves) + np.uint8(128)
     data = zlib.compress(halves.tobytes())
-    data = raw if len(data) >= len(raw) else data  # readers tell by the size
+    data = raw if len(data) >= len(raw) else data  # readers see it by the size
     return struct.pack("<I", len(data)) + data

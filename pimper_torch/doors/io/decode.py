@@ -41,7 +41,7 @@ class Decoded(Record):
     Attributes:
         samples: In [0, 1] as the file encodes them; one or three channels.
         alpha: Opacity in [0, 1]; ``None`` where the file has none.
-        lossy: True for JPEG, whose samples ring round edges.
+        lossy: True for JPEG, whose samples ring around edges.
         full: Level of the file that is full scale, a sample of 1: 255, 65535, or what the file
             says.
         colour: What the file says about its samples.
@@ -232,7 +232,7 @@ def write_deep_png(samples: np.ndarray, path: Path | str) -> None:
 
 
 def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
-    """Turn rows and columns so that an image of this EXIF orientation stands upright."""
+    """Turn rows and columns so that an image of this EXIF orientation is upright."""
     if orientation >= 5:
         array = array.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -243,7 +243,7 @@ def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
-    """Refuse, by its header, an image that memory should not be taken for."""
+    """Refuse, by its header, an image that would take too much memory."""
     pixels, held = width * height, path.stat().st_size
     if pixels > MAX_PIXELS:
         raise InputError(

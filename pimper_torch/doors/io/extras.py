@@ -33,7 +33,7 @@ _STARTS = {
 
 
 def format_of(path: Path | str) -> str:
-    """Return the name of a file's format by its first bytes; empty where they tell none."""
+    """Return the name of a file's format by its first bytes; empty if they match none."""
     try:
         with Path(path).open("rb") as file:
             start = file.read(16)
@@ -45,7 +45,7 @@ def format_of(path: Path | str) -> str:
 def extra_of(path: Path | str) -> str:
     """Return the extra that reads a file, ``heic`` or ``raw``; empty where none is needed.
 
-    The content tells, not the suffix, unless it is a TIFF's or tells nothing.
+    The content decides, not the suffix, unless it is that of a TIFF or unknown.
     """
     name, suffix = format_of(path), Path(path).suffix.lower()
     if name == "CR3" or (suffix in RAW_SUFFIXES and name in ("TIFF", "")):

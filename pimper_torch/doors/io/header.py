@@ -64,8 +64,7 @@ class Header(Record):
     """Metadata of an image file, read without decoding.
 
     Attributes:
-        width: Pixels, the right way up.
-        height: Pixels, the right way up.
+        width: Pixels, the right way up, as is the height.
         orientation: EXIF's number, 1 to 8; 1 is upright.
         channels: 1 or 3; alpha not counted.
         deep: True for 16-bit samples in several channels, which Pillow would cut to 8.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ _ERRORS = ("confidence", "expected_error")
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
 _NEEDED = "PLY, OBJ, STL, OFF or GLB"
 # Of a short edge (longer than a tenth of all): the most that rounding may move a vertex. A choice.
-# A cloud's spacing is taken for a thousandth of its radius.
+# A cloud's spacing is assumed to be a thousandth of its radius.
 _MAX_ROUNDING, _CLOUD_SPACING = 1e-3, 1e-3
 _KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's names
 
@@ -52,7 +52,7 @@ def write_ply(
     """
     columns = {"x y z": _positions(mesh, offset_world), "nx ny nz": carried_normals(mesh).float()}
     if mesh.albedo is not None:
-        columns["red green blue"] = to_bytes(_colors(mesh))
+        columns["red green blue"] = to_bytes(base_color(mesh).expand(-1, 3))
     for name in _ERRORS:
         known = getattr(mesh, name)
         if known is not None:
@@ -88,7 +88,7 @@ def write_ply(
 
 
 def _positions(mesh: Mesh, offset_world: Offset) -> Vertices:
-    """Return positions as they are written: float32 where that tells them, else float64."""
+    """Return positions as they are written: float32 where that is exact enough, else float64."""
     vertices = mesh.vertices_world.detach().double()
     placed = vertices + vertices.new_tensor(offset_world)
     single = placed.float()
@@ -114,7 +114,7 @@ def read_mesh(path: Path | str) -> Mesh:
     point cloud becomes a mesh without faces.
 
     Args:
-        path: The file. Textures and materials beside it are not looked at.
+        path: The file. Its textures and materials are not read.
 
     Returns:
         Float64 geometry on the CPU.
@@ -173,13 +173,13 @@ def write_glb(
 ) -> None:
     """Write a binary glTF of the same frame, normals and colours as the PLY.
 
-    glTF has no doubles in its buffers: vertices stay round the origin, and their node's
+    glTF has no doubles in its buffers: vertices stay near the origin, and their node's
     ``translation``, which is text, has the offset in full. Programs that follow it in single
     precision, as Blender does, place the model to its rounding and keep its shape.
 
-    glTF wants colours linear, so these are albedo itself; the material is matte and seen
-    from both sides. glTF calls y up: viewers show the model as it lies in the world frame
-    of structure from motion, whose up is arbitrary.
+    glTF's colours are linear, so these are albedo itself; the material is matte and seen from both
+    sides. glTF's y is up: viewers show the model as it is oriented in the world frame of structure
+    from motion, whose up is arbitrary.
 
     Args:
         offset_world: Of the node; see ``SparseScene.offset_world``.
@@ -187,7 +187,7 @@ def write_glb(
     """
     attributes = {"POSITION": mesh.vertices_world, "NORMAL": carried_normals(mesh)}
     if mesh.albedo is not None:
-        attributes["COLOR_0"] = _colors(mesh)
+        attributes["COLOR_0"] = base_color(mesh).expand(-1, 3)
     if measured is not None:
         attributes["_MEASURED"] = corners_of(mesh.faces, measured, len(mesh.vertices_world))
     data = gltf_of(
@@ -202,10 +202,10 @@ def write_glb(
 def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
     """Write a binary STL: triangles alone, without vertices that faces share.
 
-    STL has no doubles: far from the origin vertices stay round it, and the header tells the offset.
+    STL has no doubles: of a mesh far from the origin, vertices stay near it.
 
     Args:
-        offset_world: Told in the file's header; see ``SparseScene.offset_world``.
+        offset_world: Written into the file's header; see ``SparseScene.offset_world``.
     """
     corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
     normals = unit_face_normals(mesh.vertices_world, mesh.faces).detach().cpu()
@@ -227,25 +227,23 @@ def write_obj(
 
     Args:
         offset_world: Added to the vertices; see ``SparseScene.offset_world``.
-        measured: Faces that are not stand in a group ``caps`` of their own.
+        measured: The other faces are in a group ``caps`` of their own.
     """
     rows = mesh.vertices_world.detach().cpu().double() + torch.tensor(offset_world).double()
     if mesh.albedo is not None:
-        rows = torch.cat([rows, srgb_from_linear(_colors(mesh)).cpu().double()], dim=1)
+        colors = srgb_from_linear(base_color(mesh).expand(-1, 3))
+        rows = torch.cat([rows, colors.cpu().double()], dim=1)
     kept = torch.ones(len(mesh.faces), dtype=torch.bool) if measured is None else measured.cpu()
     with Path(path).open("w", encoding="ascii") as file:
         digits = 9 if offset_world == NO_OFFSET else 15
-        _rows_of("v", f"%.{digits}g " * 3 + "%.6g " * (rows.shape[1] - 3), rows, file)
-        _rows_of("vn", "%.6g %.6g %.6g", carried_normals(mesh).detach().cpu(), file)
+        numbers = " ".join([f"%.{digits}g"] * 3 + ["%.6g"] * (rows.shape[1] - 3))
+        np.savetxt(file, rows.numpy(), fmt=f"v {numbers}")
+        np.savetxt(file, carried_normals(mesh).detach().cpu().numpy(), fmt="vn %.6g %.6g %.6g")
         for group, chosen in (("measured", kept), ("caps", ~kept)):
             if bool(chosen.any()):
                 file.write(f"g {group}\n")
                 corners = mesh.faces.cpu()[chosen].repeat_interleave(2, dim=1) + 1
-                _rows_of("f", "%d//%d %d//%d %d//%d", corners, file)
-
-
-def _rows_of(word: str, template: str, rows: Tensor, file: TextIO) -> None:
-    np.savetxt(file, rows.numpy(), fmt=f"{word} {template.rstrip()}")
+                np.savetxt(file, corners.numpy(), fmt="f %d//%d %d//%d %d//%d")
 
 
 def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401 - untyped
@@ -304,12 +302,8 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _colors(mesh: Mesh) -> Vertices:
-    return base_color(mesh).expand(-1, 3)
-
-
-# glTF's name for vertex colours, and one that trimesh takes over as it stands in the file: those of
-# the first it rounds to 8 bits, or cuts to them.
+# glTF's name for vertex colours, and one whose values trimesh takes over unchanged: those of the
+# first it rounds to 8 bits, or cuts to them.
 _COLORS, _RAW_COLORS = "COLOR_0", "_COLOR_0"
 
 

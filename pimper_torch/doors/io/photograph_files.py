@@ -35,7 +35,7 @@ _MORE = "HEIC and camera raw where their extras are installed"
 
 
 def image_name(path: Path | str, folder: Path | str) -> str:
-    """Return the name of an image of a folder, with the folder inside that it lies in."""
+    """Return the name of an image of a folder, with the folder inside that it is in."""
     return Path(path).relative_to(folder).as_posix()
 
 
@@ -92,8 +92,8 @@ def _visible(folder: Path) -> list[Path]:
 def _readable(entries: Sequence[Path]) -> list[Path]:
     """Choose the image files, one of those that a camera writes of one photograph.
 
-    Camera raw goes before JPEG, and JPEG, PNG or TIFF before HEIC; PNG and TIFF beside raw are
-    taken for developed on purpose.
+    Camera raw goes before JPEG, and JPEG, PNG or TIFF before HEIC; PNG and TIFF next to raw count
+    as developed on purpose.
     """
     ranks: dict[str, dict[Path, int]] = defaultdict(dict)
     for path in entries:
@@ -111,7 +111,7 @@ def _readable(entries: Sequence[Path]) -> list[Path]:
 
 
 def _refuse_video(entries: Sequence[Path]) -> None:
-    """State what makes photographs of the first video."""
+    """Refuse a video, and name the command that makes photographs of it."""
     for path in sorted(entries):
         if path.is_file() and _VIDEO.fullmatch(path.suffix):
             raise InputError(

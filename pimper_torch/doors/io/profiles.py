@@ -74,7 +74,7 @@ def read_profile(data: bytes) -> Colour:
 
 
 def _colour(source: str, response: Response | None, primaries: Tensor | None) -> Colour:
-    """Put a response beside primaries, columns of XYZ adapted to D50; ``None`` is of none."""
+    """Combine a response and primaries: columns of XYZ adapted to D50, or ``None``."""
     matrix = None if primaries is None else srgb_from_primaries(primaries)
     if matrix is None:
         trouble = "has primaries that span no colours"
@@ -84,7 +84,7 @@ def _colour(source: str, response: Response | None, primaries: Tensor | None) ->
 
 
 def _tags(data: bytes) -> dict[bytes, bytes]:
-    """Return what the tags hold, once every offset was seen to lie inside."""
+    """Return the contents of the tags whose offsets are inside of the profile."""
     if not _HEADER + 4 <= len(data) <= _MAX_BYTES or data[36:40] != b"acsp":
         raise InputError("is damaged")
     (count,) = struct.unpack_from(">I", data, _HEADER)
@@ -156,7 +156,7 @@ def _table(radiance: Float[Tensor, " entry"]) -> Curve:
     if not sound or float(highest[-1] - highest[0]) < _MIN_RISE:
         raise InputError("has a tone curve that does not rise")
     level = torch.linspace(0, 1, len(radiance), dtype=torch.float64)
-    rising = highest + 1e-6 * level  # levels of one radiance do not make it stand still
+    rising = highest + 1e-6 * level  # also where levels have one radiance
     return Curve(encoded=level, radiance=(rising / rising[-1])[None])
 
 
@@ -182,8 +182,8 @@ def colour_of_codes(primaries: int, curve: int, source: str) -> Colour:
     """Follow the numbers of ITU-T H.273 for primaries and transfer.
 
     Args:
-        primaries: 1 sRGB's, 9 BT.2020, 12 Display P3; 2 where they are not told.
-        curve: 13 sRGB, 8 linear, 1, 6, 14 and 15 BT.709; 2 where it is not told.
+        primaries: 1 sRGB's, 9 BT.2020, 12 Display P3; 2 where not stated.
+        curve: 13 sRGB, 8 linear, 1, 6, 14 and 15 BT.709; 2 where not stated.
     """
     response: Response | None
     if curve in _REC_709_CURVE:
@@ -202,7 +202,7 @@ def colour_of_codes(primaries: int, curve: int, source: str) -> Colour:
 
 # sRGB's, as PNG holds them: white, red, green and blue.
 _SRGB_XY = tuple(part for point in (REC_709[3], *REC_709[:3]) for part in point)
-# Choices: programs round PNG's 0.45455 and EXIF's 2.2, which stand for sRGB, and chromaticities.
+# Choices: programs round PNG's 0.45455 and EXIF's 2.2, which mean sRGB, and chromaticities.
 _SRGB_GAMMA, _NEAR, _NEAR_XY = 2.2, 0.02, 0.005
 
 
@@ -225,20 +225,17 @@ def colour_of_info(info: Mapping[Any, Any], cicp: bytes = b"") -> Colour:
         return Colour(source="PNG's sRGB", response=Srgb())
     gamma, points = info.get("gamma", 1 / _SRGB_GAMMA), info.get("chromaticity", _SRGB_XY)
     far = max(abs(one - other) for one, other in zip(points, _SRGB_XY, strict=True))
-    if not _is_srgb(1 / gamma if gamma else 0.0) or far > _NEAR_XY:
+    exponent = 1 / gamma if gamma else 0.0
+    if abs(exponent - _SRGB_GAMMA) >= _NEAR or far > _NEAR_XY:
         return Colour(source="PNG", trouble=f"has gAMA {gamma:.5g} and cHRM that are not sRGB's")
     return Colour(source="PNG's gAMA", response=Srgb()) if "gamma" in info else SILENT
-
-
-def _is_srgb(gamma: float) -> bool:
-    return abs(gamma - _SRGB_GAMMA) < _NEAR
 
 
 def colour_of_exif(exif: Image.Exif) -> Colour:
     """Follow the mark of Adobe RGB that cameras set without a profile; a gamma is not followed."""
     tags = exif.get_ifd(ExifTags.IFD.Exif)
     gamma = tags.get(ExifTags.Base.Gamma)
-    if gamma is not None and not _is_srgb(positive_number(gamma)):
+    if gamma is not None and abs(positive_number(gamma) - _SRGB_GAMMA) >= _NEAR:
         return Colour(source="EXIF", trouble="has a gamma that is not sRGB's")
     marked = tags.get(ExifTags.Base.ColorSpace) == 65535 and ExifTags.IFD.Interop in tags
     index = exif.get_ifd(ExifTags.IFD.Interop).get(ExifTags.Interop.InteropIndex) if marked else ""

@@ -32,7 +32,7 @@ _MAX_PADDING, _MUCH_PADDING = 8, 10**8
 
 
 class _Kind(NamedTuple):
-    """Files of one kind: their level of full scale, whether they tell it, and their response."""
+    """Files of one kind: their level of full scale, whether it is stated, and their response."""
 
     full: int
     full_told: bool

@@ -66,7 +66,7 @@ def lights_report(result: Reconstruction) -> Report:
 def common_lights(result: Reconstruction) -> tuple[Float[Tensor, "view 4"], Int[Tensor, " view"]]:
     r"""Find the one light of every view that shades all patches most nearly as their own do.
 
-    A patch that is nearly flat tells its light only along its normal, so lights are weighted
+    A patch that is nearly flat determines its light only along its normal, so lights are weighted
     by what they were determined from: minimised is :math:`\sum_p \sum_s \rho_s^2 ((l - l_p)
     \cdot (1, n_s))^2` over the valid samples. What they leave open together is the mean's.
 
@@ -126,7 +126,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
     """Count what went in and came out, and what every stage cost.
 
     Args:
-        about: More to tell, such as where the photographs lay.
+        about: More entries, such as the folder of the photographs.
     """
     scene = result.scene
     figures = {key: value for report in result.report for key, value in report.figures.items()}

@@ -44,7 +44,7 @@ def read_curve(path: Path | str) -> Curve:
     of full scale), to 255 (files of 8 bits), or to more (of 16). Radiance is in any unit.
 
     ``.csv`` has rows of numbers, a first row of names is passed over; ``.npy`` rows, such as
-    OpenCV's ``CalibrateDebevec`` gives with its colours turned round.
+    OpenCV's ``CalibrateDebevec`` gives with its colours in reverse order.
 
     Raises:
         InputError: No such file, one of another kind, no table of numbers, or no curve:

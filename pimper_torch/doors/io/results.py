@@ -58,7 +58,7 @@ RESULT_NAMES = (
     "turn.webp",
     "report.html",
 )
-"""Files of a result, and nothing else; a table in the manual tells what each holds."""
+"""Files of a result, and nothing else; a table in the manual describes them."""
 _PARTS = 6  # of the bar: meshes, asset, maps, sheet, turning picture, page
 
 
@@ -74,9 +74,9 @@ def write_result(
 ) -> None:
     """Write everything a run found into a folder: the files of :data:`RESULT_NAMES`.
 
-    Everything is in the frame of the cameras that the photographs came with; ``summary.json`` tells
-    the ``offset_world`` that was added to the frame of the run, zero unless they stand far from
-    their origin. The PLY then has doubles, and the mesh's GLB the offset as its node's translation.
+    Everything is in the frame of the cameras that the photographs came with; ``summary.json`` has
+    the ``offset_world`` that was added to the frame of the run, zero unless they are far from their
+    origin. The PLY then has doubles, and the mesh's GLB the offset as its node's translation.
     The asset alone stands upright on the origin; its ``extras`` undo that.
 
     The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's

@@ -33,7 +33,7 @@ def scene_of(
     masks: Array | None = None,
     names: Sequence[str] | None = None,
 ) -> SparseScene:
-    """Put photographs without distortion beside cameras that are known.
+    """Make a scene of photographs without distortion and known cameras.
 
     Takes tensors, numpy arrays or nested lists. A chain takes the scene in the place of
     photographs, and structure from motion does not run.

@@ -37,9 +37,9 @@ class Layout:
         deep: Colour of 16 bits, which Pillow would cut to 8.
         planes: Deep colour that is stored one colour after the other.
         inverted: 0 is white, and Pillow does not undo it.
-        full: Level of full scale that the file tells.
+        full: Level of full scale by the file.
         transfer: It has a TransferFunction, a table of radiance.
-        unknown: Samples besides colours have a meaning that the file does not tell.
+        unknown: Samples besides colours have a meaning that the file does not state.
     """
 
     deep: bool

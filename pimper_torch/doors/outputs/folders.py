@@ -77,7 +77,7 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
 
     What a killed run left is removed, or put in its place where it was whole. A folder that was
     made for the block, and in which nothing was kept or written, is removed at its end. A block
-    inside another one is part of it.
+    inside another block is part of it.
 
     Yields:
         The folder, without links.

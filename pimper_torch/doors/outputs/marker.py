@@ -17,7 +17,7 @@ STAGES = ".stages"
 Kind = Literal["result", "scene", "table", "data set", "frames"]
 
 _FORMAT = "pimper_torch folder"
-# Version 1 had sizes, times and hashes beside the names.
+# Version 1 had sizes, times and hashes with the names.
 _VERSIONS = (1, 2)
 # What file managers leave wherever they look.
 _DROPPINGS = (".DS_Store", "Thumbs.db", "desktop.ini")

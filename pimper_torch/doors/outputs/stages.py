@@ -36,7 +36,7 @@ def kept(target: Path) -> list[Path]:
 
 
 def resumption(shown: Path) -> str:
-    """Return the sentence that tells how a run goes on from what is kept."""
+    """Return a sentence on how the next run goes on from what is kept."""
     return (
         f"What was finished is kept in {shown / STAGES}: the same command goes on from there, and "
         f"`pimper clean {shown}` removes it."

@@ -51,7 +51,7 @@ def find_scale(
     :func:`~pimper_torch.doors.size.scaled.scaled` multiplies them.
 
     The most accurate of what is given counts: scale bars, else markers, else camera distances.
-    Where another one differs by more than 2 %, a warning says so.
+    A warning names those that differ from it by more than 2 %.
 
     Args:
         bars: Places that are known distances apart.
@@ -61,7 +61,7 @@ def find_scale(
             which nothing was said do not change.
 
     Returns:
-        ``None`` where nothing tells the size.
+        ``None`` where the size is not known.
     """
     scales = []
     if bars:

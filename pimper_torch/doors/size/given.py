@@ -1,4 +1,4 @@
-"""Lengths as a person tells them; needs neither torch nor photographs."""
+"""Lengths that a person gives; needs neither torch nor photographs."""
 
 import re
 from collections.abc import Sequence

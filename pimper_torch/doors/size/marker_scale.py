@@ -164,5 +164,5 @@ def _is_square(corners: Float[Tensor, "4 3"]) -> bool:
     sides = (corners - corners.roll(1, dims=0)).norm(dim=1)
     diagonals = (corners[:2] - corners[2:]).norm(dim=1) / math.sqrt(2)
     lengths = torch.cat([sides, diagonals])
-    # Paper lies in waves; corners of a false marker are off by more.
+    # Paper is wavy; corners of a false marker are off by more.
     return bool((lengths / sides.mean() - 1).abs().max() <= 0.05)

@@ -1,4 +1,4 @@
-"""Where the places are that a person points at in photographs."""
+"""Positions of the places that a person points at in photographs."""
 
 from collections.abc import Sequence
 
@@ -39,9 +39,9 @@ def view_of(name: str, scene: SparseScene) -> int:
 def place_of(mark: Mark, result: Reconstruction) -> Vector:
     """Find where a mark is, world frame, float64.
 
-    A mark in one photograph is where its ray first meets the surface; beside the surface, it is on
-    the plane that the object stands on, where silhouettes or the cloud tell one. A mark in several
-    is where their rays meet, on the surface or not.
+    A mark in one photograph is where its ray first meets the surface; if it misses the surface, on
+    the supporting plane, where silhouettes or the cloud determine one. A mark in several is where
+    their rays meet, on the surface or not.
 
     Args:
         mark: Pixels of the photographs as they were loaded: the right way up, before undistortion.
@@ -147,7 +147,7 @@ def _met(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: 
 def _beside(
     pointer: Pointer, result: Reconstruction, mesh: Mesh, view: int, eye: Vector, ray: Vector
 ) -> Vector | None:
-    """Return the point of a ray beside the nearest vertex, if the surface is close to the pixel."""
+    """Return the point of a ray next to the nearest vertex, if the surface is near the pixel."""
     cameras = result.cameras.detach().to("cpu", torch.float64)
     pose, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
     pixels, depth = project(mesh.vertices_world, pose, intrinsics)
@@ -173,7 +173,7 @@ def _beside(
 
 
 def ground(scene: SparseScene, silhouettes: Silhouettes) -> supporting_plane.Plane | None:
-    """Return the plane that the object stands on: the silhouettes', else that of the cloud."""
+    """Return the supporting plane of the object: the silhouettes', else that of the cloud."""
     if len(silhouettes.planes_world):
         found = silhouettes.planes_world[0].detach().cpu()  # of the first series, whose up is up
         length = found[:3].norm()

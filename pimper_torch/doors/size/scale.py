@@ -11,7 +11,7 @@ from pimper_torch.runtime.errors import InputError, caution
 
 Source = Literal["scale bars", "markers", "camera distances"]
 # From the most accurate to the least: two places that a person clicked on the surface; printed
-# corners, whose paper may lie in waves; cameras, whose centres no one can touch.
+# corners, whose paper may be wavy; cameras, whose centres nobody can touch.
 _SOURCES: tuple[Source, ...] = get_args(Source)
 
 AGREEING = 0.02
@@ -26,7 +26,7 @@ class Scale(Record):
     Attributes:
         factor: Of a result in its own unit.
         residual: Root mean square of what single lengths are off, as a fraction of each; NaN where
-            one length alone tells the factor.
+            there is one length only.
     """
 
     factor: float
@@ -57,7 +57,7 @@ class Length(Record):
 def fitted(lengths: Sequence[Length], unit: Unit, source: Source) -> Scale:
     r"""Find the factor by least squares, :math:`\min_f \sum (f d - L)^2`.
 
-    Lengths that contradict one another by more than :data:`AGREEING` are warned of.
+    A warning names lengths that contradict one another by more than :data:`AGREEING`.
     """
     for length in lengths:
         if not (length.found > 0 and length.known > 0):

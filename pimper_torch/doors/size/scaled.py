@@ -40,7 +40,7 @@ LAST: Mapping[type[Record], str] = {
 }
 """Vectors of which the last entry alone is a length."""
 
-# What stages tell as scene units.
+# Figures of stages in scene units.
 _FIGURES = ("mismatch", "mismatch_before")
 
 
@@ -48,9 +48,8 @@ def scaled(record: AnyRecord, factor: float) -> AnyRecord:
     """Return a result, or a part of one, in another unit: every length times a factor.
 
     Vertices, expected errors, cameras, cloud, templates and their heights, covariances and inverse
-    variances, the plane that the object stands on, and ``offset_world``. Photographs, normals,
-    albedo and lights have no unit and are shared with ``record``; what is one object in it is one
-    in the copy.
+    variances, the supporting plane, and ``offset_world``. Photographs, normals, albedo and lights
+    have no unit and are shared with ``record``; fields that share an object still do.
 
     Args:
         record: Of a run, such as a :class:`~pimper_torch.records.Reconstruction`.

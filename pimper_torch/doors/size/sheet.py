@@ -1,7 +1,7 @@
 """A sheet of markers to print: which, where and how large.
 
-Numbers tell the size: sheets whose markers have sides of 10, 11, ... 36 millimetres have 16 numbers
-each, so that photographs of a sheet tell its size without being told.
+Numbers encode the size: sheets with sides of 10, 11, ... 36 millimetres have 16 numbers each, so
+that photographs of a sheet are enough to know its size.
 """
 
 from typing import Literal
@@ -14,7 +14,7 @@ Paper = Literal["a4", "letter"]
 PAPERS_MM: dict[Paper, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 
 TITLE = "pimper_torch sheet of markers"
-"""Of the PDF; tells that a file was written here."""
+"""Of the PDF; marks files that were written here."""
 
 MIN_SIDE_MM, MAX_SIDE_MM, SIDE_MM = 10, 36, 30
 _NUMBERS = 16  # of one sheet: a frame of 4 by 6
@@ -55,7 +55,7 @@ def layout(side_mm: int = SIDE_MM, paper: Paper = "a4") -> dict[int, tuple[float
 
 
 def _evenly(extent_mm: float, side_mm: int, most: int) -> list[float]:
-    """Spread as many squares as fit between the margins, up to so many."""
+    """Spread as many squares as fit between the margins, ``most`` at most."""
     margin, gap = 12.0, 8.0  # printers leave less than 6 mm blank; more than a cell of a marker
     between = extent_mm - 2 * margin
     count = min(most, int((between + gap) // (side_mm + gap)))

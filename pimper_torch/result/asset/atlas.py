@@ -1,4 +1,4 @@
-"""Where on a texture every face of a mesh lies."""
+"""Layout of a mesh's faces on a texture."""
 
 import math
 import subprocess
@@ -23,10 +23,10 @@ MAX_SIDE = 4096
 # The same mesh takes it 1.5 s. A choice: long enough for a slow machine.
 _LIMIT_S = 60.0
 
-# Of Python: the folder of the script, with this room's modules, is no place to import from.
+# Of Python: nothing is imported from the script's folder, which has this room's modules.
 _CHILD = ("-P",)
 
-# Round a cell's triangles; as much is between them, along each side. With 1, colours of a sphere
+# Around a cell's triangles, and between them, along each side. With 1, colours of a sphere
 # are off by 2.8 levels in place of 0.5.
 _GUTTER_TEXELS = 2
 
@@ -142,7 +142,7 @@ def by_triangles(mesh: Mesh, texel: float) -> Atlas:
     wanted = columns * (math.ceil(math.sqrt(2 * float(area)) / texel) + 3 * _GUTTER_TEXELS)
     size = min(MAX_SIDE, 2 ** math.ceil(math.log2(wanted)))
     side = size // columns
-    # The right angle of the first lies at the cell's upper left, that of the second opposite.
+    # The right angle of the first is at the cell's upper left, that of the second opposite.
     leg = side - 3 * _GUTTER_TEXELS
     first = torch.tensor([[0.0, 0], [0, leg], [leg, 0]]) + _GUTTER_TEXELS
     halves = torch.stack([first, side - first])

@@ -136,7 +136,7 @@ class _Surface:
     def __init__(self, full: Mesh, few: Mesh) -> None:
         self._caster = RayCaster(full.vertices_world, full.faces)
         self._upright = surfaces.unit_face_normals(full.vertices_world, full.faces)
-        # Few faces are off by far less than their sides, and what is farther is another place.
+        # Few faces are off by far less than their sides; a surface farther away is elsewhere.
         self._reach = float(surfaces.side_lengths(few.vertices_world[few.faces]).median())
 
     def nearest(self, points: Float[Tensor, "texel 3"], along: Float[Tensor, "texel 3"]) -> Hits:
@@ -164,7 +164,7 @@ class _Surface:
 def _laid(atlas: Atlas) -> Hits:
     """Find the face that every texel shows, row by row, and where on it; -1 where none is near.
 
-    Graphics cards blend a texel at a border with one beside the chart: that shows the border's face
+    Graphics cards blend a texel at a border with one off the chart: that shows the border's face
     continued.
     """
     size = atlas.uv.new_tensor([atlas.width, atlas.height])

@@ -41,13 +41,19 @@ class Simplify(Stage):
             moved = {name: getattr(found, name) for name in figures}
         if files.watertight and whole is None:
             whole = closed(few)
+        caps: dict[str, int | float] = {}
+        if whole is not None:
+            area = face_normals(whole.mesh.vertices_world, whole.mesh.faces).norm(dim=1)
+            share = float(area[~whole.measured].sum() / area.sum())
+            count = int((~whole.measured).sum())
+            caps = {"borders": whole.borders, "faces": count, "area_fraction": share}
         return Finished(
             mesh=few,
             few=reduced(few, _FACES),
             closed=whole,
             how=how,
             counts={"vertices": len(few.vertices_world), "faces": len(few.faces), **moved},
-            caps={} if whole is None else _caps(whole),
+            caps=caps,
         )
 
 
@@ -65,15 +71,6 @@ def _few_enough(mesh: Mesh, faces: int, watertight: bool) -> tuple[Mesh, Closed 
         few = reduced(mesh, wanted)
         whole = closed(few)
     return few, whole
-
-
-def _caps(whole: Closed) -> dict[str, int | float]:
-    area = face_normals(whole.mesh.vertices_world, whole.mesh.faces).norm(dim=1)
-    return {
-        "borders": whole.borders,
-        "faces": int((~whole.measured).sum()),
-        "area_fraction": float(area[~whole.measured].sum() / area.sum()),
-    }
 
 
 def written_channels(mesh: Mesh) -> Float[Tensor, "vertex channel"]:

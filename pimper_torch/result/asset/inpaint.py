@@ -15,7 +15,7 @@ UNDETERMINED, INPAINTED = 0.5, 1.0
 
 
 def inpainted(mesh: Mesh) -> tuple[Mesh, PerVertex]:
-    """Replace albedo that is too bright to be true by that of the neighbours.
+    """Replace implausibly bright albedo by that of the neighbours.
 
     Where few lights reach, normals are not determined, and neither is the shading that albedo was
     divided by. A vertex is too bright there if it is brighter than 99 of 100 determined ones; so is
@@ -41,7 +41,5 @@ def inpainted(mesh: Mesh) -> tuple[Mesh, PerVertex]:
     bright = above & torch.isin(label, label[above & (brightness > most)]) | ~finite
     if not bool(bright.any()):
         return mesh, doubt
-    return (
-        mesh.replace(albedo=about_mean(albedo, ~bright, edges)),
-        torch.where(bright, INPAINTED, doubt),
-    )
+    continued = mesh.replace(albedo=about_mean(albedo, ~bright, edges))
+    return continued, torch.where(bright, INPAINTED, doubt)

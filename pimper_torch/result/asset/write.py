@@ -119,7 +119,7 @@ def _encoded(picture: _Picture, texture: TextureFormat, *, lossless: bool = True
 
 
 def write_asset_obj(asset: Textured, path: Path | str, placement: Placement) -> None:
-    """Write an OBJ; beside it, under its name, the ``.mtl`` and two PNG files that it refers to.
+    """Write an OBJ, and next to it the ``.mtl`` and the two PNG files that it refers to.
 
     Its first lines are comments that undo the placement.
     """

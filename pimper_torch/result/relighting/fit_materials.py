@@ -26,7 +26,7 @@ _MATTE = (0.0, 1.0, 0.0)
 _ROUGHNESS, _SPECULAR = (0.12, 0.2, 0.33, 0.55, 0.9), (0.1, 0.3, 1.0)
 _LEAST_ROUGHNESS, _MOST_SPECULAR = 0.08, 4.0
 _METALLIC = (0.25, 0.5, 0.75, 1.0)
-# Factors of roughness and specular to those tried beside the best.
+# Factors from the best roughness and specular to those tried next.
 _STEPS = (1.5, 1.22, 1.1, 1.05)
 
 _CLUSTERS = 4
@@ -36,7 +36,7 @@ _Materials = Float[Tensor, "cluster 3"]
 _Candidates = Float[Tensor, "candidate 3"]
 _Clusters = Int[Tensor, " vertex"]
 
-# A gain counts from this fraction of the loss, and from so many standard errors of its mean.
+# A gain counts from this fraction of the loss, and this number of standard errors of its mean.
 _LEAST_GAIN, _SIGNIFICANT = 2e-3, 1.0
 
 

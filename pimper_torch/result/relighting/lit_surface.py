@@ -72,7 +72,7 @@ class SurfacePixels(Record):
         normals_world: Unit, those of the mesh.
         to_eye: Unit, towards the camera.
         vertex: The nearest vertex of the face that is met.
-        inner: False beside pixels that show something else, with which they are blended.
+        inner: False next to pixels that show something else, with which they are blended.
     """
 
     pixel: Int[Tensor, " pixel"]

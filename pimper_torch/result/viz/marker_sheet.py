@@ -25,7 +25,7 @@ def write_sheet(path: Path | str, side_mm: int = SIDE_MM, paper: Paper = "a4") -
     whether the printer scaled the page. The same arguments give the same bytes.
 
     Args:
-        side_mm: Of the black squares, 10 to 36; their numbers tell it.
+        side_mm: Of the black squares, 10 to 36; the markers' numbers encode it.
     """
     figure = draw_sheet(side_mm, paper)
     figure.savefig(path, format="pdf", metadata={"CreationDate": None, "Title": TITLE})

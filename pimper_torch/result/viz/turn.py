@@ -48,9 +48,8 @@ def draw_turn(
         reference: View whose side of the surface is seen first.
     """
     mesh, cameras = mesh.to("cpu"), cameras.to("cpu")
-    circle = circling(
-        mesh, up_world(cameras), cameras.centers_world[reference], _FRAMES, side_px * _OVERSAMPLING
-    )
+    start = cameras.centers_world[reference]
+    circle = circling(mesh, up_world(cameras), start, _FRAMES, side_px * _OVERSAMPLING)
     normals = vertex_normals(mesh.vertices_world, mesh.faces)
     colors = torch.full_like(normals, 0.5) if mesh.albedo is None else mesh.albedo
     colors = albedo_scale(mesh) * colors.expand(-1, 3)
