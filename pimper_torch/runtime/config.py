@@ -282,7 +282,14 @@ def _build(
             require(value == getattr(cls, key), f"{where}: {key}", value, repr(getattr(cls, key)))
             continue
         if key not in _names(cls):
-            raise ConfigError(_unknown(key, cls, where, section, root))
+            homes = [path for path in _paths(root, "") if path.rpartition(".")[2] == key]
+            elsewhere = f" Did you mean `{'` or `'.join(homes)}`?"
+            near = elsewhere if homes else nearest(shortened(str(key)), _names(cls))
+            place = f"section `{section}`" if section else "the top level"
+            raise ConfigError(
+                f"{where}: {place} has no setting `{shortened(str(key))}`.{near} Settings there: "
+                f"{', '.join(_names(cls))}."
+            )
         hint, field = hints[key], _join(section, key)
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
             values[key] = _build(hint, {} if value is None else value, where, field, root)
@@ -327,16 +334,6 @@ def _convert(hint: object, value: object, field: str) -> object:
 
 def _shown(value: object) -> str:
     return f"{shortened(repr(value))} ({_kind(value)})"
-
-
-def _unknown(key: object, cls: type[object], where: str, section: str, root: type[object]) -> str:
-    homes = [path for path in _paths(root, "") if path.rpartition(".")[2] == key]
-    elsewhere = f" Did you mean `{'` or `'.join(homes)}`?"
-    hint = elsewhere if homes else nearest(shortened(str(key)), _names(cls))
-    return (
-        f"{where}: {'section `' + section + '`' if section else 'the top level'} has no setting "
-        f"`{shortened(str(key))}`.{hint} Settings there: {', '.join(_names(cls))}."
-    )
 
 
 def nearest(key: str, valid: Sequence[str]) -> str:

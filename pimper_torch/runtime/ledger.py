@@ -130,20 +130,15 @@ def added_up() -> Iterator[None]:
     events = current().so_far()
     before = len(events)
     yield
-    events[before:] = _sums(events[before:])
-
-
-def _sums(entries: Sequence[object]) -> list[object]:
-    """Add up entries of the same guard, in an order that threads do not change."""
     sums: dict[tuple[str, str, str], LeftOut] = {}
-    for entry in left_out_of(entries):
+    for entry in left_out_of(events[before:]):
         key = entry.guard, entry.what, entry.reason
         if key in sums:
             count, total = sums[key].count + entry.count, sums[key].total + entry.total
             entry = entry.replace(count=count, total=total, names=sums[key].names + entry.names)
         sums[key] = entry
-    others = [entry for entry in entries if not isinstance(entry, LeftOut)]
-    return [*others, *(sums[key] for key in sorted(sums))]
+    others = [entry for entry in events[before:] if not isinstance(entry, LeftOut)]
+    events[before:] = [*others, *(sums[key] for key in sorted(sums))]  # not as threads came
 
 
 def left_out_of(entries: Sequence[object]) -> tuple[LeftOut, ...]:

@@ -90,22 +90,42 @@ def intersect_height_field(
     function: only the last step carries gradients, with its slope held, which is exact once
     the steps before it have converged.
     """
+    x, y, z = ray_origins.unbind(dim=-1)
+    dx, dy, dz = ray_directions.unbind(dim=-1)
+    count, height, width = depth.shape
+    raster = continued_level(depth, valid).to(ray_origins).reshape(count, -1)
+    per_sample = (1 / spacing)[:, None]
+
+    def gap_at(distance: PerRay) -> tuple[PerRay, PerRay]:
+        """Return the ray's height over the height field along z, and its derivative."""
+        column = ((x + distance * dx - origin[:, :1]) * per_sample).clamp(0, width - 1)
+        row = ((y + distance * dy - origin[:, 1:]) * per_sample).clamp(0, height - 1)
+        left = column.detach().floor().clamp_max(width - 2)
+        top = row.detach().floor().clamp_max(height - 2)
+        across, down = column - left, row - top
+        first = (top * width + left).long()
+        top_left, top_right = raster.gather(1, first), raster.gather(1, first + 1)
+        low_left, low_right = raster.gather(1, first + width), raster.gather(1, first + width + 1)
+        slope_x = torch.lerp(top_right - top_left, low_right - low_left, down)
+        upper = top_left + across * (top_right - top_left)
+        lower = low_left + across * (low_right - low_left)
+        slope_y = lower - upper
+        climb = (slope_x * dx + slope_y * dy) * per_sample
+        return z + distance * dz - upper - down * slope_y, dz - climb
+
     normal_enough = 1e-3 * ray_directions.norm(dim=-1)
-    toward_plane = _away_from_zero(ray_directions[..., 2], normal_enough)
-    field = continued_level(depth, valid).to(ray_origins), origin, spacing
-    rays = (*ray_origins.unbind(dim=-1), *ray_directions.unbind(dim=-1))
-    distance = -ray_origins[..., 2] / toward_plane
+    distance = -z / _away_from_zero(dz, normal_enough)
     with torch.no_grad():
         for _ in range(steps - 1):
-            gap, rate = _gap(*field, rays, distance)
+            gap, rate = gap_at(distance)
             distance = distance - gap / _away_from_zero(rate, normal_enough)
     distance = distance.detach()
-    gap, rate = _gap(*field, rays, distance)
+    gap, rate = gap_at(distance)
     distance = distance - gap / _away_from_zero(rate.detach(), normal_enough)
     points = ray_origins + distance[..., None] * ray_directions
 
     with torch.no_grad():
-        gap, rate = _gap(*field, rays, distance)
+        gap, rate = gap_at(distance)
         neighbours, across, down = _cell(points[..., :2], origin, spacing, depth.shape[-2:])
         known = _gather(valid[:, None], neighbours)[:, 0]
         supported = (_bilinear_weights(across, down) * known).sum(dim=-1)
@@ -137,39 +157,6 @@ def _sum_of_nine(raster: PatchRaster) -> PatchRaster:
     wide = pad(raster, (1, 1, 1, 1))
     columns = wide[:, :, :-2] + wide[:, :, 1:-1] + wide[:, :, 2:]
     return columns[:, :-2] + columns[:, 1:-1] + columns[:, 2:]
-
-
-def _gap(
-    depth: PatchRaster,
-    origin: Origins,
-    spacing: PerPatch,
-    rays: tuple[PerRay, ...],
-    distance: PerRay,
-) -> tuple[PerRay, PerRay]:
-    """Return the ray's height over the height field along z, and its derivative along the ray.
-
-    Args:
-        depth: The height field; every sample has a value.
-        rays: x, y and z of the rays' origins, and of their directions.
-    """
-    x, y, z, dx, dy, dz = rays
-    count, height, width = depth.shape
-    per_sample = (1 / spacing)[:, None]
-    column = ((x + distance * dx - origin[:, :1]) * per_sample).clamp(0, width - 1)
-    row = ((y + distance * dy - origin[:, 1:]) * per_sample).clamp(0, height - 1)
-    left = column.detach().floor().clamp_max(width - 2)
-    top = row.detach().floor().clamp_max(height - 2)
-    across, down = column - left, row - top
-    first = (top * width + left).long()
-    raster = depth.reshape(count, -1)
-    top_left, top_right = raster.gather(1, first), raster.gather(1, first + 1)
-    low_left, low_right = raster.gather(1, first + width), raster.gather(1, first + width + 1)
-    slope_x = torch.lerp(top_right - top_left, low_right - low_left, down)
-    upper = top_left + across * (top_right - top_left)
-    lower = low_left + across * (low_right - low_left)
-    slope_y = lower - upper
-    climb = (slope_x * dx + slope_y * dy) * per_sample
-    return z + distance * dz - upper - down * slope_y, dz - climb
 
 
 def _cell(

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import chain
 from typing import Literal
 
@@ -265,8 +264,28 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
     while len(shapes) < levels and min(shapes[-1]) >= 8:
         shapes.append((shapes[-1][0] // 2, shapes[-1][1] // 2))
     sizes = tuple(shapes)
-    one = partial(_one, views, images, saturation_level, len(sizes))
-    parts = side_by_side(one, range(count), tracked=False)
+
+    def of_view(view: int) -> tuple[Tensor, ...]:
+        image, given = images[view][None], views.images[view]
+        wide, high = views.sizes_px[view].tolist()
+        lost = ~given.isfinite().all(dim=0) | (given.amax(dim=0) >= saturation_level)
+        lost[high:], lost[:, wide:] = True, True
+        if views.masks is not None:
+            lost = lost | ~views.masks[view]
+        coloured, fractions = [image], [lost[None, None].to(image)]
+        for _ in sizes[1:]:
+            coloured.append(halve(coloured[-1]))
+            fractions.append(halve(fractions[-1]))
+        gray = [level[0].mean(dim=0) for level in coloured]
+
+        def row(levels: list[Tensor]) -> Tensor:
+            return torch.cat([level.reshape(-1) for level in levels[1:]] or [image.new_empty(0)])
+
+        in_255ths = (255 * row(fractions)).round().to(torch.uint8)
+        finest = 255 * lost[None].to(torch.uint8)
+        return row(coloured), gray[0][None], row(gray), finest, in_255ths
+
+    parts = side_by_side(of_view, range(count), tracked=False)
     first = next(parts)
     filled = tuple(zeros((count, *part.shape), part.dtype, part.device) for part in first)
     for view, found in enumerate(chain([first], parts)):
@@ -348,39 +367,3 @@ def _lights_of(views: Views) -> LightPrior | None:
             view = views.names.index(name)
             lights[view], variance[view] = light, error
     return given.replace(lights=lights, variance=variance, names=views.names)
-
-
-def _one(
-    views: Views,
-    images: Float[Tensor, "view channel height width"],
-    saturation_level: float,
-    levels: int,
-    view: int,
-) -> tuple[
-    Float[Tensor, " coloured"],
-    Float[Tensor, "1 height width"],
-    Float[Tensor, " entry"],
-    UInt8[Tensor, "1 height width"],
-    UInt8[Tensor, " entry"],
-]:
-    """Return a view's further levels, its gray levels and its unusable ones."""
-    image = images[view][None]
-    given = views.images[view]
-    width, height = (int(side) for side in views.sizes_px[view])
-    unusable = ~given.isfinite().all(dim=0) | (given.amax(dim=0) >= saturation_level)
-    unusable[height:], unusable[:, width:] = True, True
-    if views.masks is not None:
-        unusable = unusable | ~views.masks[view]
-    lost = unusable[None, None].to(image)
-    coloured, fractions = [image], [lost]
-    for _ in range(levels - 1):
-        coloured.append(halve(coloured[-1]))
-        fractions.append(halve(fractions[-1]))
-    gray = [level[0].mean(dim=0) for level in coloured]
-
-    def row(parts: list[Tensor]) -> Tensor:
-        return torch.cat([part.reshape(-1) for part in parts[1:]] or [image.new_empty(0)])
-
-    in_255ths = (255 * row(fractions)).round().to(torch.uint8)
-    finest = 255 * unusable[None].to(torch.uint8)
-    return row(coloured), gray[0][None], row(gray), finest, in_255ths

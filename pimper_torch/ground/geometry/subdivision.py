@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.ground.shapes import Faces, Facets, PerFacet, PerVertex, Points, Vertices
+from pimper_torch.ground.shapes import Faces, Facets, PerFacet, PerVertex, Vertices
 from pimper_torch.records import Record
 
 Corners = Float[Tensor, "corner 3"]  # vertices of the coarse mesh
@@ -84,7 +84,16 @@ def subdivide(vertices: Corners, facets: Facets, spacing: PerFacet) -> Subdivisi
     (12, 14)
     """
     edges, facet_edges = face_edges(facets)
-    own = _pieces(vertices.detach(), facets, edges, facet_edges, spacing.detach())
+    ends = vertices.detach()[edges]
+    length = (ends[:, 1] - ends[:, 0]).norm(dim=-1)
+    area = face_normals(vertices.detach(), facets).norm(dim=-1) / 2
+    equilateral = (4 / 3**0.5 * area).sqrt()  # the side of one of that area
+    narrowest = torch.full_like(length, torch.inf).scatter_reduce(
+        0, facet_edges.flatten(), equilateral.repeat_interleave(3), "amin"
+    )
+    # The pieces of a half square's diagonal: at most 2 points a spacing squared.
+    length = torch.minimum(length, 1.32 * narrowest)
+    own = (length[facet_edges] / spacing.detach()[:, None]).round().long().clamp_min(1)
     pieces = own.new_zeros(len(edges)).scatter_reduce(
         0, facet_edges.flatten(), own.flatten(), "amax"
     )
@@ -158,8 +167,12 @@ def _assemble(vertices: Corners, facets: Facets, cuts: _Cuts, spacing: PerFacet)
         steps, triangles = _subdivision_of(size, device=facets.device)
         slid = _slide(steps, cuts.pieces[cuts.edge[members]], size)
         named = _name(steps, slid, cuts, members, inner_start[members])
-        cut = slid[..., 2] / slid[..., 3].clamp_min(1)
-        place = _barycentric(steps.to(vertices) / size, cut.to(vertices), slid[..., :2])
+        # Barycentric coordinates in slots: the grid's inside, those of the cut on an edge.
+        cut = (slid[..., 2] / slid[..., 3].clamp_min(1)).to(vertices)
+        on_edge = vertices.new_zeros(*cut.shape, 3)
+        on_edge = on_edge.scatter(2, slid[..., :2], torch.stack([1 - cut, cut], dim=-1))
+        inner = (steps > 0).all(dim=1)[:, None]
+        place = torch.where(inner, steps.to(vertices) / size, on_edge)
         back = cuts.slot[members].argsort(dim=1)[:, None].expand_as(place)
         names.append(named.flatten())
         places.append(place.gather(2, back).flatten(0, 1))
@@ -208,25 +221,6 @@ def _fanned(
         fan = [cuts.named(edge, at), cuts.named(edge, at + step.sign()), faces[:, 2]]
         faces = torch.where((step.abs() > 1)[:, None], torch.stack(fan, dim=1), faces)
     return faces, owner
-
-
-def _pieces(
-    vertices: Corners,
-    facets: Facets,
-    edges: Int[Tensor, "edge 2"],
-    facet_edges: Int[Tensor, "facet 3"],
-    spacing: PerFacet,
-) -> Int[Tensor, "facet 3"]:
-    ends = vertices[edges]
-    length = (ends[:, 1] - ends[:, 0]).norm(dim=-1)
-    area = face_normals(vertices, facets).norm(dim=-1) / 2
-    equilateral = (4 / 3**0.5 * area).sqrt()  # the side of one of that area
-    narrowest = torch.full_like(length, torch.inf).scatter_reduce(
-        0, facet_edges.flatten(), equilateral.repeat_interleave(3), "amin"
-    )
-    # The pieces of a half square's diagonal: at most 2 points a spacing squared.
-    length = torch.minimum(length, 1.32 * narrowest)
-    return (length[facet_edges] / spacing[:, None]).round().long().clamp_min(1)
 
 
 def _starts(counts: Int[Tensor, " group"]) -> Int[Tensor, " group"]:
@@ -285,13 +279,3 @@ def _name(
     named = cuts.named(edge, from_lower)
     inner: Bool[Tensor, " point"] = (steps > 0).all(dim=1)
     return torch.where(inner, inner_start[:, None] + inner.cumsum(dim=0) - 1, named)
-
-
-def _barycentric(
-    free: Points, cut: Float[Tensor, "member point"], ends: Int[Tensor, "member point 2"]
-) -> Float[Tensor, "member point 3"]:
-    """Return coordinates in slots: free inside, on the cut at an edge."""
-    inner = (free > 0).all(dim=1)[:, None]
-    on_edge = free.new_zeros(*cut.shape, 3)
-    on_edge = on_edge.scatter(2, ends, torch.stack([1 - cut, cut], dim=-1))
-    return torch.where(inner, free, on_edge)

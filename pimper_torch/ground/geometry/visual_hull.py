@@ -277,7 +277,14 @@ def _voted(
     num_voxels: int,
     fractions: tuple[float, float],
 ) -> Hull:
-    """Fill a grid between two corners with about so many voxels."""
+    """Fill a grid between two corners with about so many voxels.
+
+    Args:
+        maps: Distances to the silhouettes in pixels, and what they count, one a view.
+        fractions: Of views that may disagree, and that must look.
+    """
+    from pimper_torch.ground.kernels.hull_votes import vote
+
     low, high = box_world.to(cameras.intrinsics)
     spacing = ((high - low).prod() / num_voxels) ** (1 / 3)
     counts = ((high - low) / spacing).ceil().long().clamp_min(1) + 1
@@ -289,10 +296,35 @@ def _voted(
     # All views' distances to a slab take 8 MB.
     slab = max(1, 2**21 // (len(maps) * int(counts[1:].prod())))
 
-    def vote(some: Float[Tensor, " x"]) -> Float[Tensor, "2 x y z"]:
-        return _vote(maps, cameras, (first, steps), (some, reach[1], reach[2]), fractions)
+    focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
 
-    slabs = list(side_by_side(vote, torch.split(reach[0], slab), tracked=False))
+    def of_slab(along_x: Float[Tensor, " x"]) -> Float[Tensor, "2 x y z"]:
+        """Return the smallest distance to a silhouette that is not outvoted, by both counts."""
+        shape = len(along_x), len(reach[1]), len(reach[2])
+        distance, word = low.new_ones(2, len(maps), *shape)
+        for view, border in enumerate(maps):
+            start, step = first[view], steps[view]
+            u, v, depth = (
+                start[row]
+                + (step[row, 0] * along_x)[:, None, None]
+                + ((step[row, 1] * reach[1])[:, None] + step[row, 2] * reach[2])
+                for row in range(3)
+            )
+            place = torch.stack([u / depth, v / depth], dim=-1).reshape(1, 1, -1, 2)
+            height, width = border.shape[1:]
+            grid = grid_from_pixels(place + 1, width, height)
+            found = grid_sample(border[None], grid, padding_mode="border", align_corners=False)
+            value, *counted = found.reshape(-1, *shape)
+            if counted:
+                word[view] = counted[0]
+            looks = (depth > 0) & (value < _UNSEEN / 1e3)
+            distance[view] = torch.where(looks, value * (depth / focal[view]), _UNSEEN)
+        chosen = torch.empty(2, *shape)
+        rows = (one.flatten(1).cpu().numpy() for one in (distance, word))
+        vote(*rows, _UNSEEN, *fractions, chosen.flatten(1).numpy())
+        return chosen.to(distance)
+
+    slabs = list(side_by_side(of_slab, torch.split(reach[0], slab), tracked=False))
     distance, certain = torch.cat(slabs, dim=1)
     found, count = label((distance > 0).cpu().numpy())
     labels = torch.from_numpy(found).to(distance.device)
@@ -300,47 +332,3 @@ def _voted(
     apart &= labels > 0
     distance = torch.where(apart, -spacing, distance)
     return Hull(origin_world=low, spacing=spacing, distance=distance)
-
-
-def _vote(
-    maps: list[Float[Tensor, "layer _ _"]],
-    cameras: Cameras,
-    projected: tuple[Float[Tensor, "view 3"], Float[Tensor, "view 3 3"]],
-    reach: tuple[Float[Tensor, " x"], Float[Tensor, " y"], Float[Tensor, " z"]],
-    fractions: tuple[float, float],
-) -> Float[Tensor, "2 x y z"]:
-    """Return the smallest distance to a silhouette after those that may disagree, by both counts.
-
-    Args:
-        maps: Distances to the silhouettes in pixels, and what they count, one a view.
-        projected: Homogeneous pixels of the first voxel, and what a step along each axis adds.
-        reach: Numbers of the voxels along each axis.
-        fractions: Of views that may disagree, and that must look.
-    """
-    from pimper_torch.ground.kernels.hull_votes import vote
-
-    disagreeing, min_seen = fractions
-    shape = tuple(len(axis) for axis in reach)
-    distance, word = reach[0].new_ones(2, len(maps), *shape)
-    focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
-    for view, border in enumerate(maps):
-        start, step = projected[0][view], projected[1][view]
-        u, v, depth = (
-            start[row]
-            + (step[row, 0] * reach[0])[:, None, None]
-            + ((step[row, 1] * reach[1])[:, None] + step[row, 2] * reach[2])
-            for row in range(3)
-        )
-        place = torch.stack([u / depth, v / depth], dim=-1).reshape(1, 1, -1, 2)
-        height, width = border.shape[1:]
-        grid = grid_from_pixels(place + 1, width, height)
-        found = grid_sample(border[None], grid, padding_mode="border", align_corners=False)
-        value, *counted = found.reshape(-1, *shape)
-        if counted:
-            word[view] = counted[0]
-        looks = (depth > 0) & (value < _UNSEEN / 1e3)
-        distance[view] = torch.where(looks, value * (depth / focal[view]), _UNSEEN)
-    chosen = torch.empty(2, *shape)
-    first, second = (one.flatten(1).cpu().numpy() for one in (distance, word))
-    vote(first, second, _UNSEEN, disagreeing, min_seen, chosen.flatten(1).numpy())
-    return chosen.to(distance)

@@ -81,8 +81,11 @@ class Running:
     def _kept(self, name: str, stage: Callable[..., object], inputs: tuple[object, ...]) -> object:
         """Find the record of a stage, or make it and keep it."""
         make: Callable[[], Any] = partial(called, name, stage, *inputs)
-        cls = None if self.store is None or name in _NOT_KEPT else _returns(stage)
-        if cls is None:
+        if self.store is None or name in _NOT_KEPT:
+            return make()
+        function = stage.forward if isinstance(stage, nn.Module) else stage
+        cls: Any = typing.get_type_hints(function).get("return")
+        if not (isinstance(cls, type) and issubclass(cls, Record)):
             return make()
         with aside(HASH):
             hashed = digest(stage, *inputs)
@@ -92,9 +95,3 @@ class Running:
         records = [value for value in inputs if isinstance(value, Record)]
         tensors = [leaf for leaf in pytree.tree_leaves(records) if isinstance(leaf, Tensor)]
         return record.to(tensors[0].device) if tensors else record
-
-
-def _returns(call: Callable[..., object]) -> type[Record] | None:
-    function = call.forward if isinstance(call, nn.Module) else call
-    cls: Any = typing.get_type_hints(function).get("return")
-    return cls if isinstance(cls, type) and issubclass(cls, Record) else None

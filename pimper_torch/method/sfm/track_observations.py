@@ -24,7 +24,7 @@ from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.radiometry import SATURATED
-from pimper_torch.ground.shapes import Map, Pixels, Points
+from pimper_torch.ground.shapes import Map, Points
 from pimper_torch.method.sfm.matching import MOST_PAIRED
 from pimper_torch.records import Cameras, Record
 from pimper_torch.runtime.mapped import drop_pages, zeros
@@ -241,40 +241,52 @@ def sight(
         Sorted by point, then view; the reference's own is there where another view found
         the point. A constant to autograd.
     """
+    limits = torch.tensor([*_LIMITS, max_shift_px], dtype=torch.float64)
     found = []
     for first in range(0, max(len(tangents.points_world), 1), at_once):
-        part = _sight(pictures, cameras, tangents.take(slice(first, first + at_once)), max_shift_px)
+        part = _sight(pictures, cameras, tangents.take(slice(first, first + at_once)), limits)
         found.append(part.replace(point=part.point + first))
     return TrackObservations.cat(found)
 
 
+@torch.no_grad()
 def _sight(
-    pictures: LogPictures, cameras: Cameras, tangents: Tangents, max_shift_px: float
+    pictures: LogPictures, cameras: Cameras, tangents: Tangents, limits: Float[Tensor, " limit"]
 ) -> TrackObservations:
-    with torch.no_grad():
-        window = _Window(like=pictures.log)
-        templates = _templates(pictures, cameras, tangents, window)
+    from pimper_torch.ground.kernels.patch_alignment import align
 
-        def in_view(view: int) -> tuple[Tensor, Tensor, Tensor]:
-            mine = tangents.candidates[:, view] & templates.usable
-            (chosen,) = torch.nonzero(mine, as_tuple=True)
-            homographies = plane_homographies(tangents, cameras, view, chosen)
-            kept, pixels = _aligned(
-                pictures, view, homographies, chosen, templates, window, max_shift_px
-            )
-            shown = chosen[kept]
-            return shown, torch.full_like(shown, view), pixels[kept]
+    window = _Window(like=pictures.log)
+    templates = _templates(pictures, cameras, tangents, window)
 
-        parts = side_by_side(in_view, range(len(pictures.log)))
-        point, view_, pixels = (torch.cat(part) for part in zip(*parts, strict=True))
-        own = torch.unique(point)
-        point = torch.cat([point, own])
-        view_ = torch.cat([view_, tangents.reference[own]])
-        there = cameras.take(tangents.reference[own])
-        mine, _ = project(tangents.points_world[own, None], there.cam_from_world, there.intrinsics)
-        pixels = torch.cat([pixels, mine[:, 0]])
-        order = torch.argsort(point * len(pictures.log) + view_)
-        return TrackObservations(point=point[order], view=view_[order], pixels=pixels[order])
+    def in_view(view: int) -> tuple[Tensor, Tensor, Tensor]:
+        mine = tangents.candidates[:, view] & templates.usable
+        (chosen,) = torch.nonzero(mine, as_tuple=True)
+        homographies = plane_homographies(tangents, cameras, view, chosen)
+        shift = homographies.new_empty(len(homographies), 2)
+        deviation, correlation = torch.empty_like(shift).mT.contiguous()
+        own = (templates.values, templates.slopes, templates.inverse)
+        given = (homographies, chosen, *own, window.places, window.root, window.light, limits)
+        found = (shift, deviation, correlation)  # written to: these are contiguous
+        align(*(one.contiguous().numpy() for one in (pictures.log[view], *given, *found)))
+        arrived = shift.isfinite().all(dim=1)
+        axes = homographies[:, :, :2]
+        centre = homographies[:, :, 2:] + axes @ torch.where(arrived[:, None], shift, 0)[..., None]
+        final = torch.cat([axes, centre], dim=2)
+        kept = arrived & (correlation >= 0.8) & (deviation <= 0.5)
+        kept &= _complete(pictures.unusable[view], final, window)
+        shown = chosen[kept]
+        return shown, torch.full_like(shown, view), (final[:, :2, 2] / final[:, 2:, 2])[kept]
+
+    parts = side_by_side(in_view, range(len(pictures.log)))
+    point, view_, pixels = (torch.cat(part) for part in zip(*parts, strict=True))
+    own = torch.unique(point)
+    point = torch.cat([point, own])
+    view_ = torch.cat([view_, tangents.reference[own]])
+    there = cameras.take(tangents.reference[own])
+    mine, _ = project(tangents.points_world[own, None], there.cam_from_world, there.intrinsics)
+    pixels = torch.cat([pixels, mine[:, 0]])
+    order = torch.argsort(point * len(pictures.log) + view_)
+    return TrackObservations(point=point[order], view=view_[order], pixels=pixels[order])
 
 
 def _templates(
@@ -302,34 +314,6 @@ def _templates(
         inverse=torch.linalg.inv(safe),
         usable=whole & told,
     )
-
-
-def _aligned(
-    pictures: LogPictures,
-    view: int,
-    homographies: Float[Tensor, "point 3 3"],
-    chosen: Int[Tensor, " point"],
-    templates: _Templates,
-    window: _Window,
-    max_shift_px: float,
-) -> tuple[Bool[Tensor, " point"], Pixels]:
-    """Align one view's patches; return which were found, and their pixels."""
-    from pimper_torch.ground.kernels.patch_alignment import align
-
-    shift = homographies.new_empty(len(homographies), 2)
-    deviation, correlation = torch.empty_like(shift).mT.contiguous()
-    limits = torch.tensor([*_LIMITS, max_shift_px], dtype=torch.float64)
-    own = (templates.values, templates.slopes, templates.inverse)
-    given = (homographies, chosen, *own, window.places, window.root, window.light, limits)
-    found = (shift, deviation, correlation)  # written to: these are contiguous
-    align(*(one.contiguous().numpy() for one in (pictures.log[view], *given, *found)))
-    arrived = shift.isfinite().all(dim=1)
-    axes = homographies[:, :, :2]
-    centre = homographies[:, :, 2:] + axes @ torch.where(arrived[:, None], shift, 0)[..., None]
-    final = torch.cat([axes, centre], dim=2)
-    kept = arrived & (correlation >= 0.8) & (deviation <= 0.5)
-    kept &= _complete(pictures.unusable[view], final, window)
-    return kept, final[:, :2, 2] / final[:, 2:, 2]
 
 
 def _complete(

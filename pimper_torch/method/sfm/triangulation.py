@@ -147,7 +147,19 @@ def _match_along_lines(
     settings: ReconstructConfig,
 ) -> None:
     """Replace what was verified by matches along the cameras' epipolar lines."""
-    pairs, cameras = _pairs(model, verified, settings), epipolar.pinholes_of(model)
+    cameras, limit = epipolar.pinholes_of(model), settings.max_error_px
+    # Pairs are chosen by matches that the cameras explain, then by the angle between their axes.
+    axes = model.cam_from_world[:, 2, :3]
+    angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
+    weights = {
+        (first, second): 1 - float(angles[first, second]) / 60
+        for first, second in combinations(range(model.num_views), 2)
+        if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
+    }
+    for known in epipolar.undistorted_pairs(model, verified):
+        if count := int(epipolar.explained(cameras, known, limit).sum()):
+            weights[known.views] = weights.get(known.views, 0.0) + count
+    pairs = matching.strongest(weights, model.num_views, max(settings.guided_pairs, 1))
     with quiet(), loaded().Database.open(space.database) as stored:
         image_of = features.image_ids(stored, space)
         bent = [matching.read_features(stored, image) for image in image_of]
@@ -160,12 +172,12 @@ def _match_along_lines(
             first, second = (straight[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
-            near = matching.Near(epipolar.epipolar_geometry(cameras, pair), settings.max_error_px)
+            near = matching.Near(epipolar.epipolar_geometry(cameras, pair), limit)
             found = matching.guided_matches(first, second, near, settings.max_ratio)
             ends = matching.VerifiedPair(
                 views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
             )
-            return found[epipolar.explained(cameras, ends, settings.max_error_px)]
+            return found[epipolar.explained(cameras, ends, limit)]
 
         stored.clear_two_view_geometries()
         for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
@@ -174,24 +186,6 @@ def _match_along_lines(
             geometry.F = epipolar.epipolar_geometry(cameras, pair).numpy()
             geometry.inlier_matches = found.numpy().astype(np.uint32)
             stored.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
-
-
-def _pairs(
-    model: SparseModel, verified: Sequence[matching.VerifiedPair], settings: ReconstructConfig
-) -> list[matching.PhotographPair]:
-    """Choose pairs by matches that the cameras explain, then by the angle between their axes."""
-    axes = model.cam_from_world[:, 2, :3]
-    angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
-    cameras, limit = epipolar.pinholes_of(model), settings.max_error_px
-    weights = {
-        (first, second): 1 - float(angles[first, second]) / 60
-        for first, second in combinations(range(model.num_views), 2)
-        if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
-    }
-    for pair in epipolar.undistorted_pairs(model, verified):
-        if count := int(epipolar.explained(cameras, pair, limit).sum()):
-            weights[pair.views] = weights.get(pair.views, 0.0) + count
-    return matching.strongest(weights, model.num_views, max(settings.guided_pairs, 1))
 
 
 def _triangulated(space: features.Workspace, model: SparseModel, seed: int) -> SparseModel:

@@ -59,8 +59,12 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPic
         level = torch.quantile(small.mean(dim=0).flatten()[::7], 0.99).clamp_min(1e-6)
         radiance = (small / level).clamp(0, 1).expand(3, -1, -1)
         colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)
-        # Logarithms of what is darker tell noise.
-        return colours, _opponent(radiance), torch.log(small.mean(dim=0) / level + 0.005)
+        red, green, blue = torch.log(radiance + _FAINT)
+        luma = 255 * srgb_from_linear(radiance.mean(dim=0))
+        ratios = [128 + _RATIO * (red - green), 128 + _RATIO * (blue - green)]
+        opponent = torch.stack([luma, *ratios], dim=-1).clamp(0, 255).round().byte()
+        # Logarithms of darker values are noise.
+        return colours, opponent, torch.log(small.mean(dim=0) / level + 0.005)
 
     images = views.images.detach().cpu().unbind()
     colours, opponent = (zeros((len(images), high, wide, 3), torch.uint8) for _ in range(2))
@@ -83,14 +87,6 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPic
 def of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
     """Stack what is computed of every view by itself."""
     return stacked(side_by_side(work, range(count)), count)
-
-
-def _opponent(radiance: Float[Tensor, "3 height width"]) -> UInt8[Tensor, "height width 3"]:
-    """Return brightness and two ratios of colours, which shadows and shading leave as they are."""
-    red, green, blue = torch.log(radiance + _FAINT)
-    luma = 255 * srgb_from_linear(radiance.mean(dim=0))
-    ratios = [128 + _RATIO * (red - green), 128 + _RATIO * (blue - green)]
-    return torch.stack([luma, *ratios], dim=-1).clamp(0, 255).round().byte()
 
 
 # A room is at rest if photographs, shifted, correlate with one of them by more than the first, and

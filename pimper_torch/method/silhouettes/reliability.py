@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pimper_torch.ground.geometry.opencv import signed_distance
-from pimper_torch.ground.shapes import Map, Maps, ViewMask
+from pimper_torch.ground.shapes import Map, ViewMask
 from pimper_torch.method.silhouettes.cuts import DOUBT_OFF_PLANE, Cuts, doubt_of, is_deep
 from pimper_torch.records import Silhouettes, Views
 from pimper_torch.runtime.mapped import by_view, zeros
@@ -53,24 +53,8 @@ _UNSURE_INSIDE = 0.6
 
 
 def silhouettes_of(cuts: Cuts, views: Views) -> Silhouettes:
-    """Give silhouettes at the photographs' size."""
-    found = _at_full_size(cuts, views)
-    _, reliable = agreement_of(cuts)
-    hidden = None
-    if cuts.hidden is not None:
-        size = views.images.shape[-2:]
-        hidden = by_view(
-            lambda one: interpolate(one[None, None].float(), size)[0, 0] > 0, cuts.hidden
-        )
-    return Silhouettes(
-        inside=found, reliable=reliable.to(found.device), source="found", hidden=hidden
-    )
-
-
-def _at_full_size(cuts: Cuts, views: Views) -> Maps:
     """Turn cuts into probabilities at the photographs' size; 0 in the padding."""
-    height, width = views.images.shape[-2:]
-    device = views.images.device
+    size, device = views.images.shape[-2:], views.images.device
 
     def enlarged(view: int) -> Map:
         cut, margin = cuts.masks[view], cuts.margins_px[view]
@@ -79,14 +63,20 @@ def _at_full_size(cuts: Cuts, views: Views) -> Maps:
             own = doubt_of(cuts.agreement[view]).masked_fill(is_deep(-margin), 0)
             doubt = torch.maximum(doubt, own)
         layers = torch.stack([signed_distance(cut), margin.clamp(-100, 100), doubt])
-        border, hull, doubt = interpolate(
-            layers[None], (height, width), mode="bilinear", align_corners=False
-        )[0]
+        border, hull, doubt = interpolate(layers[None], size, mode="bilinear", align_corners=False)[
+            0
+        ]
         inside = torch.sigmoid(border / 0.5)
         inside = torch.where((border > 2) & (hull < -2), _UNSURE_INSIDE, inside)
         return torch.where(border < -2, torch.maximum(inside, doubt), inside)
 
-    found, within = zeros((len(cuts.masks), height, width), device=device), views.inside
+    found, within = zeros((len(cuts.masks), *size), device=device), views.inside
     for view, inside in enumerate(side_by_side(enlarged, range(len(cuts.masks)), tracked=False)):
         found[view] = inside.to(device) * within[view]
-    return found
+    hidden = None
+    if cuts.hidden is not None:
+        hidden = by_view(
+            lambda one: interpolate(one[None, None].float(), size)[0, 0] > 0, cuts.hidden
+        )
+    _, reliable = agreement_of(cuts)
+    return Silhouettes(inside=found, reliable=reliable.to(device), source="found", hidden=hidden)

@@ -93,35 +93,26 @@ def align_factorizations(
         eye = torch.eye(4, dtype=source.dtype, device=source.device)
         cross = (w * target) @ source.mT + ridge[..., None, None] * eye
         linear = torch.linalg.solve(moment + ridge[..., None, None] * eye, cross, left=False)
-        matrix = _nearest_lorentz(linear)
+        matrix, eye = _nearest_lorentz(linear), torch.eye(7).to(linear)
+        basis, root = torch.cat([_algebra(eye[:6, :6]), eye[None, :4, :4]]), w.sqrt()
+
+        def misfit(tried: Tensor) -> Tensor:
+            return (w * (target - tried @ source) ** 2).sum(dim=(-2, -1))
+
         for _ in range(10):
-            matrix = _improve(matrix, source, target, w)
+            moved = matrix @ source
+            slopes = torch.einsum("gij,...jk->...gik", basis, moved)
+            A = (slopes * root[..., None, :, :]).flatten(-2)
+            r = ((target - moved) * root).flatten(-2)
+            normal = A @ A.mT
+            damping = 1e-9 * normal.diagonal(dim1=-2, dim2=-1).mean(dim=-1) + 1e-30
+            normal = normal + damping[..., None, None] * eye
+            step = torch.linalg.solve(normal, (A @ r[..., None])[..., 0])
+            step = step * (1 / step.norm(dim=-1, keepdim=True).clamp_min(1e-30)).clamp_max(1)
+            tried = step[..., 6, None, None].exp() * lorentz(step[..., :6]) @ matrix
+            better = misfit(tried) < misfit(matrix)
+            matrix = torch.where(better[..., None, None], tried, matrix)
         return Ambiguity(matrix=matrix.to(shading.dtype))
-
-
-def _improve(
-    matrix: Float[Tensor, "*batch 4 4"],
-    source: Float[Tensor, "*batch 4 sample"],
-    target: Float[Tensor, "*batch 4 sample"],
-    w: Float[Tensor, "*batch 1 sample"],
-) -> Float[Tensor, "*batch 4 4"]:
-    moved = matrix @ source
-    eye = torch.eye(7).to(matrix)
-    basis = torch.cat([_algebra(eye[:6, :6]), eye[None, :4, :4]])
-    root = w.sqrt()
-    steps = torch.einsum("gij,...jk->...gik", basis, moved)
-    A = (steps * root[..., None, :, :]).flatten(-2)
-    r = ((target - moved) * root).flatten(-2)
-    normal = A @ A.mT
-    damping = 1e-9 * normal.diagonal(dim1=-2, dim2=-1).mean(dim=-1) + 1e-30
-    step = torch.linalg.solve(normal + damping[..., None, None] * eye, (A @ r[..., None])[..., 0])
-    step = step * (1 / step.norm(dim=-1, keepdim=True).clamp_min(1e-30)).clamp_max(1)
-    better = step[..., 6, None, None].exp() * lorentz(step[..., :6]) @ matrix
-
-    def misfit(moving: Tensor) -> Tensor:
-        return (w * (target - moving @ source) ** 2).sum(dim=(-2, -1))
-
-    return torch.where((misfit(better) < misfit(matrix))[..., None, None], better, matrix)
 
 
 def _nearest_lorentz(linear: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:

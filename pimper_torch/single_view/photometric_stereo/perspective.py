@@ -164,11 +164,7 @@ def _cofactors(
     noise_covariance: Float[Tensor, "pixel 3 3"],
     by_noise: Float[Tensor, "2 pixel 3"],
 ) -> tuple[Matrix3, float]:
-    """Find the cofactors of minimum residual relative to that of noise.
-
-    Returns:
-        The cofactors, and the second smallest ratio over the smallest.
-    """
+    """Find the cofactors of least residual over that of noise; by how much the second is larger."""
     weight = torch.ones_like(rows[:, 0])
     for _ in range(4):
         both = torch.einsum("p,spi,spk->pik", weight, by_noise, by_noise)
