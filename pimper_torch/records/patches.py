@@ -571,13 +571,6 @@ class Depths(Record):
     transform: Float[Tensor, "patch 4"]
     status: Int[Tensor, " patch"] | None = None
 
-    @property
-    def aligned(self) -> Bool[Tensor, " patch"]:
-        """Height fields that meet a neighbour's; none before alignment."""
-        if self.status is None:
-            return torch.zeros(len(self.depth), dtype=torch.bool, device=self.depth.device)
-        return self.status == AlignStatus.ALIGNED
-
     def faults(self) -> Faults:
         """List depths that are nowhere."""
         yield from faults_in("depth", "finite where valid", not_finite, self.depth, self.valid)
