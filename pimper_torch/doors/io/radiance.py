@@ -1,7 +1,7 @@
 """Image files to radiance: the response undone, 1 where the sensor saturates, shrunk."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -83,8 +83,17 @@ def read_pictures(
     images = zeros((len(files), channels, height, width))
     opaque, tallies = _fill(images, files, sizes_px, encoding, {})
     whites = _found(tallies)
-    for told in (*_low_levels(tallies, whites), *_found_levels(whites)):
-        caution(f"{files[0].parent}: {told}", stacklevel=3)
+    if advice := _low_levels(tallies, whites):
+        caution(f"{files[0].parent}: {advice}", stacklevel=3)
+    for kind, white in whites.items():
+        levels = [str(round(kind.full * float(one))) for one in white]
+        text = levels[0] if len({*levels}) == 1 else f"{', '.join(levels)} (red, green, blue)"
+        caution(
+            f"{files[0].parent}: values of its files of {kind.full.bit_length()} bits pile up at "
+            f"{text} of {kind.full}, which is taken for the level of saturation. If it is not, set "
+            "`photographs.saturation` to the true level, or to 1 for full scale.",
+            stacklevel=3,
+        )
     if whites:
         opaque, _ = _fill(images, files, sizes_px, encoding, whites)
     return images, opaque
@@ -189,30 +198,20 @@ def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
     return whites
 
 
-def _found_levels(whites: _Whites) -> Iterator[str]:
-    for kind, white in whites.items():
-        levels = [str(round(kind.full * float(one))) for one in white]
-        text = levels[0] if len({*levels}) == 1 else f"{', '.join(levels)} (red, green, blue)"
-        yield (
-            f"values of its files of {kind.full.bit_length()} bits pile up at {text} of "
-            f"{kind.full}, which is taken for the level of saturation. If it is not, set "
-            "`photographs.saturation` to the true level, or to 1 for full scale."
-        )
-
-
-def _low_levels(tallies: Mapping[_Kind, _Tally], whites: _Whites) -> Iterator[str]:
-    """State that files of 16 bits may hold 10, 12 or 14, as cameras' sensors do."""
+def _low_levels(tallies: Mapping[_Kind, _Tally], whites: _Whites) -> str:
+    """Return advice where files of 16 bits may hold 10, 12 or 14, as cameras' sensors do."""
     deep = [kind for kind in tallies if kind.full == 2**16 - 1 and not kind.full_told]
     if not deep or any(kind in whites for kind in deep):
-        return
+        return ""
     highest = max(int(tallies[kind][0].sum(dim=0).nonzero().max()) for kind in deep)
     bits = next((bits for bits in _SENSOR_BITS if highest < 2**bits), None)
-    if bits is not None:
-        yield (
-            f"no value of its files of 16 bits is above {highest} of 65535. If they hold {bits} "
-            f"bits, full scale is {2**bits - 1}: say so by `photographs.saturation`; saturated "
-            "pixels are taken for radiance otherwise."
-        )
+    if bits is None:
+        return ""
+    return (
+        f"no value of its files of 16 bits is above {highest} of 65535. If they hold {bits} bits, "
+        f"full scale is {2**bits - 1}: say so by `photographs.saturation`; saturated pixels are "
+        "taken for radiance otherwise."
+    )
 
 
 def _levels(

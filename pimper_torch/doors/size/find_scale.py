@@ -68,16 +68,15 @@ def find_scale(
         scales.append(scale_of_bars(result, bars, unit))
     if camera_distances:
         scales.append(scale_of_cameras(result, camera_distances, unit))
-    asked = not isinstance(markers, str)
-    if markers != "off" and (asked or scales or not own_frame):
-        side_mm = float(markers) if not isinstance(markers, str) else None
+    side_mm = None if isinstance(markers, str) else float(markers)
+    if markers != "off" and (side_mm is not None or scales or not own_frame):
         found = scale_of_markers(result.scene, side_mm, unit)
-        if found is None and asked:
+        if found is not None:
+            scales.append(found)
+        elif side_mm is not None:
             caution(
                 "No marker was found that two photographs show alike. Print a sheet (`pimper "
                 "markers`), lay it flat beside the object, and photograph both sharply, not "
                 "overexposed."
             )
-        elif found is not None:
-            scales.append(found)
     return most_accurate(scales)

@@ -51,19 +51,17 @@ def textured(full: Mesh, few: Mesh, reflectance: Vertices | None = None) -> Text
 
 def halved(asset: Textured) -> Textured:
     """Return the same with textures of half the size."""
+
+    def half(texture: Float[Tensor, "height width channel"]) -> Tensor:
+        return avg_pool2d(texture.movedim(-1, 0), 2).movedim(0, -1)
+
     reflectance = asset.reflectance
     return asset.replace(
-        base_color=_halved(asset.base_color.float()).round().to(torch.uint8),
-        normal=_halved(asset.normal.float()).round().to(torch.uint8),
-        doubt=_halved(asset.doubt[..., None].float())[..., 0].round().to(torch.uint8),
-        reflectance=None if reflectance is None else _halved(reflectance),
+        base_color=half(asset.base_color.float()).round().to(torch.uint8),
+        normal=half(asset.normal.float()).round().to(torch.uint8),
+        doubt=half(asset.doubt[..., None].float())[..., 0].round().to(torch.uint8),
+        reflectance=None if reflectance is None else half(reflectance),
     )
-
-
-def _halved(
-    texture: Float[Tensor, "height width channel"],
-) -> Float[Tensor, "half narrower channel"]:
-    return avg_pool2d(texture.movedim(-1, 0), 2).movedim(0, -1)
 
 
 def baked(
