@@ -185,7 +185,13 @@ def contour_points(
     """
     centers = cameras.centers_world[rays.view]
     focal = cameras.intrinsics[rays.view, 0, 0]
-    low, high = _depths_in_box(hull, centers, rays.rays_world)
+    # The depths at which rays enter and leave the ball around the hull's grid.
+    corners = hull.corners_world.to(rays.rays_world)
+    middle, radius = corners.mean(dim=0), (corners[1] - corners[0]).norm() / 2
+    square = rays.rays_world.square().sum(dim=1, keepdim=True)
+    along = ((middle - centers) * rays.rays_world).sum(dim=1, keepdim=True) / square
+    reach = radius / square.sqrt()
+    low, high = (along - reach).clamp_min(0), (along + reach).clamp_min(0)
     steps = 128
     depth = low + torch.linspace(0, 1, steps).to(low) * (high - low)
     pixel = depth.mean(dim=1) / focal
@@ -235,18 +241,6 @@ class _SignedDistance:
         beside = (offset - height[:, None] * normals).norm(dim=1) - radii
         distance = torch.hypot(height, beside.clamp_min(0))
         return torch.where(height < -_ALONG_NORMAL * distance, -distance, distance)
-
-
-def _depths_in_box(
-    hull: Hull, centers: Float[Tensor, "ray 3"], rays: Float[Tensor, "ray 3"]
-) -> tuple[Float[Tensor, "ray 1"], Float[Tensor, "ray 1"]]:
-    """Return the depths at which rays enter and leave the ball around the hull's grid."""
-    corners = hull.corners_world.to(rays)
-    centre, radius = corners.mean(dim=0), (corners[1] - corners[0]).norm() / 2
-    square = rays.square().sum(dim=1, keepdim=True)
-    along = ((centre - centers) * rays).sum(dim=1, keepdim=True) / square
-    reach = radius / square.sqrt()
-    return (along - reach).clamp_min(0), (along + reach).clamp_min(0)
 
 
 def _costs(

@@ -13,7 +13,7 @@ limited by its area: it is then a little too coarse along its length.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -166,13 +166,19 @@ def _assemble(vertices: Corners, facets: Facets, cuts: _Cuts, spacing: PerFacet)
         members = (sizes == size).nonzero()[:, 0]
         steps, triangles = _subdivision_of(size, device=facets.device)
         slid = _slide(steps, cuts.pieces[cuts.edge[members]], size)
-        named = _name(steps, slid, cuts, members, inner_start[members])
+        # Points are numbered so that facets agree: corners, then cuts of edges, then insides.
+        start_slot, end_slot, cut, pieces = slid.unbind(dim=-1)
+        start = cuts.corner[members].gather(1, start_slot)
+        edge = cuts.edge[members].gather(1, 3 - start_slot - end_slot)
+        from_lower = torch.where(start == cuts.edges[edge, 0], cut, pieces - cut)
+        inner = (steps > 0).all(dim=1)
+        number = inner_start[members][:, None] + inner.cumsum(dim=0) - 1
+        named = torch.where(inner, number, cuts.named(edge, from_lower))
         # Barycentric coordinates in slots: the grid's inside, those of the cut on an edge.
-        cut = (slid[..., 2] / slid[..., 3].clamp_min(1)).to(vertices)
+        fraction = (cut / pieces.clamp_min(1)).to(vertices)
         on_edge = vertices.new_zeros(*cut.shape, 3)
-        on_edge = on_edge.scatter(2, slid[..., :2], torch.stack([1 - cut, cut], dim=-1))
-        inner = (steps > 0).all(dim=1)[:, None]
-        place = torch.where(inner, steps.to(vertices) / size, on_edge)
+        on_edge = on_edge.scatter(2, slid[..., :2], torch.stack([1 - fraction, fraction], dim=-1))
+        place = torch.where(inner[:, None], steps.to(vertices) / size, on_edge)
         back = cuts.slot[members].argsort(dim=1)[:, None].expand_as(place)
         names.append(named.flatten())
         places.append(place.gather(2, back).flatten(0, 1))
@@ -249,9 +255,7 @@ def _slide(
 
     Returns:
         The slots of the edge's two ends, the cut counted from the first of them, and the
-        number of pieces; 0 pieces for points inside the facet. A point halfway between two
-        cuts goes towards slot 0: were it to go to the far end, the centre triangle of a
-        facet with 1, 1 and 2 pieces would be flat.
+        number of pieces; 0 pieces for points inside the facet.
     """
     edge = torch.full_like(steps[:, 0], -1)
     for opposite in (0, 2, 1):  # corners are on two edges; either names them
@@ -260,22 +264,7 @@ def _slide(
     end = torch.where(edge == 2, 1, 2)
     gone = steps.gather(1, end[:, None])[:, 0]
     cut_into = torch.where(edge >= 0, pieces[:, edge.clamp_min(0)], 0)
+    # Half-way between two cuts, towards slot 0: at the far end, the centre triangle of a facet with
+    # 1, 1 and 2 pieces would be flat.
     cut = (2 * gone * cut_into + size - 1) // (2 * size)
     return torch.stack([start.expand_as(cut), end.expand_as(cut), cut, cut_into], dim=-1)
-
-
-def _name(
-    steps: Int[Tensor, "point 3"],
-    slid: Int[Tensor, "member point 4"],
-    cuts: _Cuts,
-    members: Int[Tensor, " member"],
-    inner_start: Int[Tensor, " member"],
-) -> Int[Tensor, "member point"]:
-    """Number points so that facets agree: corners, then cuts of edges, then insides."""
-    start_slot, end_slot, cut, pieces = slid.unbind(dim=-1)
-    start = cuts.corner[members].gather(1, start_slot)
-    edge = cuts.edge[members].gather(1, 3 - start_slot - end_slot)
-    from_lower = torch.where(start == cuts.edges[edge, 0], cut, pieces - cut)
-    named = cuts.named(edge, from_lower)
-    inner: Bool[Tensor, " point"] = (steps > 0).all(dim=1)
-    return torch.where(inner, inner_start[:, None] + inner.cumsum(dim=0) - 1, named)

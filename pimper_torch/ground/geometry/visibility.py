@@ -114,8 +114,10 @@ class RayCaster:
     def _near(self, points: Vectors) -> Vectors:
         return points if self._origin is None else points - self._origin.to(points)
 
-    def _rays(self, origins: Places, directions: Vectors) -> tuple[Rows, Rows]:
-        return _as_rows(self._near(origins).expand_as(directions)), _as_rows(directions)
+    def _rays(self, origins: Places, directions: Vectors) -> tuple[Rows, ...]:
+        both = self._near(origins).expand_as(directions), directions
+        rows = (one.detach().to("cpu", torch.float32).reshape(-1, 3).numpy() for one in both)
+        return tuple(map(np.ascontiguousarray, rows))
 
     def occluded(
         self, points: Vectors, center: Float[Tensor, " 3"], tolerance: float | Lengths
@@ -197,8 +199,3 @@ def _reaches(reach: Lengths, shape: torch.Size) -> Rows:
     far = reach.detach().expand(shape).reshape(-1).to("cpu", torch.float32)
     # embree's own word for infinity
     return far.clamp(0, 1e37).contiguous().numpy()
-
-
-def _as_rows(vectors: Vectors) -> Rows:
-    rows = vectors.detach().to("cpu", torch.float32).reshape(-1, 3)
-    return np.ascontiguousarray(rows.numpy())

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 from torch import nn
 
@@ -96,17 +96,6 @@ class Step(Record):
         return self.heights.patches.coarse
 
 
-@runtime_checkable
-class AddsPoints(Protocol):
-    """Structure from motion that finds points for known cameras, too.
-
-    A stage ``reconstruct`` without this method leaves scenes as they are.
-    """
-
-    def with_points(self, scene: SparseScene) -> SparseScene:
-        """Triangulate points for a scene whose views observe hardly any, its cameras held fixed."""
-
-
 class Chain(Stage):
     """A graph of stages from photographs to a mesh.
 
@@ -176,7 +165,8 @@ class Chain(Stage):
         """Return photographs with their cameras: those that come with them, or else find them.
 
         Views that cannot be used are left out; priors become those of undistorted views. A scene
-        without observed points gets some, unless a mesh stands in for them. Masks that belong to
+        without observed points gets some by the method ``with_points`` of ``reconstruct``, if that
+        has one, unless a mesh stands in for them. Masks that belong to
         other photographs, or are turned or inverted, are read as cameras and points say, and
         cameras are found anew with them, unless they are ``checked``.
         """
@@ -190,8 +180,8 @@ class Chain(Stage):
             )
         elif mesh is not None:
             refuse_other_axes(mesh, views)
-        elif isinstance(self.reconstruct, AddsPoints):
-            views = self.reconstruct.with_points(views)
+        elif with_points := getattr(self.reconstruct, "with_points", None):
+            views = with_points(views)
         few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
         scene = with_poses(sound(run(depth_points, views) if few else views))
         scene = with_undistorted_priors(scene)

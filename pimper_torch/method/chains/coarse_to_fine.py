@@ -37,7 +37,6 @@ from pimper_torch.records import (
     CoarseMesh,
     Mesh,
     OrientedPoints,
-    PatchSet,
     PatchViews,
     PhotometricPatches,
     Silhouettes,
@@ -156,7 +155,9 @@ class CoarseToFine(Chain):
                     light = run(self.light, seen)
                     del seen
             if surface is None:
-                by_blocks = self._by_blocks(patches)
+                limit, scales = bytes_of(self.config.max_memory), self.config.scales
+                most = largest_problem(limit, patches, scales[0], scales[-1])
+                by_blocks = () if math.isinf(most) else (most,)  # vertices solved for at once
             heights = run(photometric, scene.views, cameras, patches, light, sources)
             heights = heights.replace(photometric=run(self.gauge, heights.photometric))
             if last:
@@ -175,9 +176,3 @@ class CoarseToFine(Chain):
             )
             if not last:
                 coarse = run(self.remesh, heights, surface, contours)
-
-    def _by_blocks(self, patches: PatchSet) -> tuple[float, ...]:
-        """Return how many vertices the fusion may solve for at once, if memory limits it."""
-        limit, scales = bytes_of(self.config.max_memory), self.config.scales
-        most = largest_problem(limit, patches, scales[0], scales[-1])
-        return () if math.isinf(most) else (most,)

@@ -52,8 +52,7 @@ def refine_tracks(
     gray = views.replace(images=by_view(_gray, views.images.detach()))
     for left in reversed(range(rounds)):
         some = longest_tracks(model, _PILOTS) if left else model
-        found, pinholes = _sighted(gray, some)
-        renewed, aligned = _renewed(some, found, pinholes)
+        renewed, aligned = _renewed(gray, some)
         if not bool(aligned.any()):
             return model
         tied, leading, scale = _adjusted(renewed, aligned, cameras=cameras)
@@ -76,7 +75,7 @@ def found_again(views: Views, model: SparseModel) -> SparseModel:
     Poses, lenses and places of points are as they were.
     """
     gray = views.replace(images=by_view(_gray, views.images.detach()))
-    renewed, aligned = _renewed(model, *_sighted(gray, model))
+    renewed, aligned = _renewed(gray, model)
     return renewed.without(~aligned)
 
 
@@ -86,8 +85,8 @@ def _gray(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "1 heig
     return torch.where(brightest >= SATURATED, brightest, image.mean(dim=0, keepdim=True))
 
 
-def _sighted(views: Views, model: SparseModel) -> tuple[tracks.TrackObservations, Cameras]:
-    """Find the points in undistorted photographs, which are held no longer than that."""
+def _renewed(views: Views, model: SparseModel) -> tuple[SparseModel, Bool[Tensor, " observation"]]:
+    """Replace features by track observations, and find which observations are such."""
     raster = (views.num_views, *views.images.shape[-2:])
     pictures = tracks.log_pictures(undistorted(views, model.lenses), raster)
     cameras = Cameras(
@@ -96,13 +95,8 @@ def _sighted(views: Views, model: SparseModel) -> tuple[tracks.TrackObservations
         sizes_px=views.sizes_px.cpu(),
     )
     planes = tracks.tangents(model.points_world, model.observed, cameras)
-    return tracks.sight(pictures, cameras, planes), cameras
-
-
-def _renewed(
-    model: SparseModel, found: tracks.TrackObservations, cameras: Cameras
-) -> tuple[SparseModel, Bool[Tensor, " renewed"]]:
-    """Replace features by track observations; tell which observations are track observations."""
+    found = tracks.sight(pictures, cameras, planes)
+    del pictures  # as large as the photographs
     often = torch.bincount(found.point, minlength=len(model.points_world)) >= 3
     kept = often[found.point]
     point, view = found.point[kept], found.view[kept]

@@ -48,7 +48,13 @@ def global_descriptors(
     each = -(-40_000 // count)
     learned = torch.cat([_some(descriptors(number), each) for number in range(count)])
     words = vocabulary(learned, _WORDS)
-    return torch.stack([_aggregated(descriptors(number), words) for number in range(count)])
+    vectors = []
+    for number in range(count):
+        own = descriptors(number)
+        word = _nearest(own, words)
+        sums = torch.zeros_like(words).index_add(0, word, own - words[word]).flatten()
+        vectors.append(normalize(sums.sign() * sums.abs().sqrt(), dim=0))
+    return torch.stack(vectors)
 
 
 def vocabulary(descriptors: Descriptors, count: int) -> Float[Tensor, "word length"]:
@@ -82,11 +88,3 @@ def _some(descriptors: Descriptors, most: int) -> Descriptors:
 
 def _nearest(descriptors: Descriptors, words: Float[Tensor, "word length"]) -> Tensor:
     return (descriptors @ words.mT - words.square().sum(dim=1) / 2).argmax(dim=1)
-
-
-def _aggregated(
-    descriptors: Descriptors, words: Float[Tensor, "word length"]
-) -> Float[Tensor, " word_length"]:
-    word = _nearest(descriptors, words)
-    sums = torch.zeros_like(words).index_add(0, word, descriptors - words[word]).flatten()
-    return normalize(sums.sign() * sums.abs().sqrt(), dim=0)

@@ -111,10 +111,6 @@ def require_agreement(
     right cameras most of them lie on these cameras' epipolar lines and in front of both; with wrong
     ones a few do by chance.
 
-    Args:
-        verified: Matches that an epipolar geometry of their own explains.
-        max_error_px: Distance from epipolar lines up to which a match is explained.
-
     Raises:
         InputError: Half of the matches are not explained.
     """

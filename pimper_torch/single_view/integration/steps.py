@@ -135,12 +135,8 @@ def perspective_steps(
 
 
 def _between_planes(first: Scalars, second: Scalars, unit: float) -> tuple[Scalars, Scalars]:
-    """Return the step between tangent planes, and the rotation between them.
-
-    Args:
-        unit: One over the focal length; 0 for parallel rays.
-    """
-    if unit == 0:
+    """Return the step between tangent planes, and the rotation between them."""
+    if unit == 0:  # parallel rays; else one over the focal length
         return (first + second) / 2, second - first
     # With r_m half-way, n . r_m / n . r_a = 1 - (slope at a) unit / 2.
     ahead = (1 + unit / 2 * second).clamp_min(_GRAZING).log()
