@@ -47,7 +47,7 @@ def found_in(keypoints, verified, outside):
 def test_series_are_told_apart_and_tied_by_the_object_alone(generator):
     keypoints, num_object = photographed(SERIES, generator)
     moved = found(SERIES, keypoints, num_object)
-    assert moved.moved
+    assert moved.series.any()
     assert tuple(moved.series.tolist()) == SERIES
     pairs, _ = matched(SERIES, num_object, len(keypoints[0]))
     between = {pair for pair in pairs if SERIES[pair[0]] != SERIES[pair[1]]}
@@ -69,14 +69,14 @@ def test_the_object_is_the_body_in_the_middle_though_it_shows_more_features(gene
 def test_a_rigid_scene_is_one_series_though_a_second_geometry_fits_what_the_first_leaves(generator):
     keypoints, num_object = photographed((0,) * 12, generator)
     moved = found(SERIES, keypoints, num_object)  # matched as if there were two
-    assert not moved.moved
+    assert not moved.series.any()
     assert not moved.tying
     assert not moved.dropped
 
 
 def test_few_pairs_of_two_bodies_are_no_evidence(generator):
     keypoints, _ = photographed(SERIES, generator)
-    assert not found(SERIES, keypoints, 29).moved  # fewer than a second body needs
+    assert not found(SERIES, keypoints, 29).series.any()  # fewer than a second body needs
 
 
 def test_a_pair_that_shows_the_table_alone_does_not_tie_series(generator):

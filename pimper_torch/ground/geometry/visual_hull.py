@@ -320,8 +320,8 @@ def _voted(
             looks = (depth > 0) & (value < _UNSEEN / 1e3)
             distance[view] = torch.where(looks, value * (depth / focal[view]), _UNSEEN)
         chosen = torch.empty(2, *shape)
-        rows = (one.flatten(1).cpu().numpy() for one in (distance, word))
-        vote(*rows, _UNSEEN, *fractions, chosen.flatten(1).numpy())
+        rows = [one.flatten(1).cpu().numpy() for one in (distance, word)]
+        vote(rows[0], rows[1], _UNSEEN, *fractions, chosen.flatten(1).numpy())
         return chosen.to(distance)
 
     slabs = list(side_by_side(of_slab, torch.split(reach[0], slab), tracked=False))

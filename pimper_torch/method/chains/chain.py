@@ -171,6 +171,8 @@ class Chain(Stage):
         cameras are found anew with them, unless they are ``checked``.
         """
         asked = views
+        with_points: Callable[[SparseScene], SparseScene] | None
+        with_points = getattr(self.reconstruct, "with_points", None)
         if isinstance(views, Views):
             views = run(self.reconstruct, views, sparse_model)
         elif sparse_model is not None:
@@ -180,7 +182,7 @@ class Chain(Stage):
             )
         elif mesh is not None:
             refuse_other_axes(mesh, views)
-        elif with_points := getattr(self.reconstruct, "with_points", None):
+        elif with_points is not None:
             views = with_points(views)
         few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
         scene = with_poses(sound(run(depth_points, views) if few else views))

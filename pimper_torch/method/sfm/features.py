@@ -1,10 +1,9 @@
 """SIFT features of photographs, found by COLMAP on the CPU."""
 
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -52,12 +51,6 @@ class Workspace:
     def database(self) -> Path:
         """COLMAP's database."""
         return self.folder / self.database_name
-
-    def with_copied_database(self, name: str) -> "Workspace":
-        """Copy the database to another file of the folder, for matches of another hypothesis."""
-        copied = replace(self, database_name=name)
-        shutil.copyfile(self.database, copied.database)
-        return copied
 
 
 @contextmanager

@@ -52,11 +52,6 @@ class MovedObject(Record):
     dropped: tuple[PhotographPair, ...] = ()
     around: Matches = field(default_factory=dict)
 
-    @property
-    def moved(self) -> bool:
-        """True where there is more than one series."""
-        return bool((self.series > 0).any())
-
 
 def find_moved_object(
     keypoints: Keypoints,
@@ -76,12 +71,14 @@ def find_moved_object(
     """
     whole = MovedObject(series=torch.zeros(len(keypoints), dtype=torch.long))
     many = {pair: rows for pair, rows in outside.items() if len(rows) >= _MIN_SECOND}
-    seconds = {
-        pair: second
-        for pair, second in verify(many).items()
-        if len(second) >= max(_MIN_SECOND, _MIN_FRACTION * len(many[pair]))
-        and _contradict(keypoints, pair, verified[pair], second, max_error_px)
-    }
+    seconds = {}
+    for pair, second in verify(many).items():
+        if len(second) >= max(_MIN_SECOND, _MIN_FRACTION * len(many[pair])):
+            ends = [matching.pixels_of(keypoints, pair, rows) for rows in (verified[pair], second)]
+            shared = shared_geometry(*ends, max_error_px)
+            far = [(sampson_errors(shared, *each) > max_error_px).double().mean() for each in ends]
+            if float(torch.stack(far).amax()) > 0.2:  # no geometry explains both
+                seconds[pair] = second
     if len(seconds) < 3:  # a thing that a person moved between two photographs shows in few
         return whole
     votes = object_votes(keypoints, sizes_px, verified, seconds)
@@ -93,8 +90,8 @@ def find_moved_object(
         if series[pair[0]] != series[pair[1]]:
             counts = _counts(votes, pair, rows)
             if counts[0] <= counts[1]:
-                ends = (votes[view][outside[pair][:, side]] for side, view in enumerate(pair))
-                around_it[pair] = outside[pair][torch.stack(list(ends)).amin(dim=0) >= 0]
+                cast = [votes[view][outside[pair][:, side]] for side, view in enumerate(pair)]
+                around_it[pair] = outside[pair][torch.stack(cast).amin(dim=0) >= 0]
             elif pair in seconds:
                 own[pair] = rows  # without a second geometry it stays as it is
     own |= verify({pair: rows for pair, rows in around_it.items() if pair not in seconds})
@@ -174,16 +171,6 @@ def clusters(weight: Float[Tensor, "view view"]) -> Int[Tensor, " view"]:
         weight[kept] += weight[gone]
         weight[:, kept] += weight[:, gone]
         weight[gone] = weight[:, gone] = 0
-
-
-def _contradict(
-    keypoints: Keypoints, pair: PhotographPair, first: Rows, second: Rows, max_error_px: float
-) -> bool:
-    """Return whether no geometry explains both sets of matches."""
-    ends = [matching.pixels_of(keypoints, pair, rows) for rows in (first, second)]
-    shared = shared_geometry(ends[0], ends[1], max_error_px)
-    far = [(sampson_errors(shared, *each) > max_error_px).double().mean() for each in ends]
-    return float(torch.stack(far).amax()) > 0.2
 
 
 def _total(votes: Sequence[Tensor], pair: PhotographPair, rows: Rows) -> Float[Tensor, " match"]:
@@ -295,7 +282,7 @@ def with_series(
         caution(
             f"The object was moved on what it stands on, between {len(groups)} series of "
             f"photographs: {listed}. Between them only the object's features are matched, and the "
-            "cameras of all stand round the object.",
+            "cameras of all are around the object.",
             stacklevel=4,
         )
         return model.replace(series=numbers)

@@ -6,6 +6,7 @@ rest before a turning object is looked for, and an object that was moved on its 
 is taken if it explains clearly more of its verified matches.
 """
 
+import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -146,7 +147,8 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     thorough pass those of missing or misplaced photographs with all others.
     """
     match_pairs(space, pairs_to_match(space), settings)
-    other = space.with_copied_database("other.db")
+    other = replace(space, database_name="other.db")  # for matches of another hypothesis
+    shutil.copyfile(space.database, other.database)
     plain = _registered(space, settings)
     if plain.sound:
         return plain

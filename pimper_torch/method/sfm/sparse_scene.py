@@ -1,6 +1,5 @@
 """From a sparse model and the photographs to the scene, and back to COLMAP's files."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -132,7 +131,17 @@ def sound(scene: SparseScene) -> SparseScene:
         lost = f"{int((~finite).sum())} of {len(finite)}"
         skipped(_failure("points", lost, "their coordinates are not finite", "They are left out"))
         scene = with_points(scene, finite)
-    reasons = dict(_unusable(scene))
+    reasons: dict[int, str] = {}
+    masks = scene.views.masks
+    for view, (image, shown) in enumerate(each(scene.views.images, scene.views.inside)):
+        lit = ((image > 0) & (image < SATURATED)).any(dim=0) & shown  # false for NaN
+        reason = _nowhere(scene, view)
+        if not reason and not bool(lit.any()):
+            reason = "it is black, saturated or not finite all over"
+        elif not reason and masks is not None and not bool((lit & masks[view]).any()):
+            reason = "its mask is empty, or shows nothing that is lit"
+        if reason:
+            reasons[view] = reason
     unusable = [scene.views.names[view] for view in reasons]
     leave_out("sfm.sound_views", len(unusable), total=scene.views.num_views, names=unusable)
     if not reasons:
@@ -151,19 +160,6 @@ def sound(scene: SparseScene) -> SparseScene:
 
 def _failure(what: str, name: str, reason: str, done: str) -> Failure:
     return Failure(stage="cameras", what=what, name=name, reason=reason, done=done)
-
-
-def _unusable(scene: SparseScene) -> Iterator[tuple[int, str]]:
-    masks = scene.views.masks
-    for view, (image, shown) in enumerate(each(scene.views.images, scene.views.inside)):
-        lit = ((image > 0) & (image < SATURATED)).any(dim=0) & shown  # false for NaN
-        reason = _nowhere(scene, view)
-        if not reason and not bool(lit.any()):
-            reason = "it is black, saturated or not finite all over"
-        elif not reason and masks is not None and not bool((lit & masks[view]).any()):
-            reason = "its mask is empty, or shows nothing that is lit"
-        if reason:
-            yield view, reason
 
 
 def _nowhere(scene: SparseScene, view: int) -> str:

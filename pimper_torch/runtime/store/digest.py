@@ -87,8 +87,14 @@ def _described(value: object) -> object:
     if isinstance(value, types.FunctionType | nn.Module):
         if not is_known(value.__module__):
             raise _UnknownError
-        held = _held(value) if isinstance(value, nn.Module) else _named(value)
-        return [kind, code(), _described(held)]
+        if isinstance(value, types.FunctionType):
+            return [kind, code(), _named(value)]
+        own = {
+            name: held
+            for name, held in vars(value).items()
+            if not name.startswith("_") and name != "training"
+        }
+        return [kind, code(), _described(own | value._parameters | value._buffers | value._modules)]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [field.name for field in dataclasses.fields(value) if field.compare]
         return [kind, *((name, _described(getattr(value, name))) for name in fields)]
@@ -97,16 +103,6 @@ def _described(value: object) -> object:
     if isinstance(value, tuple | list):
         return [kind, *map(_described, value)]
     raise _UnknownError
-
-
-def _held(module: nn.Module) -> dict[str, object]:
-    """Return what a module is made with, without what every module has."""
-    own = {
-        name: value
-        for name, value in vars(module).items()
-        if not name.startswith("_") and name != "training"
-    }
-    return own | module._parameters | module._buffers | module._modules
 
 
 def _named(thing: type | types.FunctionType) -> str:
