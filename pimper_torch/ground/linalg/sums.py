@@ -4,7 +4,7 @@ Torch gives each thread a part of a long sum, so that the order of additions, an
 bits, depend on how many there are.
 """
 
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -35,3 +35,18 @@ def along_last(values: Float[Tensor, "*batch item"]) -> Scalars:
 def average(values: Float[Tensor, "*shape"]) -> Scalar:
     """Return the mean of all values, summed as by :func:`total`; NaN where there are none."""
     return total(values) / values.numel()
+
+
+def sum_at(
+    index: Int[Tensor, " entry"], values: Shaped[Tensor, "entry ..."], count: int
+) -> Shaped[Tensor, "group ..."]:
+    """Sum the values of each of some groups; 0 for a group without any. Differentiable.
+
+    Args:
+        index: The group of each value, below ``count``.
+
+    >>> import torch
+    >>> sum_at(torch.tensor([2, 0, 2]), torch.tensor([1.0, 2.0, 3.0]), 3)
+    tensor([2., 0., 4.])
+    """
+    return values.new_zeros(count, *values.shape[1:]).index_add(0, index, values)

@@ -243,29 +243,18 @@ def agreeing(
     there = nearest_pixels(inverse_depth[others], grid)
     valid = nearest_pixels(good[others].to(there), grid) > 0.5
     expected = known / ratio.clamp_min(1e-6)
-    # To first order, so that rounding to the source's nearest pixel does not count.
-    rate = _pixels_per_inverse_depth(level, view, others, pixels, there)
-    error = (there - expected).abs() * rate
-    count[chosen] = (valid & (ratio > 0) & (error <= _MAX_ERROR_PX)).sum(dim=0)
-    return count
-
-
-def _pixels_per_inverse_depth(
-    level: MatchingLevel,
-    view: int,
-    others: Int[Tensor, " other"],
-    pixels: Float[Tensor, "other 2 point"],
-    inverse_depth: Float[Tensor, "other point"],
-) -> Float[Tensor, "other point"]:
+    # Pixels that an error of inverse depth moves by, to first order, so that rounding to the
+    # source's nearest pixel does not count.
     rotation, shift = pixels_from_pixels(level.cameras, view, others)
     shift = shift.to(pixels)[:, :, None]
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
-    ray = torch.einsum("oij,ojp->oip", rotation.to(pixels), homogeneous)
-    at = ray + inverse_depth[:, None] * shift
+    at = torch.einsum("oij,ojp->oip", rotation.to(pixels), homogeneous) + there[:, None] * shift
     depth = at[:, 2:].clamp_min(1e-6)
     rate = (shift[:, :2] - at[:, :2] / depth * shift[:, 2:]) / depth
     # The norm over an inner axis takes twenty times as long.
-    return torch.hypot(rate[:, 0], rate[:, 1])
+    error = (there - expected).abs() * torch.hypot(rate[:, 0], rate[:, 1])
+    count[chosen] = (valid & (ratio > 0) & (error <= _MAX_ERROR_PX)).sum(dim=0)
+    return count
 
 
 def filled(maps: DepthMaps, view: int) -> Map:

@@ -16,7 +16,7 @@ from pimper_torch.ground.geometry.lens_models import photographed
 from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.ground.geometry.supporting_plane import fixation
-from pimper_torch.ground.shapes import Mask, Pixels, Points, Scalar
+from pimper_torch.ground.shapes import Mask, Pixels, Points
 from pimper_torch.method.coarse.densify import DepthMaps, agreeing, depth_maps, nearest_pixels
 from pimper_torch.method.coarse.window_matching import Matcher, pair
 from pimper_torch.records import Cameras, SparseScene, Views
@@ -115,18 +115,14 @@ def _along_rays(cameras: Cameras, views: Views, view: int) -> Points:
     if views.masks is not None:
         column, row = pixels.long().unbind(dim=1)
         pixels = pixels[views.masks[view][row, column]]
-    distance = _distance(cameras, view)
-    inverse = torch.linspace(1 / _FARTHEST, 1 / _NEAREST, _STEPS).to(pixels) / distance
-    rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
-    center = cameras.centers_world[view]
-    return (center + rays[:, None] / inverse[:, None]).reshape(-1, 3)
-
-
-def _distance(cameras: Cameras, view: int) -> Scalar:
-    """Return distance to the point nearest to all optical axes, or else to the other cameras."""
+    # To the point nearest to all optical axes, or else to the other cameras.
     poses, centers = cameras.cam_from_world, cameras.centers_world
-    ahead = (fixation(poses).fixation_world - centers[view]) @ poses[view, 2, :3]
-    return ahead if ahead > 0 else (centers - centers[view]).norm(dim=1).max()
+    distance = (fixation(poses).fixation_world - centers[view]) @ poses[view, 2, :3]
+    if distance <= 0:
+        distance = (centers - centers[view]).norm(dim=1).max()
+    inverse = torch.linspace(1 / _FARTHEST, 1 / _NEAREST, _STEPS).to(pixels) / distance
+    rays = rays_through(pixels, poses[view], cameras.intrinsics[view])
+    return (centers[view] + rays[:, None] / inverse[:, None]).reshape(-1, 3)
 
 
 def _framed(
@@ -151,7 +147,11 @@ def _points_of(
 
     In views whose own map agrees, it says where; in others that look alike there, this map does.
     """
-    chosen = _spread(maps.agreed[view] > 0)
+    valid = maps.agreed[view] > 0
+    step = max(1, math.ceil(math.sqrt(int(valid.sum()) / _MOST)))
+    chosen = torch.zeros_like(valid)
+    chosen[step // 2 :: step, step // 2 :: step] = True
+    chosen &= valid
     row, column = chosen.nonzero(as_tuple=True)
     own = torch.stack([column, row], dim=1).to(maps.inverse_depth) + 0.5
     count = scene.cameras.num_views
@@ -181,14 +181,6 @@ def _in_source(
     agrees = agrees & (by_source > 0)
     pixels, _ = rays.look(torch.where(agrees, by_source, field[chosen]))
     return pixels[0].mT, agrees | alike
-
-
-def _spread(valid: Mask) -> Mask:
-    """Keep pixels of a coarser raster, so that about so many are left."""
-    step = max(1, math.ceil(math.sqrt(int(valid.sum()) / _MOST)))
-    kept = torch.zeros_like(valid)
-    kept[step // 2 :: step, step // 2 :: step] = True
-    return valid & kept
 
 
 def _with(

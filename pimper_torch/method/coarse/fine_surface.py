@@ -98,7 +98,8 @@ def fine_surface(
         level = maps.level
     else:
         factor = factors(max(part.views.images.shape[-2:]), levels)[-1]
-        pixel = factor * oriented.pixel_size_at(centre, scene.cameras)
+        distance = (scene.cameras.centers_world - centre).norm(dim=1)
+        pixel = factor * float((distance / scene.cameras.intrinsics[:, 0, 0]).median())
         level = level_of(part, factor)
     if more is not None:
         cloud = OrientedPoints.cat([cloud, oriented.thinned(more, pixel)])

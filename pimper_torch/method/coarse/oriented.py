@@ -11,10 +11,11 @@ from torch.nn.functional import adaptive_avg_pool2d, max_pool2d, normalize
 
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.ground.linalg.sums import sum_at
 from pimper_torch.ground.shapes import Map, Mask, Points
 from pimper_torch.method.coarse.densify import DepthMaps, depth_maps
 from pimper_torch.method.coarse.window_matching import RADIUS, shifted
-from pimper_torch.records import Cameras, OrientedPoints, SparseScene
+from pimper_torch.records import OrientedPoints, SparseScene
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import zeros
 from pimper_torch.runtime.parallel import side_by_side
@@ -222,8 +223,7 @@ def _of_slab(
     weight = 1 / cloud.noise.double().clamp_min(1e-12).square()
 
     def summed(values: Float[Tensor, "point channel"]) -> Float[Tensor, "cell channel"]:
-        total = torch.zeros(len(counts), values.shape[1], dtype=torch.double, device=values.device)
-        return total.index_add(0, index, weight[:, None] * values.double())
+        return sum_at(index, weight[:, None] * values.double(), len(counts))
 
     total = summed(torch.ones_like(points[:, :1]))
     return OrientedPoints(
@@ -291,15 +291,9 @@ def sparse_oriented(
     width, axes = torch.linalg.eigh(steps.mT @ steps / steps.shape[1])
     normals = axes[:, :, 0].to(points)
     flat = (width[:, 0] < _FLAT**2 * width[:, 1]).to(points.device)
-    towards = torch.zeros_like(scene.points_world).index_add(
-        0,
-        scene.observation_point,
-        normalize(
-            scene.cameras.centers_world[scene.observation_view]
-            - scene.points_world[scene.observation_point],
-            dim=-1,
-        ),
-    )[index]
+    point, view = scene.observation_point, scene.observation_view
+    rays = normalize(scene.cameras.centers_world[view] - scene.points_world[point], dim=-1)
+    towards = sum_at(point, rays, len(scene.points_world))[index]
     facing = (normals * normalize(towards, dim=-1)).sum(dim=-1)
     cloud = OrientedPoints(
         points_world=points,
@@ -336,9 +330,3 @@ def pixel_size(scene: SparseScene, reliable: Int[Tensor, " reliable"]) -> float:
     frames = scene.cameras.cam_from_world[view]
     depth = (frames[:, 2, :3] * scene.points_world[point]).sum(dim=-1) + frames[:, 2, 3]
     return float((depth / scene.cameras.intrinsics[view, 0, 0]).median())
-
-
-def pixel_size_at(point: Float[Tensor, " 3"], cameras: Cameras) -> float:
-    """Return the size of a photograph's pixel at a point; the median over views."""
-    distance = (cameras.centers_world - point).norm(dim=1)
-    return float((distance / cameras.intrinsics[:, 0, 0]).median())

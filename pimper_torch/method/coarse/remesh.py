@@ -7,7 +7,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths, unit_face_normals
 from pimper_torch.ground.geometry.topology import face_edges, vertex_fans
-from pimper_torch.ground.linalg.sums import total
+from pimper_torch.ground.linalg.sums import sum_at, total
 from pimper_torch.ground.shapes import Edges, FaceMask, Faces, PerFacet, Vertices
 from pimper_torch.method.coarse import splitting
 from pimper_torch.method.coarse.coarse_config import RemeshConfig
@@ -92,15 +92,25 @@ def remesh(
     the surface's and the old mesh's; which facets are split, dropped or moved is constant.
     """
     config = config or RemeshConfig()
-    _require_subdivision(coarse, surface)
-    old = coarse.mesh.vertices_world
-    faces = coarse.mesh.faces
+    old, faces = coarse.mesh.vertices_world, coarse.mesh.faces
+    found = int(surface.facet.max()) + 1 if len(surface.facet) else 0
+    if found == 0 or found > len(faces):
+        raise InputError(
+            f"remesh: the surface is on {found} facets, the coarse mesh has {len(faces)}; needed: "
+            "the surface that was made on this mesh. Give the two of the same round."
+        )
     edges, face_edge = face_edges(faces)
     corners, centres = _on_surface(old, faces, edges, face_edge, surface)
     with torch.no_grad():
         kept = _with_data(old, faces, surface, seen, config.max_hole)
         leave_out("remesh.data", ~kept, at=(old, faces))
-        severity = _severity(corners, faces, surface, spacing, residual, config)
+        severity = departures(corners, faces, surface) / (config.max_departure * spacing)
+        spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
+        severity = torch.maximum(severity, spread.to(severity))
+        if residual is not None:
+            typical = residual.nanmedian()
+            relative = residual / torch.where(typical > 0, typical, torch.inf) / 3.0
+            severity = torch.maximum(severity, relative.nan_to_num(nan=0.0).to(severity))
         # Of the equilateral triangle of each facet's area.
         side = (2 / 3**0.5 * face_normals(corners, faces).norm(dim=1)).sqrt() / spacing
         small = (side < config.min_samples) | ~kept
@@ -116,16 +126,6 @@ def remesh(
     mesh = Mesh(vertices_world=positions[source], faces=new_faces)
     mesh = mesh.replace(normals_world=splitting.fitted_normals(mesh, surface, split, index))
     return splitting.with_points(coarse, mesh, split, index, source)
-
-
-def _require_subdivision(coarse: CoarseMesh, surface: Surface) -> None:
-    count = len(coarse.mesh.faces)
-    found = int(surface.facet.max()) + 1 if len(surface.facet) else 0
-    if found == 0 or found > count:
-        raise InputError(
-            f"remesh: the surface lies on {found} facets, the coarse mesh has {count}; needed: the "
-            "surface that was made on this mesh. Hand over the two of the same round."
-        )
 
 
 def _on_surface(
@@ -181,25 +181,6 @@ def _with_data(
     return known | enclosed_holes(vertices, faces, known, max_hole * float(total(area)))
 
 
-def _severity(
-    corners: Vertices,
-    faces: Faces,
-    surface: Surface,
-    spacing: float,
-    residual: Float[Tensor, " face"] | None,
-    config: RemeshConfig,
-) -> Float[Tensor, " face"]:
-    limit = config.max_departure * spacing
-    worst = departures(corners, faces, surface) / limit
-    spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
-    worst = torch.maximum(worst, spread.to(worst))
-    if residual is not None:
-        typical = residual.nanmedian()
-        relative = residual / torch.where(typical > 0, typical, torch.inf) / 3.0
-        worst = torch.maximum(worst, relative.nan_to_num(nan=0.0).to(worst))
-    return worst
-
-
 def departures(vertices: Vertices, faces: Faces, surface: Surface) -> Float[Tensor, " face"]:
     """Return the 90th percentile of the surface's distances from each facet's plane."""
     normals = unit_face_normals(vertices, faces)
@@ -217,10 +198,9 @@ def departures(vertices: Vertices, faces: Faces, surface: Surface) -> Float[Tens
 def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
     """Return the root mean square angle between the surface's normals and their facet's mean."""
     weight = splitting.normal_weights(surface.information)
-    total = weight.new_zeros(count, 3)
-    total = total.index_add(0, surface.facet, weight[:, None] * surface.normals_world)
-    mass = weight.new_zeros(count).index_add(0, surface.facet, weight)
-    length = total.norm(dim=1) / torch.where(mass > 0, mass, 1)
+    summed = sum_at(surface.facet, weight[:, None] * surface.normals_world, count)
+    mass = sum_at(surface.facet, weight, count)
+    length = summed.norm(dim=1) / torch.where(mass > 0, mass, 1)
     # Of small angles a from the mean, 1 - cos(a) is a^2 / 2.
     return torch.where(mass > 0, (2 * (1 - length)).clamp_min(0).sqrt(), 0)
 

@@ -19,7 +19,7 @@ from torch.nn.functional import normalize
 from pimper_torch.ground.geometry.surfaces import barycentric_2d, vertex_normals
 from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.ground.linalg.sparse import SparseCholesky
-from pimper_torch.ground.linalg.sums import average
+from pimper_torch.ground.linalg.sums import average, sum_at
 from pimper_torch.ground.shapes import FaceMask, Faces, PerVertex, Points, Vertices
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Record, Surface
 
@@ -180,13 +180,11 @@ def fitted_normals(mesh: Mesh, surface: Surface, split: Split, index: Children) 
     weight = normal_weights(surface.information[kept].double())[:, None] * barycentric
     normals = surface.normals_world[kept].double()
     # Facet by facet first: a million subdivided mesh vertices are a few thousand blocks.
-    zeros = barycentric.new_zeros(len(faces), 3, 3)
-    blocks = zeros.index_add(0, face, weight[:, :, None] * barycentric[:, None])
-    sums = zeros.index_add(0, face, weight[:, :, None] * normals[:, None])
-    diagonal = zeros.new_zeros(len(vertices)).index_add(
-        0, faces.flatten(), blocks.diagonal(dim1=1, dim2=2).flatten()
-    )
-    rhs = torch.zeros_like(vertices).index_add(0, faces.flatten(), sums.flatten(0, 1))
+    blocks = sum_at(face, weight[:, :, None] * barycentric[:, None], len(faces))
+    sums = sum_at(face, weight[:, :, None] * normals[:, None], len(faces))
+    squares = blocks.diagonal(dim1=1, dim2=2).flatten()
+    diagonal = sum_at(faces.flatten(), squares, len(vertices))
+    rhs = sum_at(faces.flatten(), sums.flatten(0, 1), len(vertices))
     # Negligible except where there is no data.
     damping = (0.01 * average(diagonal)).clamp_min(1e-12).expand(len(vertices))
     own = vertex_normals(vertices, faces)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 from torch.nn.utils.rnn import pad_sequence
@@ -20,6 +20,7 @@ from pimper_torch.ground.geometry.height_fields import intersect_height_field, s
 from pimper_torch.ground.geometry.rigid import rotate, transform
 from pimper_torch.ground.geometry.subdivision import Subdivision
 from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.ground.linalg.sums import sum_at
 from pimper_torch.ground.shapes import PerVertex, VertexMask, Vertices
 from pimper_torch.records import (
     CoarseMesh,
@@ -331,16 +332,16 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     vertex, height = estimates.vertex, estimates.height
     weight = estimates.weight * _agreement(estimates, count, outlier_samples)
     seen_weight = weight * estimates.known
-    total, seen = _sum_at(vertex, weight, count), _sum_at(vertex, seen_weight, count)
+    total, seen = sum_at(vertex, weight, count), sum_at(vertex, seen_weight, count)
     supported = total > _MIN_WEIGHT
     per_support = torch.where(supported, 1 / total.clamp_min(_MIN_WEIGHT), 0)
     by = weight[:, None]
-    certain, normals = _split(_sum_at(vertex, seen_weight[:, None] * estimates.normal, count))
-    swept, offsets = _split(_sum_at(vertex, by * estimates.offset, count))
-    guessed, prior_normals = _split(_sum_at(vertex, by * estimates.prior_normal, count))
-    told, prior_offsets = _split(_sum_at(vertex, by * estimates.prior_offset, count))
+    certain, normals = _split(sum_at(vertex, seen_weight[:, None] * estimates.normal, count))
+    swept, offsets = _split(sum_at(vertex, by * estimates.offset, count))
+    guessed, prior_normals = _split(sum_at(vertex, by * estimates.prior_normal, count))
+    told, prior_offsets = _split(sum_at(vertex, by * estimates.prior_offset, count))
     photometric = (seen > _MIN_WEIGHT) & (certain > 0)
-    colours = _sum_at(vertex, weight[:, None] * estimates.albedo, count)
+    colours = sum_at(vertex, weight[:, None] * estimates.albedo, count)
     observed = colours[:, 0] > _MIN_WEIGHT
     albedo = colours[:, 1:] / torch.where(observed, colours[:, 0], 1)[:, None]
     # Less is known of mean normals where patches know them for a fraction of the weight.
@@ -348,7 +349,7 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     unknown = (1 - known).clamp_min(0) / known.clamp_min(_MIN_WEIGHT)
     variance = math.radians(_UNKNOWN_NORMAL_DEG) ** 2
     return Blend(
-        heights=_sum_at(vertex, weight * height, count) * per_support,
+        heights=sum_at(vertex, weight * height, count) * per_support,
         supported=supported,
         normals_world=normalize(normals, dim=-1) * photometric[:, None],
         albedo=albedo * observed[:, None],
@@ -381,10 +382,10 @@ def _agreement(
         order = by_height[estimates.vertex[by_height].argsort(stable=True)]
         vertex, weight = estimates.vertex[order], estimates.weight[order].double()
         patches = torch.bincount(vertex, minlength=count)
-        total = _sum_at(vertex, weight, count)
+        total = sum_at(vertex, weight, count)
         running = weight.cumsum(0)
         before = (total.cumsum(0) - total)[vertex]
-        below = _sum_at(vertex, (running - before < total[vertex] / 2).long(), count)
+        below = sum_at(vertex, (running - before < total[vertex] / 2).long(), count)
         centre = (patches.cumsum(0) - patches + below.clamp_max((patches - 1).clamp_min(0)))[vertex]
         nearest = torch.empty_like(order)
         nearest[order] = order[centre]
@@ -394,9 +395,3 @@ def _agreement(
     beyond = (away.abs() - 1).clamp_min(0)
     leave_out("fuse.outvoted", many & (_DISTRUST * beyond.square() > 1))
     return torch.where(many, 1 / (1 + _DISTRUST * beyond.square()), 1)
-
-
-def _sum_at(
-    index: Int[Tensor, " entry"], values: Shaped[Tensor, "entry ..."], count: int
-) -> Shaped[Tensor, "vertex ..."]:
-    return values.new_zeros(count, *values.shape[1:]).index_add(0, index, values)

@@ -274,8 +274,15 @@ def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equa
 
     Differentiable; which face is nearest is constant.
     """
-    line = contacts.lines
-    hits = _above_or_below(caster, surface, contacts.points, line)
+    points, line = contacts.points, contacts.lines
+    # Where the line through each point meets the nearer of the faces on both sides.
+    ahead, behind = caster.cast(points, line), caster.cast(points, -line)
+    first = ahead.distance <= behind.distance
+    hits = Hits(
+        face=torch.where(first, ahead.face, behind.face),
+        distance=torch.where(first, ahead.distance, -behind.distance),
+        barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
+    ).refined(surface.points, surface.faces, points, line)
     lift = -hits.distance
     met = (hits.face >= 0) & (lift.abs() <= surface.reach)
     corners, fraction, line = surface.faces[hits.face[met]], hits.barycentric[met], line[met]
@@ -289,15 +296,3 @@ def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equa
         information=1 / variance.clamp_min(surface.finest**2),
         correlated=torch.ones_like(variance),
     )
-
-
-def _above_or_below(caster: RayCaster, surface: BaseSurface, points: Points, line: Points) -> Hits:
-    """Find where the line through each point meets the nearer of the faces on both sides."""
-    ahead, behind = caster.cast(points, line), caster.cast(points, -line)
-    first = ahead.distance <= behind.distance
-    nearer = Hits(
-        face=torch.where(first, ahead.face, behind.face),
-        distance=torch.where(first, ahead.distance, -behind.distance),
-        barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
-    )
-    return nearer.refined(surface.points, surface.faces, points, line)

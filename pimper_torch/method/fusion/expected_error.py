@@ -24,6 +24,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.subdivision import Subdivision
 from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.ground.linalg.sums import sum_at
 from pimper_torch.ground.linalg.systems import prepare
 from pimper_torch.ground.shapes import PerVertex, Scalar
 from pimper_torch.method.fusion.equations import Equations
@@ -88,9 +89,9 @@ def regions(subdivision: Subdivision) -> Int[Tensor, " facet"]:
     num_facets = int(subdivision.face_facet.max()) + 1
     count = torch.bincount(subdivision.facet, minlength=num_facets).clamp_min(1)[:, None]
     points = subdivision.points.double()
-    centre = points.new_zeros(num_facets, 3).index_add(0, subdivision.facet, points) / count
+    centre = sum_at(subdivision.facet, points, num_facets) / count
     areas = face_normals(points, subdivision.faces).norm(dim=1) / 2
-    area = areas.new_zeros(num_facets).index_add(0, subdivision.face_facet, areas)
+    area = sum_at(subdivision.face_facet, areas, num_facets)
     edge = (4 / math.sqrt(3) * area[area > 0].median()).sqrt()  # of an equilateral facet
     _, label = torch.unique((centre / (_REGION * edge)).floor(), dim=0, return_inverse=True)
     return label

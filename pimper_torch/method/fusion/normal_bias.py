@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.geometry.subdivision import Subdivision
+from pimper_torch.ground.linalg.sums import sum_at
 from pimper_torch.ground.linalg.systems import prepare
 from pimper_torch.ground.shapes import PerVertex, Scalar, VertexMask, Vertices
 from pimper_torch.method.fusion.equations import Common, Equations
@@ -48,10 +49,9 @@ class NormalBias(Record):
         size = int(facets.max()) + 1
         corner = facets.flatten()
         weight = self.count.repeat_interleave(3)
-        total = weight.new_zeros(size).index_add(0, corner, weight).clamp_min(1e-12)
-        summed = self.tilt.new_zeros(size, 3).index_add(
-            0, corner, (self.count[:, None] * self.tilt).repeat_interleave(3, dim=0)
-        )
+        total = sum_at(corner, weight, size).clamp_min(1e-12)
+        tilts = (self.count[:, None] * self.tilt).repeat_interleave(3, dim=0)
+        summed = sum_at(corner, tilts, size)
         return subdivision.interpolate(summed / total[:, None], facets)
 
 
@@ -75,10 +75,8 @@ def normal_bias(
     difference = torch.where(known[:, None], shape - normals, 0)
     size = difference.norm(dim=-1, keepdim=True)
     difference = difference * (most / size.clamp_min(most))
-    one = known.to(difference)
-    count = one.new_zeros(len(facets)).index_add(0, subdivision.facet, one)
-    summed = difference.new_zeros(len(facets), 3)
-    summed = summed.index_add(0, subdivision.facet, difference)
+    count = sum_at(subdivision.facet, known.to(difference), len(facets))
+    summed = sum_at(subdivision.facet, difference, len(facets))
     return NormalBias(tilt=summed / count.clamp_min(1)[:, None], count=count, known=count > 0)
 
 
@@ -101,8 +99,8 @@ def common_variance(
     size = int(facet.max()) + 1
     off = found.residual(heights)
     weight = found.information.to(off)
-    total = off.new_zeros(size).index_add(0, facet[vertex], weight)
-    mean = off.new_zeros(size).index_add(0, facet[vertex], weight * off)
+    total = sum_at(facet[vertex], weight, size)
+    mean = sum_at(facet[vertex], weight * off, size)
     used = torch.zeros_like(total, dtype=torch.bool).index_fill(0, otherwise, True) & (total > 0)
     square = (mean[used] / total[used]).square()
     # The median of the square of unit Gaussian noise.
@@ -122,21 +120,16 @@ class CoarsePart:
         self._subdivision, self._facets = subdivision, facets
         self._size = int(facets.max()) + 1
         fraction = subdivision.barycentric.double()
-        rows, cols, entries = [], [], []
-        for one in range(3):
-            for other in range(3):
-                rows.append(facets[:, one])
-                cols.append(facets[:, other])
-                product = fraction[:, one] * fraction[:, other]
-                sums = product.new_zeros(len(facets)).index_add(0, subdivision.facet, product)
-                entries.append(sums)
+        products = fraction[:, :, None] * fraction[:, None]
+        blocks = sum_at(subdivision.facet, products, len(facets))
+        rows, cols = facets.mT[:, None].expand(-1, 3, -1), facets.mT.expand(3, -1, -1)
         each = torch.arange(self._size, device=facets.device)
         # It only keeps corners without a vertex from being singular.
         damping = torch.full_like(each, 1e-3, dtype=fraction.dtype)
         self._normal = prepare(
-            torch.cat([each, *rows]),
-            torch.cat([each, *cols]),
-            torch.cat([damping, *entries]),
+            torch.cat([each, rows.flatten()]),
+            torch.cat([each, cols.flatten()]),
+            torch.cat([damping, blocks.permute(1, 2, 0).flatten()]),
             self._size,
             "the fusion's coarse shape",
         )

@@ -205,10 +205,8 @@ class PriorNormals(Term):
 
     def equations(self, problem: Problem) -> list[Equations]:
         """State the slopes, if anything was guessed."""
-        information, normals = (
-            problem.blend.prior_normal_information,
-            problem.blend.prior_normals_world,
-        )
+        information = problem.blend.prior_normal_information
+        normals = problem.blend.prior_normals_world
         edges = problem.edges[self._edges(problem)]
         if len(edges) == 0:
             return []

@@ -19,7 +19,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
-from pimper_torch.ground.shapes import Scalar
 from pimper_torch.method.photometry import light_models
 from pimper_torch.method.photometry.light_colour import exposures, light_colours
 from pimper_torch.method.photometry.light_field import LightField, harmonics, second_harmonics
@@ -163,7 +162,11 @@ def fit_light_field(
     groups = [samples.at((slice(None), slice(first, None, step))) for first in range(step)]
     name = _selected(groups[0], *geometry, iterations) if model == "auto" else model
     fits = [_lights(name, group, *geometry, iterations) for group in groups]
-    scales = [1.0, *(_ratio(each[2], fits[0][2]) for each in fits[1:])]
+    scales = [fits[0][2].new_ones(())]
+    for _, _, albedo, _ in fits[1:]:
+        both = (albedo > 0) & (fits[0][2] > 0)
+        ratio = albedo[both] / fits[0][2][both]
+        scales.append(ratio.median() if len(ratio) else scales[0])
     order = torch.cat([torch.arange(first, views, step) for first in range(step)]).argsort()
     lights, point_lights = (
         torch.cat([scale * each[part] for scale, each in zip(scales, fits, strict=True)])[order]
@@ -179,12 +182,6 @@ def fit_light_field(
         point_light=(point_lights / factor).to(radiance),
         closeness=closeness.to(radiance),
     )
-
-
-def _ratio(albedo: light_models.Albedo, other: light_models.Albedo) -> Scalar | float:
-    """Return the median ratio of two albedos where both are known; 1 where none is."""
-    both = (albedo > 0) & (other > 0)
-    return (albedo[both] / other[both]).median() if bool(both.any()) else 1.0
 
 
 def _lights(
