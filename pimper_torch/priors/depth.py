@@ -212,26 +212,25 @@ def _lines(
     count: int,
     offset: bool,
 ) -> Float[Tensor, "map 2"]:
-    """Fit :func:`_line` to each of ``count`` maps; NaN where too few points tell it."""
+    """Fit ``a values + b``, ``a`` at least 0, to each of ``count`` maps for small absolute errors.
+
+    Returns:
+        Factor and offset of each map; NaN where too few points show them.
+    """
     lines = values.new_full((count, 2), torch.nan)
     for one in torch.unique(maps).tolist():
-        here = maps == one
-        if int(here.sum()) >= _FEWEST:
-            lines[one] = _line(values[here], truth[here], offset=offset)
+        given, wanted = values[maps == one], truth[maps == one]
+        if len(given) < _FEWEST:
+            continue
+        weight = torch.ones_like(wanted)
+        for _ in range(_STEPS):
+            weight = weight / weight.sum()
+            means = [(weight * each).sum() * offset for each in (given, wanted)]
+            across, along = given - means[0], wanted - means[1]
+            squares = (weight * across.square()).sum().clamp_min(1e-300)
+            slope = ((weight * across * along).sum() / squares).clamp_min(0)
+            error = (along - slope * across).abs()
+            least = 1e-3 * float(error.median()) + 1e-12 * float(wanted.mean())
+            weight = 1 / error.clamp_min(least)
+        lines[one] = torch.stack([slope, means[1] - slope * means[0]])
     return lines
-
-
-def _line(
-    values: Float[Tensor, " point"], truth: Float[Tensor, " point"], *, offset: bool
-) -> Float[Tensor, "2"]:
-    """Fit ``a values + b``, ``a`` at least 0, for small absolute errors; return both."""
-    weight = torch.ones_like(truth)
-    for _ in range(_STEPS):
-        weight = weight / weight.sum()
-        means = [(weight * one).sum() * offset for one in (values, truth)]
-        across, along = values - means[0], truth - means[1]
-        squares = (weight * across.square()).sum().clamp_min(1e-300)
-        slope = ((weight * across * along).sum() / squares).clamp_min(0)
-        error = (along - slope * across).abs()
-        weight = 1 / error.clamp_min(1e-3 * float(error.median()) + 1e-12 * float(truth.mean()))
-    return torch.stack([slope, means[1] - slope * means[0]])

@@ -23,17 +23,13 @@ def settled(scene: SparseScene, silhouettes: Silhouettes | None = None) -> Spars
     if not scene.views.priors:
         return scene
     scene = with_undistorted_priors(scene)
-
-    names = scene.views.names
-
-    def decided(prior: Prior) -> Prior:
-        there = [index for index, name in enumerate(prior.names) if name in names]
-        if not there or not isinstance(prior, NormalPrior | DepthPrior):
-            return prior
-        prior = prior.take(there)
-        if isinstance(prior, NormalPrior):
-            return settled_normals(prior, scene, silhouettes)
-        return settled_depth(prior, scene)
-
-    priors = tuple(decided(prior) for prior in scene.views.priors)
-    return scene.replace(views=scene.views.replace(priors=priors))
+    priors: list[Prior] = []
+    for prior in scene.views.priors:
+        there = [index for index, name in enumerate(prior.names) if name in scene.views.names]
+        if there and isinstance(prior, NormalPrior):
+            priors.append(settled_normals(prior.take(there), scene, silhouettes))
+        elif there and isinstance(prior, DepthPrior):
+            priors.append(settled_depth(prior.take(there), scene))
+        else:
+            priors.append(prior)
+    return scene.replace(views=scene.views.replace(priors=tuple(priors)))

@@ -109,7 +109,13 @@ def load_views(
             drawn[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
         drop_pages()
     if has_masks and not opacities:
-        _tell_alpha(transparent, names, Path(folder))
+        holed = [name for name, one in zip(names, transparent, strict=True) if one is not None]
+        caution(
+            f"{folder}: {len(holed)} of {len(names)} photographs have transparent pixels "
+            f"({some(holed)}), which are taken for masks: opaque is the object. If that is wrong, "
+            "save them without transparency, or give masks by `--masks`.",
+            stacklevel=2,
+        )
     lit = _judge(images, drawn, sizes, names, Path(folder), masks)
     views = Views(
         images=images,
@@ -136,16 +142,6 @@ def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
         stacklevel=3,
     )
     return torch.tensor([folders.index(path.parent) for path in paths])
-
-
-def _tell_alpha(opaque: Sequence[Mask | None], names: tuple[str, ...], folder: Path) -> None:
-    drawn = [name for name, one in zip(names, opaque, strict=True) if one is not None]
-    caution(
-        f"{folder}: {len(drawn)} of {len(names)} photographs have transparent pixels "
-        f"({some(drawn)}), which are taken for masks: opaque is the object. If that is wrong, save "
-        "them without transparency, or give masks by `--masks`.",
-        stacklevel=3,
-    )
 
 
 def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:

@@ -60,8 +60,12 @@ def read_maps(
     for name, path in _matched(Path(folder), views.names, kinds[0]).items():
         layer = read_layer(path, kinds, cut_out)
         variance = layer.variance
-        if beside := [one for one in path.parent.iterdir() if _is_variance_of(one, path)]:
-            variance = read_layer(beside[0], (VARIANCE,)).values[..., 0]
+        for other in path.parent.iterdir():
+            stem, is_variance = _OF_VARIANCE.subn("", other.stem)
+            mine = stem in (path.stem, _ADDED.sub("", path.stem))
+            if is_variance and mine and other.suffix.lower() in FORMATS:
+                variance = read_layer(other, (VARIANCE,)).values[..., 0]
+                break
         values = check(path, layer)
         _require_shape(path, values, name, *sizes[name])
         if variance is not None and variance.shape != values.shape[:2]:
@@ -86,12 +90,6 @@ def single(path: Path, layer: Layer) -> np.ndarray:
             "a stack of maps."
         )
     return values[..., :1]
-
-
-def _is_variance_of(path: Path, of: Path) -> bool:
-    stem = _OF_VARIANCE.sub("", path.stem)
-    mine = path.suffix.lower() in FORMATS and stem != path.stem
-    return mine and stem in (of.stem, _ADDED.sub("", of.stem))
 
 
 def _matched(folder: Path, names: Sequence[str], kind: str) -> dict[str, Path]:
@@ -154,8 +152,14 @@ def _called(folder: Path, level: str, names: Sequence[str], kind: str) -> dict[s
             name = part if part in known else _ADDED.sub("", f" {part}")[1:]
             added += f" {part}"[len(name) + 1 :]
             called += [name] if name else []
-        stem = "/".join(called)
-        ranked.append((_rank(added, kind), FORMATS.index(suffix), flat.get(stem, stem), path))
+        stem, words = "/".join(called), re.split("[ _.-]+", added.lower())
+        kinds = {
+            of
+            for of, known_words in _WORDS.items()
+            if of and any(re.fullmatch(f"({known_words})s?", word) for word in words)
+        }
+        rank = _OTHER if kinds - {kind} else int(not kinds)
+        ranked.append((rank, FORMATS.index(suffix), flat.get(stem, stem), path))
     others = min(ranked, default=(0,))[0] == _OTHER
     files: dict[str, Path] = {}
     for rank, _, stem, path in sorted(ranked, key=lambda one: one[:2]):
@@ -167,16 +171,6 @@ def _called(folder: Path, level: str, names: Sequence[str], kind: str) -> dict[s
         return folder in files and last not in known
 
     return {stem: path for stem, path in files.items() if not belongs(stem)}
-
-
-def _rank(added: str, kind: str) -> int:
-    """Return 0 where the words added to a name are of a kind, 1 where they are of none."""
-    words = re.findall(r"[^ _.-]+", added.lower())
-    kinds = {
-        of for of, some_of in _WORDS.items() for one in words if re.fullmatch(f"({some_of})s?", one)
-    }
-    kinds -= {""}
-    return int(not kinds) if kinds <= {kind} else _OTHER
 
 
 def _require_shape(path: Path, values: np.ndarray, name: str, width: int, height: int) -> None:

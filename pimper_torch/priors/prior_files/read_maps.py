@@ -89,7 +89,13 @@ def read_depth(
         if layer.labelled:
             raise InputError(f"{path}: holds whole numbers below {LABELS}, labels; needed: depth.")
         levels = values * (layer.full or 1)
-        none = _none_in(levels)
+        # Programs write infinity where there is no depth; 1e10; and the largest half, or whole
+        # number of 16 bits, unless other values come within a tenth (a choice) of it, as of a map
+        # that was stretched to full scale.
+        none = np.isinf(levels) | (levels >= 1e10)
+        for one in (65504, 65535):
+            if not ((levels > 0.9 * one) & (levels != one) & ~none).any():
+                none |= levels == one
         for one, count in zip(*np.unique(levels[none], return_counts=True), strict=True):
             lost[f"{one:g}"] += int(count)
         return np.where(none, np.float32(np.nan), values)
@@ -102,17 +108,3 @@ def read_depth(
             stacklevel=2,
         )
     return from_maps.depth_from(maps, inverse, along=along, gauge=gauge, error=error)
-
-
-def _none_in(levels: np.ndarray) -> np.ndarray:
-    """Find what programs write where there is no depth.
-
-    Infinity, and 1e10, which no map has; the largest half (65504) and whole number of 16 bits
-    (65535), unless other values come close, as of a map that was stretched to full scale.
-    """
-    none = np.isinf(levels) | (levels >= 1e10)
-    for one in (65504, 65535):
-        # Within a tenth: a choice.
-        if not ((levels > 0.9 * one) & (levels != one) & ~none).any():
-            none |= levels == one
-    return none
