@@ -34,7 +34,7 @@ def at_points(
     """Find where maps of undistorted photographs show the points that their views observe.
 
     Args:
-        known: Pixels at which the maps say something; others are left out.
+        known: Pixels with a value; observations at others are left out.
     """
     point, view = scene.observation_point, scene.observation_view
     poses, intrinsics = scene.cameras.cam_from_world[view], scene.cameras.intrinsics[view]
@@ -75,7 +75,7 @@ def layouts(prior: MapPrior, scene: SparseScene) -> Iterator[tuple[str, Int[Tens
 def turned(
     place: Int[Tensor, "pixel 3"], prior: MapPrior, orientations: Int[Tensor, " map"]
 ) -> Int[Tensor, "pixel 3"]:
-    """Return where maps that are to be turned as EXIF says have what belongs to a place."""
+    """Return the pixels that come to places when maps are turned as EXIF says."""
     tag, last = orientations.to(place)[place[:, 0]], prior.sizes_px[place[:, 0]].to(place) - 1
     mirrored, flipped = _flips(tag)
     row = torch.where(flipped, last[:, 1] - place[:, 1], place[:, 1])

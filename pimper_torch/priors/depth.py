@@ -1,7 +1,7 @@
-"""Whether maps hold depth or one over it, along which way, and up to what, by the cloud.
+"""The meaning of depth maps, by the cloud: depth or one over it, along which way, up to what.
 
-A reading says how values ``d`` of a map belong to depth ``t`` of the points that the view
-observes: ``t = a d + b`` with ``a`` above 0, where ``t`` is depth, distance, or one over either.
+A reading relates values ``d`` of a map to depth ``t`` of the points that the view observes:
+``t = a d + b`` with ``a`` above 0, where ``t`` is depth, distance, or one over either.
 """
 
 from typing import Literal
@@ -39,19 +39,19 @@ _FEWEST, _STEPS, _WORSE, _FLAT, _ROUGH = 8, 20, 2.0, 0.03, 3e-4
 
 
 def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
-    """Decide what depth means, and turn it to scene units along the camera's axis.
+    """Decide the meaning of depth, and convert it to scene units along the camera's axis.
 
-    Where it is left open it is found, which is told in a warning: whether it is one over depth,
-    along the axis unless along the ray fits far better, and the simplest gauge that fits. Factors
-    and offsets are those that fit the cloud, map by map; standard errors are at least what a map
-    is off there. A map before which too few points are seen is left out.
+    If it is left open it is found, and a warning states it: whether it is one over depth, along the
+    axis unless along the ray fits far better, and the simplest gauge that fits. Factors and offsets
+    are those that fit the cloud, map by map; standard errors are at least a map's error there. A
+    map that shows too few points is left out.
 
     Args:
-        prior: Of undistorted photographs. Depth that is so already is believed as it is.
+        prior: Of undistorted photographs. Depth in scene units along the axis is kept as it is.
 
     Raises:
-        InputError: Another reading than the stated one fits far better, maps fit far better
-            mirrored or as EXIF turns them, none is better than no depth at all, or nothing tells.
+        InputError: A reading fits far better than the stated one, maps fit far better mirrored or
+            as EXIF turns them, none is better than no depth at all, or the cloud decides nothing.
     """
     where = f"The depth of {len(prior.names)} photographs ({some(prior.names, most=1)})"
     lines, errors, seen = _compared(prior.detach(), scene)
@@ -77,7 +77,7 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
         )
     if not told or (prior.inverse is None and not helps):
         raise InputError(
-            f"{where}: too few points of the cloud tell what it is; needed: {_FEWEST} before each "
+            f"{where}: too few points of the cloud show its meaning; needed: {_FEWEST} in each "
             "map, at several depths. State whether it is one over depth (`inverse`), and its "
             "`gauge`, or give it in scene units."
         )
@@ -91,7 +91,7 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
         worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
         if helps and worse and surely_better(worth[stated, -1], worth[stated, gauge]):
             raise InputError(
-                f"{where} is no depth {_GAUGES[prior.gauge]}: its median error at the cloud is "
+                f"{where} is not depth {_GAUGES[prior.gauge]}: its median error at the cloud is "
                 f"{at(stated, gauge)}, and {at(stated)} {_GAUGES['affine']} (`gauge` affine)."
             )
         best = stated
@@ -124,11 +124,11 @@ def _lengths(pixels: Tensor, scene: SparseScene, views: Tensor) -> Tensor:
 def _in_scene(
     prior: DepthPrior, scene: SparseScene, along: Along, inverse: bool, lines: Tensor, off: Tensor
 ) -> DepthPrior:
-    """Turn values to depth along the camera's axis in scene units; differentiable in them.
+    """Convert values to depth along the camera's axis in scene units; differentiable in them.
 
     Args:
-        lines: Factor and offset of each map; NaN where too few points tell them.
-        off: Relative error of each map at the points, of which the standard error is at least.
+        lines: Factor and offset of each map; NaN where too few points show them.
+        off: Relative error of each map at the points: the least standard error.
     """
     parts = torch.cat([lines.nan_to_num(0), off[:, None]], dim=1).to(prior.depth)
     slope, offset, off = parts.mT[..., None, None]
@@ -157,11 +157,11 @@ def _in_scene(
 def _compared(
     prior: DepthPrior, scene: SparseScene
 ) -> tuple[Float[Tensor, "reading gauge map 2"], Tensor, AtPoints]:
-    """Fit all readings, and last none, to the cloud in every gauge.
+    """Fit all readings, and last a plane across the view, to the cloud in every gauge.
 
     Returns:
-        Factor and offset of each map, NaN where fewer points than needed tell them; relative
-        errors, ``reading gauge observation``; and the observations.
+        Factor and offset of each map, NaN where too few points show them; relative errors,
+        ``reading gauge observation``; and the observations.
     """
     seen = at_points(prior, prior.variance.isfinite(), scene)
     count = torch.bincount(seen.place[:, 0], minlength=len(prior.names))

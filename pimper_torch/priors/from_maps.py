@@ -29,7 +29,7 @@ class Maps(NamedTuple):
 
     Attributes:
         values: Padded with NaN.
-        variance: NaN where nothing is said of it.
+        variance: NaN where it is not known.
         undistorted: Whether they are of the photographs as a run undistorts them.
     """
 
@@ -41,7 +41,7 @@ class Maps(NamedTuple):
 
     @property
     def about(self) -> dict[str, Any]:
-        """What every kind of prior has."""
+        """The fields of every kind of prior."""
         return {
             "names": self.names,
             "sizes_px": self.sizes_px,
@@ -94,7 +94,7 @@ def depth_from(
     gauge: Literal["scene", "scale", "affine"] = "affine",
     error: float = DEPTH_ERROR,
 ) -> DepthPrior:
-    """Make a prior of depth; 0, NaN and infinity say nothing."""
+    """Make a prior of depth; 0, NaN and infinity are not depth."""
     require(error > 0, "error", error, "above 0")
     values = maps.values[..., 0]
     known = values.isfinite() & (values != 0)
@@ -120,12 +120,12 @@ def depth_from(
 
 
 def silhouettes_from(maps: Maps) -> SilhouettePrior:
-    """Make a prior of silhouettes; NaN says nothing."""
+    """Make a prior of silhouettes; NaN is unknown."""
     return SilhouettePrior(**maps.about, inside=maps.values[..., 0].nan_to_num(0.5))
 
 
 def variance_of(maps: Maps, known: Tensor, default: Tensor | float) -> Tensor:
-    """Return the variance that comes along, or the default; infinite where nothing is known."""
+    """Return the variance of the maps, or the default; infinite where nothing is known."""
     if not bool(known.any()):
         low, high = maps.values.norm(dim=-1).nan_to_num(0).aminmax()
         raise InputError(

@@ -1,9 +1,9 @@
-"""Which axes and which frame normals have, by what else is known of the scene.
+"""The axes and the frame of normals, by cloud, outlines and cameras of the scene.
 
-Three things tell. Normals face the camera that sees them; they are at right angles to the way from
-a point of the cloud to its neighbours; and where a silhouette ends they point out of it. Each
-reading of the normals is worth, of a point of the cloud, 1 less twice the mean cosine to the ways,
-or -1 where they face away; of a place on an outline, the cosine between normal and outward.
+Normals face the camera that sees them; they are at right angles to the directions from a point of
+the cloud to its neighbours; and at the end of a silhouette they point out of it. The worth of a
+reading is, at a point of the cloud, 1 less twice the mean cosine to these directions, or -1 where
+normals face away; at a place on an outline, the cosine between normal and outward.
 """
 
 from collections.abc import Callable
@@ -32,8 +32,8 @@ from pimper_torch.runtime.errors import InputError, caution, some
 
 _NAMED: list[tuple[int, ...]] = [signs for signs, _ in AXES.values()]
 _WORLD = len(_NAMED)
-# What normals may mean, and the signs that turn them to our axes of the camera: in named axes of
-# it, in the world, in axes that have no name.
+# Meanings of normals, and the signs that turn them to our axes of the camera: in named axes of it,
+# in the world, in axes that have no name.
 _READINGS: dict[str, tuple[int, ...] | None] = {
     "camera normals in axes of OpenCV": _NAMED[0],
     "camera normals in axes of OpenGL": _NAMED[1],
@@ -43,7 +43,7 @@ _READINGS: dict[str, tuple[int, ...] | None] = {
 for signs in product((1, -1), repeat=3):
     if signs not in _NAMED:
         odd = " and ".join(axis for sign, axis in zip(signs, "xyz", strict=True) if sign < 0)
-        _READINGS[f"camera normals in axes of OpenCV but for {odd}, turned round"] = signs
+        _READINGS[f"camera normals in axes of OpenCV with {odd} reversed"] = signs
 _MEANINGS = list(_READINGS)
 
 # Choices. Points whose neighbours are looked at: as many as keep these apart by more than their
@@ -79,18 +79,18 @@ class _Samples(Record):
 def settled_normals(
     prior: NormalPrior, scene: SparseScene, silhouettes: Silhouettes | None
 ) -> NormalPrior:
-    """Turn normals to our axes of the camera, or leave them in the world.
+    """Convert normals to our axes of the camera, or leave them in the world.
 
-    Axes that are left open are found, and exchanged red and blue are exchanged back: a warning
+    Axes that are left open are found, and exchanged red and blue are exchanged back; a warning
     says so.
 
     Args:
         prior: Of undistorted photographs.
-        silhouettes: Where they are known; without, the cloud alone tells.
+        silhouettes: Where they are known; without them the cloud alone decides.
 
     Raises:
         InputError: Other axes than the stated ones fit far better, maps fit far better mirrored or
-            as EXIF turns them, or nothing tells which axes do.
+            as EXIF turns them, or the scene does not show which axes fit.
     """
     where = f"The normals of {len(prior.names)} photographs ({some(prior.names, most=1)})"
     bare = prior.detach()
@@ -107,7 +107,7 @@ def settled_normals(
         return InputError(f"{where} {found}. Cloud, outlines and cameras show it. {needed}")
 
     if _of_other_world(bare, at) and means[best] < _LEAST:
-        found = "fit in no axes, yet agree between views as they stand: they are world normals of "
+        found = "fit in no axes, yet agree between views as they are: they are world normals of "
         needed = "Give camera normals, or the cameras of that world with `--sparse`."
         raise refused(f"{found}another world", needed)
     others = [(_BGR, _worth(bare, every, change=lambda normals, _: normals.flip(-1)))]
@@ -132,7 +132,7 @@ def settled_normals(
         unsure = [_MEANINGS[one] for one in rest if not far_better(index, one)]
         if unsure or doubt:
             what = f"are {_MEANINGS[index]} or {unsure[0]}" if unsure else "fit in any axes"
-            raise InputError(f"{where}: nothing tells whether they {what}. State `axes`.")
+            raise InputError(f"{where}: the scene does not show whether they {what}. State `axes`.")
         fit, next_best = float(means[index]), float(means[rest].max())
         caution(
             f"{where} are taken to be {_MEANINGS[index]}: they fit cloud, outlines and cameras to "
@@ -206,7 +206,7 @@ def _worth(
 
     Args:
         tags: Numbers of EXIF by which maps are to be turned.
-        change: From normals, and the tags of their maps, to those that are looked at.
+        change: Of normals, by the tags of their maps.
     """
     tags = torch.ones_like(prior.sizes_px[:, 0]) if tags is None else tags
     there = turned(at.place, prior, tags).unbind(dim=-1)
@@ -220,7 +220,7 @@ def _worth(
 
 @torch.no_grad()
 def _of_other_world(prior: NormalPrior, at: _Samples) -> bool:
-    """Return whether normals agree between views as they stand, and better than most readings."""
+    """Return whether normals agree between views as they are, and better than most readings."""
     at = at.take(~at.on_outline)
     found = _read(prior.normals[at.place.unbind(dim=-1)].to(at.ways), at.pose)
     agree = means_by(found.movedim(-1, 1), at.point).norm(dim=1).mean(dim=-1)
@@ -230,7 +230,7 @@ def _of_other_world(prior: NormalPrior, at: _Samples) -> bool:
 
 
 def _ways(points: Points) -> Float[Tensor, "point neighbour 3"]:
-    """Return unit ways to the nearest neighbours among some of the points; NaN of the others."""
+    """Return unit directions to the nearest neighbours of some points; NaN for the others."""
     ways = points.new_full((len(points), _NEIGHBOURS, 3), torch.nan)
     if len(points) <= _NEIGHBOURS:
         return ways

@@ -1,4 +1,4 @@
-"""Priors whose meaning is decided, and agrees with the scene."""
+"""Priors of a decided meaning, which agrees with the scene."""
 
 from pimper_torch.method.sfm.undistort import with_undistorted_priors
 from pimper_torch.priors.depth import settled_depth
@@ -7,18 +7,18 @@ from pimper_torch.records import DepthPrior, NormalPrior, Prior, Silhouettes, Sp
 
 
 def settled(scene: SparseScene, silhouettes: Silhouettes | None = None) -> SparseScene:
-    """Decide what normals and depth in ``views.priors`` mean, by cloud, cameras and silhouettes.
+    """Decide the meaning of normals and depth in ``views.priors`` by cloud, cameras, silhouettes.
 
-    Priors of the original photographs are undistorted before. What was left open is found, and
-    told in a warning; what contradicts the scene by far is refused by name. Where the scene tells
-    nothing, what is stated is believed.
+    Priors of the original photographs are undistorted first. Meanings that were left open are
+    found, and a warning states them; a stated meaning that contradicts the scene by far is refused
+    by name. It is believed where the scene does not decide.
 
     Returns:
         Normals in our axes of the camera, or in the world; depth along its axis in scene units.
-        Differentiable in what priors hold.
+        Differentiable in the values of priors.
 
     Raises:
-        InputError: Names what contradicts, or what has to be stated.
+        InputError: Names the contradiction, or the statement that is missing.
     """
     if not scene.views.priors:
         return scene

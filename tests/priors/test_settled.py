@@ -75,9 +75,9 @@ def test_axes_that_are_left_open_are_found_and_told(rendered, axes, degrees, out
         ({"axes": "opengl"}, "lub", "in axes of DSINE .*, given as .* OpenGL"),
         ({"axes": "lub"}, "opencv", "axes of OpenCV, given as .* DSINE"),
         ({"frame": "world"}, "opengl", "axes of OpenGL, given as world normals"),
-        ({"axes": None}, (-1, 1, 1), "OpenCV but for x, turned round, as no known estimator"),
-        ({"axes": None}, (1, 1, -1), "OpenCV but for z, turned round"),
-        ({}, "other world", "agree between views as they stand: they are world normals of another"),
+        ({"axes": None}, (-1, 1, 1), "OpenCV with x reversed, as no known estimator"),
+        ({"axes": None}, (1, 1, -1), "OpenCV with z reversed"),
+        ({}, "other world", "agree between views as they are: they are world normals of another"),
     ],
 )
 @pytest.mark.parametrize("outlines", [False, True])
@@ -164,11 +164,13 @@ def test_where_nothing_tells_axes_are_to_be_stated(rendered):
     bare = without_points(scene)
     upside_down = of_normals(bare, -rendered.camera)
     assert torch.equal(settle(bare, upside_down).normals, upside_down.normals)
-    with pytest.raises(InputError, match=r"nothing tells whether they are .* State `axes`"):
+    with pytest.raises(
+        InputError, match=r"the scene does not show whether they are .* State `axes`"
+    ):
         settle(bare, upside_down.replace(axes=None))
     depth = of_depth(bare, rendered.depth, gauge="scene")
     assert torch.equal(settle(bare, depth).depth, depth.depth)
-    with pytest.raises(InputError, match=r"too few points of the cloud tell .*`inverse`"):
+    with pytest.raises(InputError, match=r"too few points of the cloud show .*`inverse`"):
         settle(bare, depth.replace(inverse=None))
     # Outlines alone tell the axes, too.
     with pytest.warns(PimperWarning, match="in axes of DSINE"):
@@ -284,8 +286,8 @@ def test_a_map_before_which_no_points_are_seen_is_left_out(rendered):
         ("disparity", {}, r"one over depth \(disparity\) .*, given as depth along the camera"),
         ("affine", {"inverse": True}, "is depth .*, given as one over depth"),
         ("distance", {}, "is depth along the ray, given as depth along the camera's axis"),
-        ("affine", {"gauge": "scale"}, "is no depth up to a factor a map: its median error"),
-        ("metres", {"gauge": "scene"}, "is no depth in the scene's unit"),
+        ("affine", {"gauge": "scale"}, "is not depth up to a factor a map: its median error"),
+        ("metres", {"gauge": "scene"}, "is not depth in the scene's unit"),
     ],
 )
 def test_depth_that_means_something_else_is_refused_by_name(rendered, kind, stated, what):
@@ -361,7 +363,7 @@ def test_a_relief_too_flat_to_tell_depth_is_believed_as_stated(rendered):
     assert_close(
         found.depth[5][known], torch.full_like(found.depth[5][known], 7), rtol=1e-3, atol=0
     )
-    with pytest.raises(InputError, match="too few points of the cloud tell what it is"):
+    with pytest.raises(InputError, match="too few points of the cloud show its meaning"):
         settle(wall, prior.replace(inverse=None))
 
 
@@ -374,7 +376,7 @@ def test_normals_that_know_nothing_of_the_scene_are_doubted(rendered):
     normals = normalize(random.movedim(1, -1), dim=-1)
     with pytest.warns(PimperWarning, match="hardly fit cloud, outlines and cameras, to 0.0"):
         settle(rendered.scene, of_normals(rendered.scene, normals))
-    with pytest.raises(InputError, match=r"nothing tells whether they .* State `axes`"):
+    with pytest.raises(InputError, match=r"the scene does not show whether they .* State `axes`"):
         settle(rendered.scene, of_normals(rendered.scene, normals, axes=None))
 
 

@@ -90,18 +90,24 @@ def _room(scene: SparseScene) -> SparseScene:
     """Fill what three views have in their frames, and hardly a mask lacks, with points."""
     cameras, views = scene.cameras, scene.views
     points = torch.cat([_along_rays(cameras, views, view) for view in range(cameras.num_views)])
-    framed, shown = _framed(points, cameras, views)
-    count = framed.sum(dim=1)
-    lacking = (framed & ~shown).sum(dim=1)
+    framed = torch.zeros(len(points), cameras.num_views, dtype=torch.bool, device=points.device)
+    shown = framed.clone()
+    for view in range(cameras.num_views):
+        pixels, depth = project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
+        within = ((pixels > 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
+        column, row = torch.where(within[:, None], pixels, 0).long().unbind(dim=1)
+        masked = within if views.masks is None else within & views.masks[view][row, column]
+        framed[:, view], shown[:, view] = within, masked
+    count, lacking = framed.sum(dim=1), (framed & ~shown).sum(dim=1)
     # Masks err, too.
     kept = (count >= _FEWEST_VIEWS) & (lacking <= 0.2 * count)
-    point, view = (framed & shown)[kept].nonzero(as_tuple=True)
+    point, seen_by = shown[kept].nonzero(as_tuple=True)
     inside = points[kept]
     return scene.replace(
         points_world=inside,
         reprojection_errors_px=torch.zeros_like(inside[:, 0]),
         observation_point=point,
-        observation_view=view,
+        observation_view=seen_by,
         observation_pixels=torch.zeros_like(inside[point, :2]),
     )
 
@@ -123,21 +129,6 @@ def _along_rays(cameras: Cameras, views: Views, view: int) -> Points:
     inverse = torch.linspace(1 / _FARTHEST, 1 / _NEAREST, _STEPS).to(pixels) / distance
     rays = rays_through(pixels, poses[view], cameras.intrinsics[view])
     return (centers[view] + rays[:, None] / inverse[:, None]).reshape(-1, 3)
-
-
-def _framed(
-    points: Points, cameras: Cameras, views: Views
-) -> tuple[Bool[Tensor, "point view"], Bool[Tensor, "point view"]]:
-    framed, shown = [], []
-    for view in range(cameras.num_views):
-        pixels, depth = project(points, cameras.cam_from_world[view], cameras.intrinsics[view])
-        size = cameras.sizes_px[view]
-        within = ((pixels > 0) & (pixels < size)).all(dim=1) & (depth > 0)
-        column, row = torch.where(within[:, None], pixels, 0).long().unbind(dim=1)
-        masked = within if views.masks is None else within & views.masks[view][row, column]
-        framed.append(within)
-        shown.append(masked)
-    return torch.stack(framed, dim=1), torch.stack(shown, dim=1)
 
 
 def _points_of(

@@ -25,7 +25,6 @@ from pimper_torch.records import CoarseMesh, FacetPoints, Mesh, Record, Surface
 
 Children = Int[Tensor, " child"]
 
-
 # Barycentric coordinates of a face's corners, and of the midpoints of the opposite edges.
 _NODES = ((1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0, 0.5, 0.5), (0.5, 0, 0.5), (0.5, 0.5, 0))
 

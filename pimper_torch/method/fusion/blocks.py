@@ -7,9 +7,8 @@ Source: Smith, Bjørstad & Gropp, Domain Decomposition, 1996, for overlapping Sc
 levels.
 """
 
-import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -154,11 +153,6 @@ def pooled(samples: Iterable[Mapping[Key, tuple[int, Scalar]]]) -> Typical:
                 count[key] += number
                 total[key] = total.get(key, torch.zeros_like(value)) + number * value
     return {key: value / count[key] for key, value in total.items()}
-
-
-def sampled(parts: Sequence[Bool[Tensor, " facet"]]) -> Sequence[Bool[Tensor, " facet"]]:
-    """Return the parts that noise is estimated from."""
-    return parts[:: math.ceil(len(parts) / 2)]
 
 
 def parts_of(whole: Subdivision, mesh: Mesh, most: float) -> list[Bool[Tensor, " facet"]]:

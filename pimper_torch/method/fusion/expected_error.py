@@ -68,19 +68,16 @@ def expected_error(
         start = _normal(generator, coarse.damping) / coarse.damping.double().sqrt()
         for solve, side in zip(solves, sides, strict=True):
             side.append(_answerable(solve, noise, start))
-    off, *detail = (_answers(*each) for each in zip(solves, sides, strict=True))
-    for each in detail:
-        off = each + CoarsePart(subdivision, facets)(off - each)
+    answers = []
+    for solve, side in zip(solves, sides, strict=True):
+        size, what = len(solve.heights), "the expected error"
+        system = prepare(*solve.matrix(), size, what, tolerance=1e-2)
+        answers.append(system.solve(torch.stack(side, dim=1)))
+        del system
+    off = answers[0]
+    for detail in answers[1:]:
+        off = detail + CoarsePart(subdivision, facets)(off - detail)
     return off.square().mean(dim=1).sqrt()
-
-
-def _answers(fused: Fused, sides: list[PerVertex]) -> Float[Tensor, "vertex draw"]:
-    """Return the heights' answers to errors of the targets, all draws at once."""
-    rows, cols, values = fused.matrix()
-    what = "the expected error"
-    system = prepare(rows, cols, values, len(fused.heights), what, tolerance=1e-2)
-    del rows, cols, values
-    return system.solve(torch.stack(sides, dim=1))
 
 
 def regions(subdivision: Subdivision) -> Int[Tensor, " facet"]:

@@ -172,7 +172,8 @@ class Fuse(Stage):
         typical: blocks.Typical = {}
         if coarse.detail is not None:
             parts = blocks.parts_of(whole, mesh, most)
-            some = (self._noise(swept, whole, mine, shared) for mine in blocks.sampled(parts))
+            two = parts[:: math.ceil(len(parts) / 2)]  # enough to estimate the noise from
+            some = (self._noise(swept, whole, mine, shared) for mine in two)
             typical = {**coarse.typical, **coarse.noise, **blocks.pooled(some)}
         channels = swept.photometric.buckets[0].albedo.shape[-1]
         values = whole.points.new_zeros(len(whole.points), 1 + channels, dtype=torch.float64)

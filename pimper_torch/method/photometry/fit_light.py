@@ -12,7 +12,12 @@ from pimper_torch.ground.geometry.rigid import invert_rigid, rotate
 from pimper_torch.ground.geometry.template_normals import transferred_normals
 from pimper_torch.ground.shapes import PatchVectors, Scalar
 from pimper_torch.method.photometry.factor_priors import RELATIVE_NOISE
-from pimper_torch.method.photometry.light_field import LightField, harmonics, rotate_lights
+from pimper_torch.method.photometry.light_field import (
+    LightField,
+    harmonics,
+    linearized,
+    rotate_lights,
+)
 from pimper_torch.method.photometry.lights import light_of_mesh
 from pimper_torch.method.photometry.photometry_config import FitLightConfig
 from pimper_torch.method.photometry.sample_estimates import initial_shading, rows_of
@@ -92,7 +97,7 @@ def lights_in_patches(
 ]:
     """Return first-order light at the centres of patches, soft light alone, and the point light."""
     centre, outward = invert_rigid(patch_from_world)[:, :3, 3], -patch_from_world[:, 2, :3]
-    both, soft = field.lights_at(centre, outward), field.soft_at(outward)
+    both, soft = field.lights_at(centre, outward), linearized(field.soft, outward)
     point_light = rotate(patch_from_world, field.point_light_at(centre))
     return rotate_lights(patch_from_world, both), rotate_lights(patch_from_world, soft), point_light
 

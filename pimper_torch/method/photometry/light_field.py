@@ -102,13 +102,9 @@ class LightField(Record):
         distance = away.norm(dim=-1, keepdim=True)
         return strength[:, None] * away / torch.where(strength[:, None] > 0, distance, 1) ** 3
 
-    def soft_at(self, normals: Points) -> Float[Tensor, "point view 4"]:
-        """Return first-order light that is soft light near given normals; world frame."""
-        return linearized(self.soft, normals)
-
     def lights_at(self, points: Points, normals: Points) -> Float[Tensor, "point view 4"]:
         """Return first-order light near normals that face the point light; world frame."""
-        point_light, soft = self.point_light_at(points), self.soft_at(normals)
+        point_light, soft = self.point_light_at(points), linearized(self.soft, normals)
         return torch.cat([soft[..., :1], soft[..., 1:] + point_light], dim=-1)
 
 

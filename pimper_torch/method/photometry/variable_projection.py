@@ -144,7 +144,10 @@ def _step(
             cost=torch.where(better, after, state.cost),
             slope=torch.where(keep, slope, state.slope),
         )
-        state = _with_robust_weights(problem, state)
+        if not isinstance(problem.loss, Squares):
+            weight = bilinear.robust_weights(problem, state.lights, state.shading)
+            cost, slope = bilinear.evaluate(problem, state.lights, state.shading, weight)
+            state = state.replace(weight=weight, cost=cost, slope=slope)
         state = state.replace(curvature=_curvature(problem, state, curvature_samples))
     cause = torch.where(stalled, int(StopCause.STALLED), bilinear.RUNNING)
     return state, torch.where(exact | (small >= small_steps), int(StopCause.CONVERGED), cause)
@@ -175,14 +178,6 @@ def _curvature(
     problem: Bilinear, state: _State, samples: int | None
 ) -> Float[Tensor, "patch unknown unknown"]:
     return curvature_of_lights(problem, state.lights, state.shading, state.weight, samples)
-
-
-def _with_robust_weights(problem: Bilinear, state: _State) -> _State:
-    if isinstance(problem.loss, Squares):
-        return state
-    weight = bilinear.robust_weights(problem, state.lights, state.shading)
-    cost, slope = bilinear.evaluate(problem, state.lights, state.shading, weight)
-    return state.replace(weight=weight, cost=cost, slope=slope)
 
 
 def _whitened(

@@ -41,8 +41,7 @@ def read_maps(
 ) -> Maps:
     """Read the maps of photographs, matched by name.
 
-    A map that is for all photographs of a pose becomes that of the first of them, so that what it
-    says counts once.
+    A map of all photographs of a pose becomes that of the first of them, so that it counts once.
 
     Args:
         kinds: How names of arrays begin that hold the maps; the first is ``normal``, ``depth`` or
@@ -93,7 +92,7 @@ def single(path: Path, layer: Layer) -> np.ndarray:
 
 
 def _matched(folder: Path, names: Sequence[str], kind: str) -> dict[str, Path]:
-    """Find the map of each photograph or pose; some photographs, or some maps, may be alone."""
+    """Find the map of each photograph or pose; there may be more or fewer photographs than maps."""
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing"
         raise InputError(f"{folder}: found {found}; needed: a folder of maps, one a photograph.")
@@ -115,9 +114,7 @@ def _matched(folder: Path, names: Sequence[str], kind: str) -> dict[str, Path]:
     paths = list(files.values())
     lacking = [name for name, place in zip(names, places, strict=True) if place is None]
     free = [
-        path.relative_to(folder).as_posix()
-        for place, path in enumerate(paths)
-        if place not in places
+        path.relative_to(folder).as_posix() for at, path in enumerate(paths) if at not in places
     ]
     if lacking and free:
         near = difflib.get_close_matches(Path(lacking[0]).stem, free, n=1, cutoff=0) or free[:1]
@@ -135,8 +132,8 @@ def _matched(folder: Path, names: Sequence[str], kind: str) -> dict[str, Path]:
 def _called(folder: Path, level: str, names: Sequence[str], kind: str) -> dict[str, Path]:
     """List the files at a level that may be maps of a kind, by the photographs that they name.
 
-    Of several files of one name, those come first whose names state the kind, and then those in
-    whose formats least is lost. Files of other kinds count where there are no others.
+    Of several files of one name, the first is one whose name states the kind, else one in the
+    format that loses least. Files of other kinds count only where there are no others.
     """
     stems = {str(PurePosixPath(name).with_suffix("")) for name in names}
     known = {part for stem in stems for part in stem.split("/")}
@@ -149,14 +146,14 @@ def _called(folder: Path, level: str, names: Sequence[str], kind: str) -> dict[s
             continue
         called, added = [], ""
         for part in (*inside.parts[:-1], path.stem):
-            name = part if part in known else _ADDED.sub("", f" {part}")[1:]
-            added += f" {part}"[len(name) + 1 :]
-            called += [name] if name else []
-        stem, words = "/".join(called), re.split("[ _.-]+", added.lower())
+            name = f" {part}" if part in known else _ADDED.sub("", f" {part}")
+            added += f" {part}"[len(name) :]
+            called += [name[1:]] if name else []
+        stem = "/".join(called)
         kinds = {
             of
-            for of, known_words in _WORDS.items()
-            if of and any(re.fullmatch(f"({known_words})s?", word) for word in words)
+            for of, words in _WORDS.items()
+            if of and re.search(rf"[ _.-]({words})s?(?![a-z])", added, re.IGNORECASE)
         }
         rank = _OTHER if kinds - {kind} else int(not kinds)
         ranked.append((rank, FORMATS.index(suffix), flat.get(stem, stem), path))

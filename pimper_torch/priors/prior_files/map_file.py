@@ -17,7 +17,6 @@ FORMATS = (".npz", ".npy", ".exr", *PICTURES)
 
 VARIANCE = "variance"
 
-
 LABELS = 32
 """Whole numbers that are all below are labels, as they are where masks of photographs are read."""
 
