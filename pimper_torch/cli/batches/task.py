@@ -1,4 +1,4 @@
-"""One object of a batch, and carrying it out wherever a worker stands.
+"""One object of a batch, and how a worker on any machine carries it out.
 
 A worker starts ``pimper reconstruct`` as a process of its own, so that a run that is killed, hangs
 or takes all memory leaves the worker unharmed. All that driver and workers share is the folder of
@@ -40,7 +40,7 @@ faulthandler.enable()
 from pimper_torch.cli.main import main
 sys.exit(main())
 """
-# Of errors that another worker, with more memory, may not make.
+# Errors that a worker with more memory may not raise.
 _OF_MEMORY = ("MemoryError", "OutOfMemoryError")
 _TRIES = 3  # a choice
 _LOOK_SECONDS = 0.5
@@ -88,9 +88,9 @@ class Outcome:
     """End of a try.
 
     Attributes:
-        status: ``ended`` with a result; ``failed`` by itself, as it will anywhere; ``lost``, as
-            another try may not; ``kept``, as the result was whole before; ``waiting`` where no
-            try was begun.
+        status: ``ended`` with a result; ``failed`` by itself, as it will anywhere; ``lost``, where
+            a new try may succeed; ``kept``, where the result was whole already; ``waiting``, where
+            no try began.
         message: Why there is no result.
         place: Host of the worker.
     """
@@ -137,7 +137,7 @@ def attempted(task: Task) -> Outcome:
 def is_whole(task: Task) -> bool:
     """Return whether the object's result is there, of the same arguments and files.
 
-    It is newer than the key that was written before its run, whoever saw how that ended.
+    It is newer than the key that was written before its run, however that ended.
     """
     with suppress(OSError):
         written, begun = (one.stat() for one in (task.out / MARKER, task.beside(".key")))
@@ -155,7 +155,7 @@ def _tried(task: Task, latest: float) -> tuple[Status, str]:
                 if task.made_from() != task.key:
                     task.beside(".key").write_text(task.key, encoding="utf-8")
             break
-        except OutputError as error:  # another run holds it: that is said, and nothing taken away
+        except OutputError as error:  # a different run holds it, and keeps its lock
             if time.monotonic() > patient:
                 return "waiting", f"not begun: {error}"
             time.sleep(_LOOK_SECONDS)

@@ -58,11 +58,11 @@ def contour_rays(silhouettes: Silhouettes, cameras: Cameras, per_view: int = 300
     Args:
         silhouettes: Probabilities that pixels show the object; views that are not reliable get
             no rays.
-        per_view: About so many rays a view, evenly spaced, at least a pixel apart.
+        per_view: Approximate number of rays a view, evenly spaced, at least a pixel apart.
 
     Returns:
         Rays of all reliable views. Corners, where the surface has no single normal, specks,
-        and what lies at the photograph's border have none. A constant to autograd.
+        and points at the photograph's border have none. A constant to autograd.
     """
 
     def of_view(view: int) -> ContourRays:
@@ -127,7 +127,7 @@ def _samples(points: Array, closed: bool, smooth: Array, stride: float) -> Array
     how: Literal["wrap", "nearest"] = "wrap" if closed else "nearest"
     tangent = gaussian_filter1d(points, _TANGENT_PX, axis=0, order=1, mode=how)
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
-    # The probability falls outward; half a pixel to either side tells how fast.
+    # The probability falls outward; its slope is the difference over half a pixel to either side.
     across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     rise = _read(smooth, points + 0.5 * across) - _read(smooth, points - 0.5 * across)
     outward = -np.sign(rise)[:, None] * across
@@ -304,7 +304,14 @@ class Contours(Record):
     @classmethod
     def none(cls, silhouettes: Silhouettes, cameras: Cameras) -> "Contours":
         """Return contours without rays; the hull holds everything, or what is above planes."""
-        hull = Everywhere.of(cameras, silhouettes.planes_world)
+        like, planes = cameras.cam_from_world, silhouettes.planes_world
+        hull = Everywhere(
+            origin_world=like.new_zeros(3),
+            spacing=like.new_ones(()),
+            distance=like.new_full((1, 1, 1), torch.inf),
+            normals_world=planes[:, :3].to(like),
+            offsets=-planes[:, 3].to(like),
+        )
         return cls(silhouettes=silhouettes, rays=_nothing(cameras), cameras=cameras, hull=hull)
 
     @property

@@ -82,7 +82,7 @@ def intersect_height_field(
         ray_directions: Any length and sign; the ray is the whole line.
 
     Returns:
-        The points, and whether each lies on the height field: all neighbours it is blended from
+        The points, and whether each is on the height field: all neighbours it is blended from
         are valid, and the line passes it within a fiftieth of the spacing. A miss gives a
         point on the ray that means nothing, though it is finite.
 

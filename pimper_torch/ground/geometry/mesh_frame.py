@@ -15,7 +15,7 @@ from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
 
-# Rays: at most so many to points, and so many along a photograph's longer side.
+# Maximum number of rays to points, and along a photograph's longer side.
 _MAX_RAYS, _SIDE = 4000, 64
 # A point is on the mesh within this fraction of its diagonal: rough meshes are off by as much.
 _NEAR = 0.03
@@ -28,7 +28,7 @@ def compare_with_scene(
 ) -> dict[str, int | float]:
     """Compare a mesh with the points and masks of a scene; warn of one that is far off.
 
-    A point that a camera saw lies neither behind the mesh nor in front of it: rays to observed
+    A point that a camera saw is neither behind the mesh nor in front of it: rays to observed
     points meet the mesh at the point, or nowhere, as those to the background do.
 
     Args:

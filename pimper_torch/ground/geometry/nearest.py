@@ -24,7 +24,7 @@ class Nearest(Record):
     """Where surfaces are nearest to points.
 
     Attributes:
-        face: That they lie in; of a point cloud the index of the point.
+        face: Which contains them; of a point cloud, the index of the point.
     """
 
     distance: Float[Tensor, " point"]
@@ -54,7 +54,7 @@ class NearestSurface:
             self._tree = cKDTree(self._vertices.numpy())
             return
         used = self._vertices[torch.unique(self._faces)]
-        # Float32 is finest round the origin.
+        # Float32 is finest around the origin.
         self._origin = (used.amin(dim=0) + used.amax(dim=0)) / 2
         self._scene = fcpw.scene_3D()
         self._scene.set_object_count(1)
@@ -89,7 +89,7 @@ def closest_on_triangles(
 ) -> Float[Tensor, "pair 3"]:
     """Return the point of each triangle that is nearest to its partner.
 
-    It is the foot of the perpendicular where that lies inside, else on the nearest edge. A
+    It is the foot of the perpendicular where that is inside, else on the nearest edge. A
     degenerate triangle has edges only.
     """
     a, b, c = corners.unbind(dim=1)

@@ -151,7 +151,7 @@ class Pyramid(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Sources(Record):
-    """Photographs at several sizes. It is not hashed beside the photographs themselves.
+    """Photographs at several sizes. It is not hashed in addition to the photographs.
 
     Attributes:
         images: Linear radiance; zero where it is not finite.

@@ -34,8 +34,8 @@ class Subdivision(Record):
     """A coarse mesh, subdivided.
 
     Attributes:
-        points: Where the vertices lie on the flat facets.
-        facet: A facet each vertex lies in; a vertex on an edge or a corner of the coarse
+        points: Where the vertices are on the flat facets.
+        facet: A facet that contains each vertex; a vertex on an edge or a corner of the coarse
             mesh exists once and names one of its facets.
         barycentric: Where in that facet; exactly 0 on its edges.
         spacing: Wanted length of the pieces' edges in each facet.
@@ -72,7 +72,7 @@ def subdivide(vertices: Corners, facets: Facets, spacing: PerFacet) -> Subdivisi
 
     Returns:
         A mesh with the coarse mesh's topology and surface: an edge inside it has as many
-        faces as the coarse edge it lies on, areas add up, and no face is turned round.
+        faces as the coarse edge it is part of, areas add up, and no face is flipped.
         Needle-shaped facets give needle-shaped faces.
 
     Differentiable in ``vertices`` through ``points``; the cuts are constants.

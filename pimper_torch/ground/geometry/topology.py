@@ -98,7 +98,7 @@ def corners_of(
 
 
 def dilated(faces: Faces, some: FaceMask, rings: int, num_vertices: int) -> FaceMask:
-    """Find some faces and a number of rings of faces round them."""
+    """Find some faces and a number of rings of faces around them."""
     for _ in range(rings):
         some = corners_of(faces, some, num_vertices)[faces].any(dim=1)
     return some
@@ -139,7 +139,7 @@ def face_components(faces: Faces, among: FaceMask | None = None) -> Int[Tensor, 
 
 
 def vertex_fans(faces: Faces, edges: FaceEdges | None = None) -> tuple[Int[Tensor, " fan"], Faces]:
-    """Split non-manifold vertices: every fan of faces round one gets a vertex of its own.
+    """Split non-manifold vertices: every fan of faces around one gets a vertex of its own.
 
     Args:
         edges: As for :func:`face_pairs`.

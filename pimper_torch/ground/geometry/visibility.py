@@ -84,7 +84,13 @@ class RayCaster:
     """
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
-        self._origin = _origin(vertices.detach())
+        self._origin: Float[Tensor, "3"] | None = None
+        if len(vertices):
+            low, high = vertices.detach().amin(dim=0), vertices.detach().amax(dim=0)
+            middle = (low + high) / 2
+            # Single precision moves a mesh so far away by more than a millionth of its diagonal.
+            if bool(middle.norm() > 16.0 * (high - low).norm()):
+                self._origin = middle
         triangles = self._near(vertices.detach())[faces].to("cpu", torch.float32)
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles.numpy()))
@@ -126,7 +132,7 @@ class RayCaster:
 
         Args:
             tolerance: A surface closer than this in front of the point does not count: it
-                is the surface the point itself lies on. Scene units.
+                is the surface that the point itself is on. Scene units.
         """
         directions = points - center
         length = directions.norm(dim=-1)
@@ -183,16 +189,6 @@ def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
     rays = rays_through(pixels.reshape(-1, 2), pose, intrinsics).reshape(height, width, 3)
     caster = ray_caster(mesh) if isinstance(mesh, Mesh) else mesh
     return caster.cast(cameras.centers_world[view], rays)
-
-
-def _origin(vertices: Vertices) -> Float[Tensor, "3"] | None:
-    """Choose an origin for a mesh that is too far from its own for single precision, if it is."""
-    if len(vertices) == 0:
-        return None
-    low, high = vertices.amin(dim=0), vertices.amax(dim=0)
-    middle = (low + high) / 2
-    # Single precision moves such a mesh by more than a millionth of its diagonal.
-    return middle if bool(middle.norm() > 16.0 * (high - low).norm()) else None
 
 
 def _reaches(reach: Lengths, shape: torch.Size) -> Rows:

@@ -23,7 +23,7 @@ from pimper_torch.runtime.parallel import side_by_side
 _STRIDE = 4  # pixels between rays; how deep they get is interpolated
 _UNSEEN = 1e9  # pixels; stands beyond the photograph's border, where a view abstains
 
-# How far outside, in voxels, surface of the object may lie: silhouettes that are found are right to
+# How far outside, in voxels, surface of the object may be: silhouettes that are found are right to
 # a few pixels. The skull's cranium, borne out by points, lay up to 2.9 outside their hull.
 _SLACK = 3.0
 
@@ -76,7 +76,7 @@ class Hull(Record):
         return self.depth_of(points_world) > -max(tolerance, _SLACK * float(self.spacing))
 
     def depth_of(self, points_world: Vectors) -> Scalars:
-        """Return how deep points lie inside the hull; negative outside.
+        """Return how deep points are inside the hull; negative outside.
 
         Trilinear between voxels. Off the grid it is the value at its border less the distance
         to it. Differentiable where a point is not level with the voxels' centres.
@@ -98,7 +98,7 @@ class Hull(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Everywhere(Hull):
-    """The hull of silhouettes that leave nothing out: everything above planes, if there are any.
+    """The hull of silhouettes that exclude nothing: everything above planes, if there are any.
 
     Points of the planes are as deep inside as all others, and shape the surface with them; surface
     on a plane is not held.
@@ -110,18 +110,6 @@ class Everywhere(Hull):
 
     normals_world: Float[Tensor, "plane 3"]
     offsets: Float[Tensor, " plane"]
-
-    @classmethod
-    def of(cls, cameras: Cameras, planes_world: Float[Tensor, "plane 4"]) -> "Everywhere":
-        """Make it, of the cameras' floating-point type and device."""
-        like = cameras.cam_from_world
-        return cls(
-            origin_world=like.new_zeros(3),
-            spacing=like.new_ones(()),
-            distance=like.new_full((1, 1, 1), torch.inf),
-            normals_world=planes_world[:, :3].to(like),
-            offsets=-planes_world[:, 3].to(like),
-        )
 
     def depth_of(self, points_world: Vectors) -> Scalars:
         """Return infinity: a hull without bounds excludes nothing."""
@@ -277,7 +265,7 @@ def _voted(
     num_voxels: int,
     fractions: tuple[float, float],
 ) -> Hull:
-    """Fill a grid between two corners with about so many voxels.
+    """Fill a grid between two corners with about ``num_voxels`` voxels.
 
     Args:
         maps: Distances to the silhouettes in pixels, and what they count, one a view.

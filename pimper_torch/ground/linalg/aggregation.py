@@ -38,7 +38,7 @@ _COUPLED = 0.05
 # of an M-matrix best.
 _DAMPING = 2 / 3
 
-# Roots are chosen in blocks of so many unknowns, in random order within each: a choice, a block
+# Roots are chosen in blocks of this many unknowns, in random order within each: a choice, a block
 # and its neighbours fit the cache.
 _BLOCK = 4096
 

@@ -43,7 +43,7 @@ def solve_by_cycles(
     residual = with_product(matrix, found, rhs, keep=1.0, gain=-1.0)
     scale = diagonal.rsqrt()[:, None]
     left, side = (scale * residual).norm(dim=0), (scale * rhs).norm(dim=0)
-    # Smooth solutions have a right-hand side that is small beside their energy norm.
+    # Smooth solutions have a right-hand side that is small compared with their energy norm.
     energy = (found * rhs).sum(dim=0).clamp_min(0).sqrt()
     # The energy norm bounds the residual but for a factor of 1.5; the hierarchy estimates it.
     most = torch.maximum(WORST_RESIDUAL * side, 10.0 * tolerance * energy)

@@ -36,7 +36,7 @@ def to_bytes(radiance: Scalars) -> UInt8[Tensor, "*batch"]:
     return (255 * srgb_from_linear(radiance)).round().to(torch.uint8)
 
 
-# A power of 2.2 between so many entries is off by 0.13 % of full scale, half a level of 255.
+# A power of 2.2 between this many entries is off by 0.13 % of full scale, half a level of 255.
 MIN_ENTRIES = 17
 _FULL_SCALE = {8: 255, 16: 65535}
 

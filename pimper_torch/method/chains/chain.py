@@ -92,14 +92,14 @@ class Step(Record):
 
     @property
     def coarse(self) -> CoarseMesh:
-        """The facets that the templates stand on."""
+        """The facets that carry the templates."""
         return self.heights.patches.coarse
 
 
 class Chain(Stage):
     """A graph of stages from photographs to a mesh.
 
-    Each stage is an attribute; assigning another module that takes and gives the same records
+    Each stage is an attribute; assigning a different module that takes and returns the same records
     swaps it, as naming it to the constructor does: ``CoarseToFine(config, factorize=Mine())``.
 
     Gradients run from photographs, cameras and coarse mesh through every stage after it. Structure
@@ -166,13 +166,11 @@ class Chain(Stage):
 
         Views that cannot be used are left out; priors become those of undistorted views. A scene
         without observed points gets some by the method ``with_points`` of ``reconstruct``, if that
-        has one, unless a mesh stands in for them. Masks that belong to
+        has one, unless a mesh is given. Masks that belong to
         other photographs, or are turned or inverted, are read as cameras and points say, and
         cameras are found anew with them, unless they are ``checked``.
         """
         asked = views
-        with_points: Callable[[SparseScene], SparseScene] | None
-        with_points = getattr(self.reconstruct, "with_points", None)
         if isinstance(views, Views):
             views = run(self.reconstruct, views, sparse_model)
         elif sparse_model is not None:
@@ -182,8 +180,9 @@ class Chain(Stage):
             )
         elif mesh is not None:
             refuse_other_axes(mesh, views)
-        elif with_points is not None:
-            views = with_points(views)
+        elif with_points := getattr(self.reconstruct, "with_points", None):
+            observed: SparseScene = with_points(views)
+            views = observed
         few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
         scene = with_poses(sound(run(depth_points, views) if few else views))
         scene = with_undistorted_priors(scene)
@@ -223,7 +222,7 @@ class Chain(Stage):
                 that of the scene.
 
         Raises:
-            InputError: The mesh is no surface, or in another frame.
+            InputError: The mesh is not a surface, or is in a different frame.
         """
         if mesh is None:
             return None

@@ -52,8 +52,8 @@ class Running:
 
     Attributes:
         store: Where records are kept; nowhere without.
-        last: Whether this is the last pass. What stages of earlier ones warn of is told only where
-            they fail, as the last one warns of it, too.
+        last: Whether this is the last pass. Warnings of earlier ones are given only where these
+            fail, as the last one repeats them.
     """
 
     names: Mapping[nn.Module, str]

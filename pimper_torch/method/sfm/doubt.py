@@ -50,7 +50,7 @@ MOVE = (
 
 
 def count_spread_views(model: SparseModel, fewest: int) -> int:
-    """Count the views that see enough points under a triangulation angle that tells depth."""
+    """Count the views that see enough points under a triangulation angle that determines depth."""
     return int((model.observed[wide_points(model)].sum(dim=0) >= fewest).sum())
 
 
@@ -148,7 +148,7 @@ def count_views_with_depth(models: Sequence[SparseModel], fewest: int) -> list[i
 
     Returns:
         As :func:`~pimper_torch.method.sfm.doubt.count_spread_views`, but 0 for a model whose points
-        move as before a camera in its place, where there is another one to go on with.
+        move as before a camera in its place, where a different one is left to go on with.
     """
     spread = [count_spread_views(model, fewest) for model in models]
     only = len(models) == 1

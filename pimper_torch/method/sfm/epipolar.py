@@ -69,12 +69,10 @@ def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Matrix3:
 
 def pinholes_of(model: SparseModel) -> Cameras:
     """Return the pinholes behind a model's lenses."""
-    intrinsics = [pinhole_of(lens) for lens in model.lenses]
-    sizes = [[lens.width, lens.height] for lens in model.lenses]
     return Cameras(
-        intrinsics=torch.stack(intrinsics) if intrinsics else torch.zeros(0, 3, 3).double(),
+        intrinsics=torch.stack([pinhole_of(lens) for lens in model.lenses]),
         cam_from_world=model.cam_from_world,
-        sizes_px=torch.tensor(sizes).reshape(-1, 2).long(),
+        sizes_px=torch.tensor([[lens.width, lens.height] for lens in model.lenses]),
     )
 
 

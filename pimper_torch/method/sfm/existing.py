@@ -55,12 +55,12 @@ def existing_model(views: Views, path: Path) -> SparseModel:
             "holds more of them, or leave it out to run structure from motion."
         )
     shown = taken(views, model)
-    placed = follow_pictures(model, shown, _quarter_turns(model, shown, where))
+    placed = _in_photographs(model, shown, _quarter_turns(model, shown, where))
     return placed.replace(points_world=read_cloud(path)) if path.is_file() else placed
 
 
 def resize_fits(lens: Lens, width: int, height: int) -> bool:
-    """Return whether a resize alone leads from a lens's picture to one of another size."""
+    """Return whether a resize alone leads from a lens's picture to one of a different size."""
     # Rounding a side to whole pixels changes the shape by less than this.
     ratio = width / lens.width / (height / lens.height)
     return abs(ratio - 1) <= max(0.01, 2 / min(width, height))
@@ -163,14 +163,8 @@ def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[
     return sizes
 
 
-def follow_pictures(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:
-    """Put a model's cameras and observations into photographs that were resized and turned.
-
-    Args:
-        model: Its pictures have the photographs' shapes once they are turned.
-        views: The photographs, in the model's order.
-        turns: Clockwise quarters by which each picture is turned in its photograph.
-    """
+def _in_photographs(model: SparseModel, views: Views, turns: Sequence[int]) -> SparseModel:
+    """Resize a model's pictures to its photographs, and turn them by clockwise quarters."""
     placed = []
     cameras: dict[tuple[int, ...], int] = {}
     fresh = 1 + max(lens.camera for lens in model.lenses)

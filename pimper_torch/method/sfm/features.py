@@ -55,7 +55,10 @@ class Workspace:
 
 @contextmanager
 def workspace(views: Views, threads: int) -> Iterator[Workspace]:
-    """Write photographs and masks to a temporary folder, which goes when the block ends."""
+    """Write photographs and masks to a temporary folder, which is removed when the block ends.
+
+    Photographs are in 8-bit sRGB, without their padding.
+    """
     with scratch() as folder:
         space = Workspace(
             folder=folder,
@@ -64,23 +67,23 @@ def workspace(views: Views, threads: int) -> Iterator[Workspace]:
         )
         space.images.mkdir()
         space.masks.mkdir()
+
+        def write(index: int) -> None:
+            width, height = (int(side) for side in views.sizes_px[index])
+            pixels = to_bytes(views.images[index, :, :height, :width].detach()).cpu()
+            picture = Image.fromarray(pixels.movedim(0, -1).squeeze(-1).numpy()).convert("L")
+            # Fast compression: the files live for seconds. COLMAP finds features in luma alone.
+            picture.save(space.images / space.files[index], compress_level=1)
+            if views.masks is not None:
+                mask = views.masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
+                path = space.masks / f"{space.files[index]}.png"
+                Image.fromarray(mask).save(path, compress_level=1)
+            drop_pages()
+
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(lambda index: _write(views, index, space), range(views.num_views)))
+            list(pool.map(write, range(views.num_views)))
         release_memory()
         yield space
-
-
-def _write(views: Views, index: int, space: Workspace) -> None:
-    """Write a photograph in 8-bit sRGB without its padding, and its mask if there is one."""
-    width, height = (int(side) for side in views.sizes_px[index])
-    pixels = to_bytes(views.images[index, :, :height, :width].detach()).cpu()
-    picture = Image.fromarray(pixels.movedim(0, -1).squeeze(-1).numpy())
-    # Fast compression: the files live for seconds. COLMAP looks for features in luma alone.
-    picture.convert("L").save(space.images / space.files[index], compress_level=1)
-    if views.masks is not None:
-        mask = views.masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
-        Image.fromarray(mask).save(space.masks / f"{space.files[index]}.png", compress_level=1)
-    drop_pages()
 
 
 # The side of photographs below which COLMAP 4.2's covariant detector reads past their end.

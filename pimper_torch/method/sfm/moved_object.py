@@ -75,7 +75,7 @@ def find_moved_object(
     for pair, second in verify(many).items():
         if len(second) >= max(_MIN_SECOND, _MIN_FRACTION * len(many[pair])):
             ends = [matching.pixels_of(keypoints, pair, rows) for rows in (verified[pair], second)]
-            shared = shared_geometry(*ends, max_error_px)
+            shared = shared_geometry(ends[0], ends[1], max_error_px)
             far = [(sampson_errors(shared, *each) > max_error_px).double().mean() for each in ends]
             if float(torch.stack(far).amax()) > 0.2:  # no geometry explains both
                 seconds[pair] = second
@@ -289,8 +289,8 @@ def with_series(
     if apart := [name for name in names if name not in model.names]:
         caution(
             f"The object was moved on what it stands on, and too little of it ties {len(apart)} of "
-            f"{len(names)} photographs to the others, which are reconstructed alone; apart stand "
-            f"{some(apart, most=20)}. {JOINING}",
+            f"{len(names)} photographs to the others, which are reconstructed alone; left out "
+            f"are {some(apart, most=20)}. {JOINING}",
             stacklevel=4,
         )
     return model

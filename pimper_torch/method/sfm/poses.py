@@ -1,4 +1,4 @@
-"""Several photographs of one pose, each under another light: one of them for all that is geometry.
+"""Several photographs of one pose, each under a different light: one is used for geometry.
 
 Photographs of one pose have no parallax to one another. Structure from motion gets one picture a
 pose, and what it finds holds for all photographs of the pose; silhouettes and depth maps are those
@@ -76,11 +76,11 @@ def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
     pose = cameras.cam_from_world.detach().double()
     centers = cameras.centers_world.detach().double()
     focal = cameras.intrinsics[:, 0, 0].detach().double()
-    # Cameras stand round an object about as far from each other as from it.
+    # Cameras around an object are about as far from each other as from it.
     extent = (centers - centers.mean(dim=0)).norm(dim=1).mean()
     turned = (pose[:, None, :3, :3] - pose[None, :, :3, :3]).flatten(2).norm(dim=2) / 2**0.5
     moved = (centers[:, None] - centers).norm(dim=2)
-    # Bundle adjustment leaves photographs of one pose 0.1 px apart; between neighbours lie tens.
+    # Bundle adjustment leaves photographs of one pose 0.1 px apart, and neighbours by tens.
     same = focal[:, None] * (turned + moved / extent) < 0.5
     return same.long().argmax(dim=1)  # the first of each pose
 
@@ -91,13 +91,13 @@ def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPos
     Guessed silhouettes of other photographs of a pose become those of the one that is kept.
 
     Args:
-        needed: Names, with their suffix or without, of photographs that go before others.
+        needed: Names, with their suffix or without, of photographs that are preferred.
     """
     poses = scene.views.poses
     if poses is None:
         every = torch.arange(scene.cameras.num_views)
         return OneAPose(scene, every, every)
-    rank = _texture(scene.views)
+    rank = by_view(_texture, scene.views.images, scene.views.sizes_px)
     for view, name in enumerate(scene.views.names):
         if {name, name.rsplit(".", 1)[0]} & set(needed):
             rank[view] += 1
@@ -134,12 +134,8 @@ def _with_leads(prior: Prior, names: Sequence[str], lead: Int[Tensor, " view"]) 
     return prior.take(list(maps.values())).replace(names=tuple(maps))
 
 
-def _texture(views: Views) -> Float[Tensor, " view"]:
+def _texture(image: Float[Tensor, "channel _ _"], size: Int[Tensor, "2"]) -> Scalar:
     """Compute the mean step of the square root of radiance between neighbouring pixels."""
-
-    def of_view(image: Float[Tensor, "channel _ _"], size: Int[Tensor, "2"]) -> Scalar:
-        wide, high = size.tolist()
-        one = image.detach().mean(dim=0).clamp(0, 1).sqrt()
-        return one[:high, 1:wide].sub(one[:high, : wide - 1]).abs().mean()
-
-    return by_view(of_view, views.images, views.sizes_px)
+    wide, high = size.tolist()
+    one = image.detach().mean(dim=0).clamp(0, 1).sqrt()
+    return one[:high, 1:wide].sub(one[:high, : wide - 1]).abs().mean()

@@ -16,19 +16,19 @@ from pimper_torch.records import Cameras, Views, pairs_table
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view
 
-# Residual at which a track observation counts half, before the residuals themselves tell; then
+# Residual at which a track observation counts half, until the residuals determine it: then
 # their spread, between bounds. Cauchy's 2.4 spreads would suit Gaussian residuals; these have long
-# tails, from light that is no slope: one spread puts points a quarter nearer to the truth.
+# tails, from light that is not a slope: one spread puts points a quarter nearer to the truth.
 _FIRST_SCALE_PX, _SCALES_PX = 0.5, (0.05, 1.0)
 
-# Relative falls of the cost that end the adjustment that tells the spread, and the one after it.
+# Relative falls of the cost that end the adjustment for the spread, and the one after it.
 _FIRST_TOLERANCE, _TOLERANCE = 1e-3, 1e-5
 
 
 # Points a view in the rounds before the last, whose cameras are where the next one looks from. On
 # 20 photographs of 640x480 with 8,900 points both rounds take 21 in place of 35 CPU s, and cameras
 # put places 0.009 % of the diagonal off (0.013 % with all points); with 128 points 0.024 %. In the
-# last round the number tells: 128 points a view there, 0.13 %.
+# last round the number matters: 128 points a view there, 0.13 %.
 _PILOTS = 256
 
 
@@ -56,11 +56,19 @@ def refine_tracks(
         if not bool(aligned.any()):
             return model
         tied, leading, scale = _adjusted(renewed, aligned, cameras=cameras)
+        model = model if left else renewed
+        model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
         if left:
-            model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
             model = bundle(model, _FIRST_SCALE_PX, cameras=False, tolerance=_FIRST_TOLERANCE)
-        else:
-            model = _with_others(renewed, tied, leading, scale)
+            continue
+        points = model.points_world.clone()
+        points[leading] = tied.points_world
+        if not bool(leading.all()):
+            others = model.without(leading[model.observation_point])
+            others = bundle(others, _FIRST_SCALE_PX, cameras=False, tolerance=_FIRST_TOLERANCE)
+            others = bundle(others, scale, cameras=False, tolerance=_TOLERANCE)
+            points[~leading] = others.points_world
+        model = model.replace(points_world=points)
     if rounds:
         limit = torch.where(aligned, 10 * scale, 2.0)  # features are less exact
         before = len(model.points_world)
@@ -141,18 +149,3 @@ def _adjusted(
     spread = float(observation_errors(tied)[aligned[leading]].median()) / 1.1774
     scale = min(max(spread, _SCALES_PX[0]), _SCALES_PX[1])
     return bundle(tied, scale, cameras=cameras, tolerance=_TOLERANCE), points, scale
-
-
-def _with_others(
-    model: SparseModel, tied: SparseModel, leading: Bool[Tensor, " point"], scale_px: float
-) -> SparseModel:
-    """Return all points with the adjusted cameras: leading ones as they are, others adjusted."""
-    model = model.replace(lenses=tied.lenses, cam_from_world=tied.cam_from_world)
-    points = model.points_world.clone()
-    points[leading] = tied.points_world
-    if not bool(leading.all()):
-        others = model.without(leading[model.observation_point])
-        for scale, tolerance in ((_FIRST_SCALE_PX, _FIRST_TOLERANCE), (scale_px, _TOLERANCE)):
-            others = bundle(others, scale, cameras=False, tolerance=tolerance)
-        points[~leading] = others.points_world
-    return model.replace(points_world=points)

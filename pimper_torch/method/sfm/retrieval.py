@@ -82,7 +82,7 @@ def nearest_pairs(
 
 
 def _some(descriptors: Descriptors, most: int) -> Descriptors:
-    """Keep so many at most, evenly spread."""
+    """Keep at most ``most``, evenly spread."""
     return descriptors[:: max(1, -(-len(descriptors) // most))]
 
 

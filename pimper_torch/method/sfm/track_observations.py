@@ -104,14 +104,14 @@ def _laid(points_world: Points, observed: Seen, normals: Points, cameras: Camera
 
 
 def evenly(candidates: Seen, most: Int[Tensor, "point 1"]) -> Seen:
-    """Keep so many views of each point at most, evenly spread among the candidates."""
+    """Keep at most ``most`` views of each point, evenly spread among the candidates."""
     place = candidates.cumsum(dim=1) * most
     count = torch.maximum(candidates.sum(dim=1, keepdim=True), most).clamp_min(1)
     return candidates & (place // count > (place - most) // count)
 
 
 def plane_normals(points: Points, towards: Points) -> Points:
-    """Return the unit normals of the planes that points and their nearest ones lie on.
+    """Return the unit normals of the planes through points and their nearest neighbours.
 
     Args:
         towards: Unit; what a normal points to, and what it is where neighbours say otherwise.

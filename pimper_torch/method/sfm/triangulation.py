@@ -120,8 +120,8 @@ def require_agreement(
     if total < 2 * MIN_MATCHES or right >= _DOUBTFUL * total:
         return
     found = (
-        f"{right / total:.0%} of {total} matches in {len(verified)} pairs of photographs lie "
-        f"within {max_error_px:g} px of the cameras' epipolar lines and before both cameras"
+        f"{right / total:.0%} of {total} matches in {len(verified)} pairs of photographs are "
+        f"within {max_error_px:g} px of the cameras' epipolar lines and in front of both cameras"
     )
     advice = (
         "Needed are cam_from_world, not its inverse, with camera axes x right, y down, z forward, "

@@ -210,7 +210,7 @@ def _undistorted(prior: AnyMap, lenses: Mapping[str, Lens | None]) -> AnyMap:
 
 
 def _straight(one: AnyMap, lens: Lens | None) -> AnyMap:
-    """Resample one map; what lies beside it in its raster stays as it is."""
+    """Resample one map; the rest of its raster stays as it is."""
     width, height = one.sizes_px[0].tolist()
     grid = source_grid(lens, one.sizes_px.double(), width, height) if lens else None
     if grid is None:

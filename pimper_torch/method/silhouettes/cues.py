@@ -139,7 +139,7 @@ class Cues(Record):
 
     Attributes:
         object_px: Pixels of the object's points, one tensor a view.
-        background_from_view: Maps to a room at rest before which the object turns; empty without.
+        background_from_view: Maps to a room at rest behind an object that turns; empty without.
         agreement: With the texture of plane and room, the better of both.
         soft: Masks that the photographs come with as priors.
     """
@@ -167,7 +167,7 @@ class Cues(Record):
 
     @property
     def all_round(self) -> bool:
-        """Whether backgrounds that are known are all round: a room, and the plane before it."""
+        """Whether known backgrounds surround the object: a room, and a plane in front of it."""
         return self.plane is not None and len(self.background_from_view) > 0
 
     def agreement_in(self, view: int) -> Map | None:
@@ -218,7 +218,7 @@ class Cues(Record):
         return self.replace(soft=self.soft.replace(seeds_px=tuple(pixels)))
 
     def seen_in(self, seen: Maps) -> "Cues":
-        """Keep points inside the hull alone where soft masks tell of the object."""
+        """Keep points inside the hull alone where soft masks show the object."""
         if self.soft is None:
             return self
         last = torch.tensor(seen.shape[:0:-1]) - 1
@@ -296,8 +296,8 @@ def split_cloud(
 ) -> tuple[Bool[Tensor, " point"], Bool[Tensor, " point"]]:
     """Find the points of the object, and those that certainly are not; others may be either.
 
-    With a plane they are what stands above it near the fixation point, without one what is near
-    that point.
+    With a plane they are the points above it near the fixation point, without one those near that
+    point.
 
     Args:
         tolerance: Of the plane, scene units.
@@ -328,7 +328,7 @@ def pixels_of(
 
     Args:
         observed: Those that the view observes, or else all in its frame: a point of the object is
-            inside its silhouette also where another part hides it.
+            inside its silhouette even where a different part hides it.
     """
     pixels, _ = project(scene.points_world, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px.to(pixels)[:, None]

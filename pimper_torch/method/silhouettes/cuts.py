@@ -81,7 +81,7 @@ class Cuts(Record):
         held: Fraction of the object's points that each cut holds.
         doubted: Views whose soft mask was not used.
         agreement: With the backgrounds; ``None`` without any.
-        hidden: Pixels of the cuts that show something before the object; ``None`` where none do.
+        hidden: Pixels of the cuts that show something in front of the object; ``None`` for none.
     """
 
     masks: Masks
@@ -199,7 +199,7 @@ def _in_front(cues: Cues, masks: Masks) -> Masks:
 
 
 def _first(cues: Cues) -> Masks:
-    """Cut from points and parallax; by parallax alone before a room, or with hardly a point.
+    """Cut from points and parallax; by parallax alone in front of a room, or with few points.
 
     Every other pixel is enough: all are cut again. Soft masks need no cut, but for the plane.
     """
@@ -239,8 +239,8 @@ def _cut(
 ) -> Mask:
     """Cut a view, by colours that shadows change little where there is a plane for them to fall on.
 
-    Those cannot tell the grey inside of a vessel from a grey table: what is well inside is the
-    object's unless the plane is seen there.
+    Those do not distinguish the grey inside of a vessel from a grey table: pixels well inside are
+    the object's unless the plane is seen there.
     """
     if cues.agreement is None:
         return how(cues.pictures.opponent[view], labels, 2)
@@ -381,7 +381,7 @@ def off_plane(agreement: Map) -> Mask:
 
 
 def in_front(cut: Mask, agreement: Map) -> Mask:
-    """Find what stands before the plane and is not the object, as a person who may hide some of it.
+    """Find what is in front of the plane but not the object, such as a person, who may hide it.
 
     Windows that hold some of the object do not agree with the plane either: what is as narrow as
     these is left out.
@@ -392,7 +392,7 @@ def in_front(cut: Mask, agreement: Map) -> Mask:
 
 
 def is_deep(margin: Map) -> Mask:
-    """Find what is so far inside that shadows beside the object do not reach it."""
+    """Find pixels so far inside that shadows next to the object do not reach them."""
     return margin > _DEEP * max(margin.shape)
 
 

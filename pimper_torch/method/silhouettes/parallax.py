@@ -1,10 +1,11 @@
-"""Parallax: what stands before a background does not look as the background does from elsewhere.
+"""Parallax: a thing in front of a background does not look like the background from elsewhere.
 
 Backgrounds are what views see through homographies: the plane that the object stands on, and a room
-at rest before which it turns. All photographs are rectified to it. The median of what they show
-there is its texture, without what stands before it and without shadows, which move with the light.
-Where a view agrees with it, it shows the background; where it does not, something stands before it,
-textured or not. Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
+at rest in front of which it turns. All photographs are rectified to it. Their median is its
+texture, without things in front of it and without shadows, which move with the light. Where a view
+agrees with it, it shows the background; elsewhere something is in front of it, textured or not.
+
+Source: Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
 """
 
 from collections.abc import Callable
