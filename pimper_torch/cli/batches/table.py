@@ -20,7 +20,9 @@ _COLUMNS = (
     *("peak_memory_mb", "place", "message", "photographs"),
 )
 SIGNS = {CSV: "name,status,tries,seconds", HTML: "<!-- pimper batch -->"}
-"""Text that tells our files: only what holds it is replaced."""
+"""Text by which our files are known: only files that hold it are replaced."""
+
+_WITH_RESULT = ("ended", "kept")
 
 
 def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]) -> None:
@@ -38,16 +40,12 @@ def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Pat
 def _row(one: Outcome, out: Path) -> dict[str, object]:
     """Return how an object ended and figures of its result, by column."""
     row: dict[str, object] = {}
-    if _has_result(asdict(one)):
+    if one.status in _WITH_RESULT:
         summary = json.loads((out / one.name / "summary.json").read_text(encoding="utf-8"))
         row = {name: summary.get(name, "") for name in _COLUMNS}
     seconds = one.seconds or float(str(row.get("seconds") or 0))
     row |= asdict(one) | {"seconds": seconds}
     return {key: round(it, 1) if isinstance(it, float) else it for key, it in row.items()}
-
-
-def _has_result(row: Mapping[str, object]) -> bool:
-    return row["status"] in ("ended", "kept")
 
 
 def _page(rows: Sequence[Mapping[str, object]], out: Path) -> str:
@@ -57,7 +55,7 @@ def _page(rows: Sequence[Mapping[str, object]], out: Path) -> str:
     statuses = [str(row["status"]) for row in rows]
     reasons = _reasons(rows, out)
     return page.substitute(
-        title=f"{sum(map(_has_result, rows))} of {len(rows)} objects",
+        title=f"{sum(one in _WITH_RESULT for one in statuses)} of {len(rows)} objects",
         counts=", ".join(f"{statuses.count(one)} {one}" for one in dict.fromkeys(statuses)),
         style=style.read_text(encoding="utf-8"),
         sign=SIGNS[HTML],

@@ -129,7 +129,11 @@ def _samples(points: Array, closed: bool, smooth: Array, stride: float) -> Array
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
     # The probability falls outward; its slope is the difference over half a pixel to either side.
     across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    rise = _read(smooth, points + 0.5 * across) - _read(smooth, points - 0.5 * across)
+    inner, outer = (
+        map_coordinates(smooth, (points + shift * across).T[::-1], order=1, mode="nearest")
+        for shift in (0.5, -0.5)
+    )
+    rise = inner - outer
     outward = -np.sign(rise)[:, None] * across
     behind, ahead = (
         np.take(tangent, np.arange(len(points)) + by, axis=0, mode="wrap" if closed else "clip")
@@ -146,10 +150,6 @@ def _samples(points: Array, closed: bool, smooth: Array, stride: float) -> Array
     chosen = chosen[good[chosen]]
     rows = np.concatenate([points, tangent, outward, np.abs(rise)[:, None]], axis=1)
     return np.asarray(rows[chosen])
-
-
-def _read(values: Array, points: Array) -> Array:
-    return np.asarray(map_coordinates(values, points.T[::-1], order=1, mode="nearest"))
 
 
 # Cosine between the offset from the nearest point's disc and its normal, from which on a place

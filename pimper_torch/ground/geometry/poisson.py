@@ -23,15 +23,6 @@ from pimper_torch.records import Mesh
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import ReconstructionError
 
-
-def write_cloud(points: Points, normals: Points, path: Path) -> None:
-    """Write points with normals as binary PLY."""
-    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
-    start = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
-    rows = torch.cat([points, normals], dim=1).detach().cpu().float().numpy().astype("<f4")
-    path.write_bytes(f"{start}{properties}end_header\n".encode("ascii") + rows.tobytes())
-
-
 # COLMAP's octree is dense down to this depth, or to the least that any call of the process asked
 # for: a call with less would change the surfaces of all calls after it.
 _DENSE_DEPTH = 5
@@ -62,9 +53,12 @@ def poisson_surface(
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.point_weight = max(_DENSE_DEPTH, depth), point_weight
     options.trim, options.color, options.num_threads = 0.0, False, 1
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    start = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+    rows = torch.cat([points, normals], dim=1).detach().cpu().float().numpy().astype("<f4")
     with tempfile.TemporaryDirectory() as folder:
         cloud, surface = Path(folder) / "cloud.ply", Path(folder) / "surface.ply"
-        write_cloud(points, normals, cloud)
+        cloud.write_bytes(f"{start}{properties}end_header\n".encode("ascii") + rows.tobytes())
         return _made(surface, "Poisson", pycolmap.poisson_meshing, cloud, surface, options)
 
 

@@ -6,6 +6,9 @@ Torch's compressed rows take up to 4 times as long for less than a million unkno
 Vectors have one row per unknown and one column per right-hand side.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -71,18 +74,15 @@ class Level:
         over_rows(sparse_products.corrected, size, *arrays, of_step, _OF_CORRECTION)
         return found
 
-    def coarse_residual(self, residual: Sides, found: Sides) -> Float[Tensor, "coarse side"]:
-        """Return the restricted residual of a solution."""
+    def correct(self, residual: Sides, found: Sides, coarser: Callable[[Sides], Sides]) -> None:
+        """Add the prolonged correction that the next level makes of the restricted residual."""
+        assert self._prolong is not None, "the last level has no coarser one"
         assert self._restrict is not None
         remaining = self._buffer("left", residual)
         with_product(self._matrix, found, residual, keep=1.0, gain=-1.0, found=remaining)
         coarse = self._buffer("coarse", residual, self._restrict.shape[0])
-        return with_product(self._restrict, remaining, found=coarse)
-
-    def add_coarse(self, found: Sides, coarse: Float[Tensor, "coarse side"]) -> None:
-        """Add the prolonged correction of the next level."""
-        assert self._prolong is not None
-        with_product(self._prolong, coarse, found, keep=1.0, found=found)
+        correction = coarser(with_product(self._restrict, remaining, found=coarse))
+        with_product(self._prolong, correction, found, keep=1.0, found=found)
 
     def _buffer(self, name: str, like: Tensor, size: int | None = None) -> Tensor:
         """Return a named buffer, kept from cycle to cycle while its shape is the same."""
@@ -129,8 +129,7 @@ class Hierarchy:
                     return self._coarsest @ residual
             return level.smoothed(residual)
         found = level.smoothed(residual)
-        coarse = self._cycle(depth + 1, level.coarse_residual(residual, found))
-        level.add_coarse(found, coarse)
+        level.correct(residual, found, partial(self._cycle, depth + 1))
         return level.smoothed(residual, found)
 
 

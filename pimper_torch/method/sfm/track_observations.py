@@ -64,15 +64,13 @@ def tangents(points_world: Points, observed: Seen, cameras: Cameras) -> Tangents
     """Lay a plane through every point and choose the views to look for it in."""
     at_once = max(1, 2**22 // cameras.num_views)  # 100 MB of rays
     points, seen = torch.split(points_world, at_once), torch.split(observed, at_once)
-    towards = [_towards(some, by, cameras) for some, by in zip(points, seen, strict=True)]
+    towards = []
+    for some, by in zip(points, seen, strict=True):
+        rays = normalize(cameras.centers_world - some[:, None], dim=-1)
+        towards.append(normalize((rays * by[..., None]).sum(dim=1), dim=-1))
     normals = torch.split(plane_normals(points_world, torch.cat(towards)), at_once)
     laid = zip(points, seen, normals, strict=True)
     return Tangents.cat([_laid(some, by, across, cameras) for some, by, across in laid])
-
-
-def _towards(points_world: Points, observed: Seen, cameras: Cameras) -> Points:
-    rays = normalize(cameras.centers_world - points_world[:, None], dim=-1)
-    return normalize((rays * observed[..., None]).sum(dim=1), dim=-1)
 
 
 def _laid(points_world: Points, observed: Seen, normals: Points, cameras: Cameras) -> Tangents:

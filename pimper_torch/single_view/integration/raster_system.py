@@ -62,7 +62,16 @@ class RasterSystem:
         held = anchor.flatten().cpu().double()
         degree = weight.new_zeros(count).index_add(0, first, weight).index_add(0, second, weight)
         self._inside = degree.detach() + held.detach() != 0
-        self._find_free(torch.stack([first, second], dim=1), held.detach() > 0)
+        # Free components are those without anchor, but for single pixels.
+        edges, anchored = torch.stack([first, second], dim=1), held.detach() > 0
+        label = graph_components(edges, count).long()
+        known = label[anchored].bincount(minlength=count + 1) > 0
+        tied = edges.flatten().bincount(minlength=count) > 0
+        self._pixel = (tied & ~known[label]).nonzero()[:, 0]
+        free, self._component = torch.unique(label[self._pixel], return_inverse=True)
+        root = self._pixel.new_full((len(free),), count)
+        self._root = root.scatter_reduce(0, self._component, self._pixel, "amin")
+        self._size = torch.bincount(self._component, minlength=len(free)).double()
         # Anchors of free components are zero and stay it.
         held = held.index_fill(0, self._pixel, 0.0)
         # Doubled at one pixel of each free component, so that the matrix is definite. With a
@@ -115,17 +124,6 @@ class RasterSystem:
         if heights is not None:
             source = source + _times(anchor, heights)
         return self.solve(source).to(right)
-
-    def _find_free(self, edges: Tensor, anchored: Tensor) -> None:
-        """Find the connected components without anchor, but for single pixels."""
-        label = graph_components(edges, len(anchored)).long()
-        known = label[anchored].bincount(minlength=len(label) + 1) > 0
-        connected = edges.flatten().bincount(minlength=len(label)) > 0
-        self._pixel = (connected & ~known[label]).nonzero()[:, 0]
-        free, self._component = torch.unique(label[self._pixel], return_inverse=True)
-        root = self._pixel.new_full((len(free),), len(label))
-        self._root = root.scatter_reduce(0, self._component, self._pixel, "amin")
-        self._size = torch.bincount(self._component, minlength=len(free)).double()
 
     def _centered(self, heights: Float[Tensor, "pixel side"]) -> Float[Tensor, "pixel side"]:
         """Subtract from each free component its mean."""
