@@ -43,27 +43,28 @@ def load_views(
 ) -> Views:
     """Read the photographs of a folder, in the natural order of their names.
 
-    Of a folder without photographs but with folders of them, three at least, each of these holds
-    the photographs of one pose of the camera, each under another light.
+    If the folder has no photographs but at least three folders of them, each of these holds the
+    photographs of one pose of the camera, under different lights.
 
-    JPEG, PNG and TIFF of 8 or 16 bits, HEIC and camera raw where their extras are installed; other
-    files are passed over, with a warning where they look like photographs. EXIF's orientation is
-    applied, its focal length kept in pixels. The response is undone, so that radiance is linear:
-    the one given, else the one that each file tells, else sRGB. Colours are turned into the
-    primaries of sRGB. Radiance 1 is saturation, in every colour: the level that is told, or at
-    which values pile up, or full scale. Photographs of unlike sizes are padded.
+    JPEG, PNG and TIFF of 8 or 16 bits are read, HEIC and camera raw if their extras are installed;
+    a warning names other files that look like photographs. EXIF's orientation is applied, its focal
+    length kept in pixels. The response is undone, so that radiance is linear: the given one, else
+    that of the file, else sRGB. Colours are converted to the primaries of sRGB. Radiance 1 is
+    saturation, in every colour: the stated level, or the one at which values pile up, or full
+    scale. Photographs of different sizes are padded.
 
-    Masks are images of the photographs' sizes, at least half as bright on the object as the
-    brightest pixel of all masks; labels and transparency are followed, and inverted masks turned
-    round. Without a folder of masks, alpha channels that are somewhere transparent are the masks,
-    and a warning says so. The manual has tables of what files tell, and of how masks are read.
+    Masks have the photographs' sizes, and are at least half as bright on the object as the
+    brightest pixel of all masks; labels and transparency are followed, and inverted masks are
+    inverted back. Without a folder of masks, alpha channels that are somewhere transparent are the
+    masks, and a warning says so. The manual has tables of the metadata that are read, and of the
+    kinds of masks.
 
     Args:
         masks: Folder with one mask for each photograph, of the same name whatever the
             suffix (``17.jpg``: ``17.png``, COLMAP's ``17.jpg.png``, or ``17_mask.png``), or of
-            one that differs in case, spaces or Unicode form. They are turned as EXIF turns their
-            photographs; those of the pixels that files store are turned where sizes differ. A
-            run with cameras finds out where sizes are equal.
+            one that differs in case, spaces or Unicode form. A mask of the pixels that the file
+            stores is turned as EXIF turns its photograph if their sizes show it; a run with cameras
+            finds it if sizes are equal.
         mask_object: How masks show the object; ``auto`` looks at them.
         encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs whose longer side is longer, in linear light and
@@ -75,10 +76,10 @@ def load_views(
 
     Raises:
         InputError: Names the photographs or masks that are missing, damaged or saturated all
-            over, do not belong together or do not fit the encoding, and says what to do; most
+            over, do not belong together or do not fit the encoding, and the remedy; most
             photographs are black. A :class:`~pimper_torch.runtime.errors.PimperWarning` names
-            photographs that are black all over, which are left out, and those of which hardly
-            anything is left, and tells a level of saturation that was found.
+            photographs that are black all over, which are left out, photographs that are nearly
+            all saturated, and a level of saturation that was found.
     """
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
@@ -221,7 +222,7 @@ def _read_masks(
 
 
 def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: Path | str | None) -> bool:
-    """Return whether masks show the object dark, by all of them together; a warning says so."""
+    """Return whether masks show the object dark, judged by all together; a warning says so."""
     around, inside = around_and_inside(opacities) if opacities else (0.0, 0.0)
     # An object that fills its photographs is bright in the centre, too.
     dark = inside < 0.75 < around
@@ -236,7 +237,7 @@ def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: Path | str
 
 
 def _brightness(path: Path) -> Map:
-    """Read how bright a mask is; 1 on the object where labels or transparency tell it."""
+    """Read the brightness of a mask; 1 on the object if it has labels or transparency."""
     decoded = decode(path)
     brightest = decoded.samples.amax(dim=0)
     labelled = not decoded.lossy and float(brightest.max()) * decoded.full < 32
@@ -297,7 +298,7 @@ def _judge(
             "object, black off it. Draw them again, or leave these photographs out."
         )
     blind = [name for name, fraction in left.items() if fraction <= _LIT_FRACTION]
-    what = "Expose less, or tell the level of saturation by `photographs.saturation`"
+    what = "Expose less, or state the level of saturation by `photographs.saturation`"
     if blind:
         raise InputError(
             f"{folder}: {some(blind)} {'is' if len(blind) == 1 else 'are'} saturated all over. "
