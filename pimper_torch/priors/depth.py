@@ -86,7 +86,7 @@ def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
         if helps and surely_better(worth[best, -1], worth[stated, -1]):
             raise InputError(
                 f"{where} is {_READINGS[ways[best]]}, given as {_READINGS[ways[stated]]}: the "
-                f"cloud shows it (median error {at(best)} against {at(stated)}). State the right one."
+                f"cloud shows it (median error {at(best)} against {at(stated)}). State the first."
             )
         worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
         if helps and worse and surely_better(worth[stated, -1], worth[stated, gauge]):

@@ -41,8 +41,9 @@ def write(folder, files):
 def test_of_maps_of_several_kinds_in_one_folder_the_wanted_kind_is_read(kind, tmp_path):
     """As of MoGe (a folder a photograph), and of estimators that append what it is."""
     kinds = ("depth", "depth_vis", "mask", "normal")
-    for layout in ("cup_{}/{}.npy", "cup_{}_{}.npy", "{1}/cup_{0}.npy", "cup_{}-pred_{}.npy"):
-        folder = tmp_path / layout[:9]
+    layouts = "cup_{}/{}.npy", "cup_{}_{}.npy", "{1}/cup_{0}.npy", "cup_{}-pred_{}.npy"
+    for layout in (*layouts, "cup_{}_pred/{}.npy"):
+        folder = tmp_path / layout.replace("/", " in ")
         write(folder, [layout.format(name, of) for name in (1, 2) for of in kinds])
         number = kinds.index(kind)
         assert numbers_of(folder, FLAT, kind) == dict(zip(FLAT, (number, number + 4), strict=True))

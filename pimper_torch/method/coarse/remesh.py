@@ -1,5 +1,7 @@
 """Remeshing: facets that the surface departs from are split, unseen ones dropped."""
 
+from bisect import bisect_right
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -217,23 +219,19 @@ def _worst_first(
     _, face_edge = face_edges(faces)
     wanted = torch.where(small, 0, severity)
     order = wanted.argsort(descending=True, stable=True)
-    most, least = int((wanted > 1).sum()), 0
+    most = int((wanted > 1).sum())
 
     def marks(count: int) -> Bool[Tensor, " edge"]:
         chosen = torch.zeros_like(small)
         chosen[order[:count]] = True
         return splitting.mark_edges(vertices, faces, chosen, small)
 
-    def facets(marked: Bool[Tensor, " edge"]) -> int:
-        return int((1 + marked[face_edge].sum(dim=1))[kept].sum())
+    def facets(count: int) -> int:
+        return int((1 + marks(count)[face_edge].sum(dim=1))[kept].sum())
 
-    found = marks(most)
-    if facets(found) <= max_facets:
-        return found
-    while most - least > 1:
-        centre = (most + least) // 2
-        least, most = (centre, most) if facets(marks(centre)) <= max_facets else (least, centre)
-    return marks(least)
+    if facets(most) > max_facets:
+        most = bisect_right(range(1, most), max_facets, key=facets)
+    return marks(most)
 
 
 def _without_folds(flat: Vertices, onto: Vertices, faces: Faces) -> Vertices:

@@ -127,46 +127,33 @@ class Guesses(FactorPrior):
 
     def forward(self, samples: PatchSamples) -> Known:
         """Return the guesses in units of the light field and the albedo under it."""
-        albedo, albedo_weight = _guessed_albedo(samples)
-        lights, light_weight = _guessed_lights(samples)
-        information = samples.guessed_information
-        return Known(
-            normals=samples.guessed_normals,
-            normal_weight=None if information is None else views_worth(information),
-            albedo=albedo,
-            albedo_weight=albedo_weight,
-            lights=lights,
-            light_weight=light_weight,
-            inlier=samples.guessed_inlier,
-        )
+        known = Known(normals=samples.guessed_normals, inlier=samples.guessed_inlier)
+        if (information := samples.guessed_information) is not None:
+            known = known.replace(normal_weight=views_worth(information))
+        albedo, variance = samples.guessed_albedo, samples.guessed_albedo_variance
+        if albedo is not None and variance is not None:
+            both = (albedo > 0) & (samples.albedo > 0)
+            if bool(both.any()):
+                scale = _median_ratio(samples.albedo, albedo, both)
+                weight = torch.where(both, views_worth(1 / variance), 0)
+                known = known.replace(albedo=scale * albedo, albedo_weight=weight)
+        lights, variance = samples.guessed_lights, samples.guessed_light_variance
+        if lights is not None and variance is not None:
+            length = lights.norm(dim=2)
+            both = variance.isfinite() & (length > 0)
+            scale = _median_ratio(samples.lights.norm(dim=2), length, both)
+            # The field itself is 6 degrees off: a variance of 0.01 of its square.
+            weight = torch.where(both, 0.01 / torch.where(both, variance, 1), 0)
+            known = known.replace(lights=scale[..., None] * lights, light_weight=weight)
+        return known
 
 
-def _guessed_albedo(
-    samples: PatchSamples,
-) -> tuple[Float[Tensor, "patch sample"] | None, Float[Tensor, "patch sample"] | None]:
-    guess, variance = samples.guessed_albedo, samples.guessed_albedo_variance
-    if guess is None or variance is None:
-        return None, None
-    both = (guess > 0) & (samples.albedo > 0)
-    if not bool(both.any()):
-        return None, None
-    ratio = torch.where(both, samples.albedo / torch.where(both, guess, 1), torch.nan)
-    factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
-    return factor * guess, torch.where(both, views_worth(1 / variance), 0)
-
-
-def _guessed_lights(
-    samples: PatchSamples,
-) -> tuple[Float[Tensor, "patch view 4"] | None, Float[Tensor, "patch view"] | None]:
-    lights, variance = samples.guessed_lights, samples.guessed_light_variance
-    if lights is None or variance is None:
-        return None, None
-    length = lights.norm(dim=2)
-    known = variance.isfinite() & (length > 0)
-    ratio = samples.lights.norm(dim=2) / torch.where(known, length, torch.nan)
-    factor = ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
-    # The field itself is 6 degrees off: a variance of 0.01 of its square.
-    return factor[..., None] * lights, torch.where(known, 0.01 / torch.where(known, variance, 1), 0)
+def _median_ratio(
+    own: Float[Tensor, "patch item"], guess: Float[Tensor, "patch item"], known: Tensor
+) -> Float[Tensor, "patch 1"]:
+    """Return each patch's factor from guesses to its own values; 0 where nothing is known."""
+    ratio = torch.where(known, own / torch.where(known, guess, 1), torch.nan)
+    return ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
 
 
 def views_worth(information: Scalars) -> Scalars:

@@ -208,13 +208,13 @@ class Factorize(Stage):
         factors = self._solve(problem)
         if torch.is_grad_enabled() and problem.requires_grad:
             factors = differentiable(problem, factors)
-        estimates = recomputed(refine_on_manifold, problem, factors)
+        gray, normals, information = recomputed(refine_on_manifold, problem, factors)
         views = rows.seen.shape[1]  # a view beyond them represents known albedo
         lights, weight = factors.lights[:, :views], factors.weight[:, :views]
         anchor, given = problem.anchor[:, :views], problem.weight[:, :views]
         finite = lights.isfinite().flatten(1).all(dim=1)
-        estimated = estimates.normals.isfinite().all(dim=2) & estimates.albedo.isfinite()
-        estimated &= (estimates.albedo > 0) & (rows.seen.sum(dim=1) >= self.config.min_views)
+        estimated = normals.isfinite().all(dim=2) & gray.isfinite()
+        estimated &= (gray > 0) & (rows.seen.sum(dim=1) >= self.config.min_views)
         outvoted = (weight < given / 2) & rows.seen
         leave_out("photometry.robust", int(outvoted.sum()), total=int(rows.seen.sum()))
         failed = (status == int(PatchStatus.DETERMINED)) & ~(finite & estimated.any(dim=1))
@@ -222,11 +222,11 @@ class Factorize(Stage):
         lost, reason = bucket.templates.facet[failed], "the solver found no finite solution"
         skipped_patches("factorize", lost, reason, _COARSE_NORMALS)
         determined = (status == int(PatchStatus.DETERMINED))[:, None]
-        valid = estimated & determined & (estimates.normals[..., 2] < 0)
+        valid = estimated & determined & (normals[..., 2] < 0)
         fitted = finite & rows.seen.flatten(1).any(dim=1)
         lights = torch.where(fitted[:, None, None], lights, anchor)
         lights = lights * rows.seen.any(dim=2)[..., None]
-        normals = torch.where(valid[..., None], estimates.normals, rows.normals)
+        normals = torch.where(valid[..., None], normals, rows.normals)
         weight = torch.where(determined[..., None], weight, given)
         basis = harmonics(normals).mT
         albedo = recomputed(fit_albedo, rows.radiance, weight, lights, basis)
@@ -239,7 +239,7 @@ class Factorize(Stage):
             albedo=on_raster(albedo.mT, rows.index, black),
             lights_patch=lights,
             valid=on_raster(valid, rows.index, blank > 0),
-            information=on_raster(estimates.information * valid, rows.index, blank),
+            information=on_raster(information * valid, rows.index, blank),
             status=status,
             convergence=factors.convergence.replace(residual=finite_residual),
         )

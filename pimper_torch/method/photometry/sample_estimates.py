@@ -79,22 +79,11 @@ def on_raster(
 BORROWED_VIEWS = 4.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class SampleEstimates(Record):
-    """Each sample's estimates.
-
-    Attributes:
-        albedo: Gray.
-        normals: Unit.
-        information: Inverse variance of the normals, 1 / rad^2; 0 where they are not determined.
-    """
-
-    albedo: Float[Tensor, "patch sample"]
-    normals: Float[Tensor, "patch sample 3"]
-    information: Float[Tensor, "patch sample"]
-
-
-def refine_on_manifold(problem: Bilinear, factors: Factors) -> SampleEstimates:
+def refine_on_manifold(
+    problem: Bilinear, factors: Factors
+) -> tuple[
+    Float[Tensor, "patch sample"], Float[Tensor, "patch sample 3"], Float[Tensor, "patch sample"]
+]:
     r"""Take a last Gauss-Newton step of each sample, and give its normal's inverse variance.
 
     With ``A`` and ``b`` the sample's normal equations and ``B`` the manifold's tangents,
@@ -106,14 +95,17 @@ def refine_on_manifold(problem: Bilinear, factors: Factors) -> SampleEstimates:
     :math:`\sigma^2 = s^2 (C_{11} + C_{22}) / \rho^2` with ``C`` the inverse of
     :math:`B^\top A B` for the tangents that rotate the normal and :math:`s^2` the variance of the
     residuals, the sample's and the patch's pooled. Differentiable in factors and radiance.
+
+    Returns:
+        Gray albedo, unit normals, and the normals' inverse variance, one over squared radians; 0
+        where they are not determined.
     """
     A, b = bilinear.equations_of_samples(problem, factors.lights, factors.weight)
     slope = b - apply_packed(A, factors.shading)
     moved = bilinear.tangent_step(problem.manifold, A, slope, factors.shading)
     albedo, normals = problem.manifold.split(moved.mT)
     curvature = bilinear.curvature_along(problem.manifold.tangents(factors.shading), A)
-    information = _information(problem, factors, curvature)
-    return SampleEstimates(albedo=albedo, normals=normals, information=information)
+    return albedo, normals, _information(problem, factors, curvature)
 
 
 def fit_albedo(

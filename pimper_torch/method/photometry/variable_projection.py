@@ -148,7 +148,9 @@ def _step(
             weight = bilinear.robust_weights(problem, state.lights, state.shading)
             cost, slope = bilinear.evaluate(problem, state.lights, state.shading, weight)
             state = state.replace(weight=weight, cost=cost, slope=slope)
-        state = state.replace(curvature=_curvature(problem, state, curvature_samples))
+        at = state.lights, state.shading, state.weight
+        curvature = curvature_of_lights(problem, *at, curvature_samples)
+        state = state.replace(curvature=curvature)
     cause = torch.where(stalled, int(StopCause.STALLED), bilinear.RUNNING)
     return state, torch.where(exact | (small >= small_steps), int(StopCause.CONVERGED), cause)
 
@@ -160,24 +162,17 @@ def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
     shading = bilinear.update_shading(problem, *equations, problem.shading, SHADING_STEPS)
     cost, slope = bilinear.evaluate(problem, lights, shading, weight)
     seen = (weight * problem.radiance).flatten(1)
-    state = _State(
+    return _State(
         lights=lights,
         shading=shading,
         weight=weight,
         energy=torch.linalg.vecdot(seen, problem.radiance.flatten(1)),
         cost=cost,
         slope=slope,
-        curvature=lights.new_zeros(len(lights), 0, 0),
+        curvature=curvature_of_lights(problem, lights, shading, weight, curvature_samples),
         damping=torch.full_like(cost, INITIAL_DAMPING),
         small=torch.zeros_like(cost).long(),
     )
-    return state.replace(curvature=_curvature(problem, state, curvature_samples))
-
-
-def _curvature(
-    problem: Bilinear, state: _State, samples: int | None
-) -> Float[Tensor, "patch unknown unknown"]:
-    return curvature_of_lights(problem, state.lights, state.shading, state.weight, samples)
 
 
 def _whitened(
