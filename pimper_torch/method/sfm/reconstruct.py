@@ -1,6 +1,5 @@
 """Structure from motion: photographs to cameras and a sparse cloud."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -168,7 +167,14 @@ def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
     focals_px = [one if 0 < one < float("inf") else None for one in views.focals_px.tolist()]
     release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
     with workspace(views, config.num_threads) as space:
-        _require_features(find_features(space, config, focals_px, lenses), views.names)
+        counts = find_features(space, config, focals_px, lenses)
+        bare = [name for count, name in zip(counts, views.names, strict=True) if count == 0]
+        if views.num_views - len(bare) < 3:
+            raise ReconstructionError(
+                f"No features were found in {len(bare)} of {views.num_views} photographs: "
+                f"{some(bare, most=20)}. At least 3 photographs with features are needed. Check "
+                "that they are not black, blank or masked out entirely, and expose them brighter."
+            )
         release_memory()
         found = register(space, config)
     release_memory()
@@ -213,14 +219,4 @@ def _require_finite(views: Views) -> None:
         raise InputError(
             f"NaN or infinity in the photographs {', '.join(odd)}; needed: radiance in numbers. "
             "Set these pixels to 0 and leave them out by `masks`, or to 1 if they are saturated."
-        )
-
-
-def _require_features(counts: Sequence[int], names: Sequence[str]) -> None:
-    bare = [name for count, name in zip(counts, names, strict=True) if count == 0]
-    if len(names) - len(bare) < 3:
-        raise ReconstructionError(
-            f"No features were found in {len(bare)} of {len(names)} photographs: "
-            f"{some(bare, most=20)}. At least 3 photographs with features are needed. Check "
-            "that they are not black, blank or masked out entirely, and expose them brighter."
         )

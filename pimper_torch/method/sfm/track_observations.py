@@ -304,13 +304,13 @@ def _templates(
     normal = slopes.mT @ slopes
     worst, best = torch.linalg.eigvalsh(normal).unbind(dim=1)
     # Below, the patch is a stripe, and noise determines its place.
-    told = (best > 1e-9) & (worst > 0.01 * best)
-    safe = torch.where(told[:, None, None], normal, torch.eye(2).to(normal))
+    textured = (best > 1e-9) & (worst > 0.01 * best)
+    safe = torch.where(textured[:, None, None], normal, torch.eye(2).to(normal))
     return _Templates(
         values=window.freed(patches),
         slopes=slopes,
         inverse=torch.linalg.inv(safe),
-        usable=whole & told,
+        usable=whole & textured,
     )
 
 
