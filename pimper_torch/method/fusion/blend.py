@@ -130,7 +130,12 @@ def blend_patches(
     vertices = _Lists.of(
         subdivision.facet, torch.arange(len(subdivision.points)).to(faces), len(faces)
     )
-    around = _facets_around(faces)
+    # Of each facet itself and the facets that share a corner with it, in order.
+    own = torch.arange(len(faces), device=faces.device)[:, None].expand_as(faces).flatten()
+    corner = faces.flatten()
+    taken, facet = _Lists.of(corner, own, int(corner.max()) + 1).take(corner)
+    pairs = torch.unique(torch.stack([own[taken], facet], dim=1), dim=0)
+    around = _Lists.of(pairs[:, 0], pairs[:, 1], len(faces))
     heights = swept if swept is not None else [None] * len(depths.buckets)
     buckets = zip(
         depths.patches.buckets, depths.buckets, depths.photometric.buckets, heights, strict=True
@@ -300,15 +305,6 @@ class _Lists:
         taken = torch.arange(len(which), device=which.device).repeat_interleave(count)
         within = torch.arange(len(taken), device=which.device) - (count.cumsum(0) - count)[taken]
         return taken, self.index[self.start[which][taken] + within]
-
-
-def _facets_around(faces: Int[Tensor, "facet 3"]) -> _Lists:
-    """List, for each facet, itself and the facets that share a corner with it, in order."""
-    own = torch.arange(len(faces), device=faces.device)[:, None].expand_as(faces).flatten()
-    corner = faces.flatten()
-    taken, facet = _Lists.of(corner, own, int(corner.max()) + 1).take(corner)
-    pairs = torch.unique(torch.stack([own[taken], facet], dim=1), dim=0)
-    return _Lists.of(pairs[:, 0], pairs[:, 1], len(faces))
 
 
 def _barycentric_map(corners: Float[Tensor, "patch 3 2"]) -> Float[Tensor, "patch 3 3"]:

@@ -58,49 +58,27 @@ def fit_lights(
         iterations: At most, where no gradients are required.
         start: Lights and albedo; by default, see :meth:`LightModel.initialize`.
     """
+    from pimper_torch.ground.kernels.lights_and_albedo import TILE, fit
+
     limit, min_gain = _TO_CONVERGENCE if _requires_grad(model, samples) else (iterations, _MIN_GAIN)
     with torch.no_grad():
         lights, albedo = start or model.initialize(samples)
-        lights, albedo = _minimize(model, samples, model.clamp(lights), albedo, limit, min_gain)
-    return LightFit(model=model, lights=lights, albedo=albedo)
+        count, device, padding = len(albedo), albedo.device, (0, -len(albedo) % TILE)
+        lights = model.clamp(lights).cpu().clone(memory_format=torch.contiguous_format)
+        known, radiance, seen = (
+            pad(each.detach().mT.to(lights), padding).contiguous().numpy()
+            for each in (torch.cat(model.geometry(), dim=1), samples.radiance, samples.seen)
+        )
+        albedo, level = pad(albedo.cpu(), padding), samples.level.detach().cpu().numpy()
+        closest = 1 / light_models.MIN_DISTANCE
+        # Jointly: alternation converges slowly along the valley of lights and albedo.
+        fit(known, radiance, seen, level, closest, limit, min_gain, lights.numpy(), albedo.numpy())
+    return LightFit(model=model, lights=lights.to(device), albedo=albedo[:count].to(device))
 
 
 def _requires_grad(model: LightModel, samples: ImageSamples) -> bool:
     parts = (samples.radiance, *model.geometry())
     return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
-
-
-def _minimize(
-    model: LightModel,
-    samples: ImageSamples,
-    lights: light_models.Parameters,
-    albedo: light_models.Albedo,
-    limit: int,
-    min_gain: float,
-) -> Unknowns:
-    """Minimize over lights and albedo jointly; alternation converges slowly along their valley."""
-    from pimper_torch.ground.kernels.lights_and_albedo import TILE, fit
-
-    count, device = len(albedo), albedo.device
-    lights, found = lights.cpu().clone(memory_format=torch.contiguous_format), albedo.cpu()
-    padding = (0, -count % TILE)
-    known, radiance, seen = (
-        pad(each.detach().mT.to(found), padding).contiguous().numpy()
-        for each in (torch.cat(model.geometry(), dim=1), samples.radiance, samples.seen)
-    )
-    found, level = pad(found, padding), samples.level.detach().cpu()
-    fit(
-        known,
-        radiance,
-        seen,
-        level.numpy(),
-        1 / light_models.MIN_DISTANCE,
-        limit,
-        min_gain,
-        lights.numpy(),
-        found.numpy(),
-    )
-    return lights.to(device), found[:count].to(device)
 
 
 def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:

@@ -26,7 +26,7 @@ class Layer(NamedTuple):
 
     Attributes:
         values: ``height width channel``: whole numbers of 8 and 16 bits in [0, 1], other values as
-            they are; NaN where PNG says that there is nothing.
+            they are; NaN where a PNG is transparent, or MoGe's depth is unknown.
         variance: ``height width``, where the file has it.
         full: Of whole numbers, the level that is 1 in ``values``; else 0.
     """
@@ -111,7 +111,7 @@ def _raster(path: Path, values: np.ndarray) -> Layer:
 
 
 def _picture(path: Path, cut_out: bool) -> Layer:
-    """Read samples; depth that MoGe wrote, whose levels are logarithms, as depth."""
+    """Read samples; MoGe's depth, whose levels are logarithms, becomes depth."""
     decoded = decode(path)
     if cut_out and decoded.alpha is not None and bool((decoded.alpha < 1).any()):
         return Layer(decoded.alpha.numpy()[..., None])

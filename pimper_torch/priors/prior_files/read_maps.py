@@ -24,9 +24,9 @@ def read_normals(
 ) -> NormalPrior:
     """Read normals of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
 
-    A map has the photograph's name, with what estimators append, its shape, and any size. PNG, and
-    arrays without a negative value, hold ``(n + 1) / 2``. Vectors far from unit length, and NaN,
-    say nothing. ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, has the mean square of the
+    A map has the photograph's name, with words that estimators append, its shape, and any size. PNG
+    and arrays without a negative value hold ``(n + 1) / 2``. Vectors far from unit length, and NaN,
+    are unknown. ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, has the mean square of the
     angular error in squared radians.
 
     Args:
@@ -66,8 +66,9 @@ def read_depth(
 ) -> DepthPrior:
     """Read depth of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
 
-    A map has the photograph's name, with what estimators append, its shape, and any size. 0, NaN,
-    infinity, 1e10, and 65504 and 65535 apart from other values say nothing; a warning counts these.
+    A map has the photograph's name, with words that estimators append, its shape, and any size. 0,
+    NaN, infinity, 1e10, and 65504 and 65535 far from other values are unknown; a warning counts
+    them.
     PNG counts in its full scale, that of MoGe in metres (text ``near`` and ``far``).
     ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, has squared units.
 

@@ -1,4 +1,4 @@
-"""Silhouettes of a segmenter, and those that a person points at."""
+"""Silhouettes of a segmenter, and pixels that a person points at."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,9 +21,9 @@ def read_silhouettes(
 ) -> SilhouettePrior:
     """Read soft masks of photographs from a folder: PNG or JPEG of 8 or 16 bits, EXR, NPZ or NPY.
 
-    A mask has the photograph's name, with what segmenters append, its shape, and any size; some
-    photographs may have none. It is 1 on the object, in full scale. In pictures that are somewhere
-    transparent it is their opacity. NaN says nothing.
+    A mask has the photograph's name, with words that segmenters append, its shape, and any size;
+    some photographs may have none. It is 1 on the object, in full scale. The mask of a picture that
+    is somewhere transparent is its opacity. NaN is unknown.
 
     Args:
         undistorted: Whether they are of the photographs as a run undistorts them.
@@ -53,7 +53,7 @@ def _chance(path: Path, layer: Layer) -> np.ndarray:
 
 
 def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
-    """Make maps of pixels that show the object, and say nothing elsewhere.
+    """Make maps of pixels that show the object; all other pixels are unknown.
 
     Args:
         marks: Places on it, in one photograph or more each.
