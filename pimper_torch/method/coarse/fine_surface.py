@@ -14,12 +14,11 @@ from pimper_torch.ground.geometry.pixels import crop_intrinsics
 from pimper_torch.ground.geometry.poisson import poisson_surface
 from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.ground.shapes import Faces, VertexMask, Vertices
+from pimper_torch.ground.shapes import Faces, Vertices
 from pimper_torch.method.coarse import oriented, trim
 from pimper_torch.method.coarse.densify import factors
 from pimper_torch.method.coarse.window_matching import level_of
 from pimper_torch.records import (
-    Cameras,
     ContourPoints,
     OrientedPoints,
     Record,
@@ -163,25 +162,14 @@ def closed_surface(
         if not len(touched.ray):
             break
         normals = vertex_normals(vertices, faces)
-        front = visible_vertices(vertices, faces, normals, contours.cameras, trim.CELL_PX * pixel)
+        caster, front = RayCaster(vertices, faces), torch.zeros_like(normals[:, 0]) > 0
+        for center in contours.cameras.centers_world.to(vertices):
+            towards = normalize(center - vertices, dim=1)
+            facing = ((towards * normals).sum(dim=1) > 0.1) & ~front
+            # Surface in front of a vertex occludes it only from a cell away.
+            front[facing] = ~caster.occluded(vertices[facing], center, trim.CELL_PX * pixel)
         points, normals = vertices[front], normals[front]
     return vertices, faces, touched
-
-
-def visible_vertices(
-    vertices: Vertices, faces: Faces, normals: Vertices, cameras: Cameras, tolerance: float
-) -> VertexMask:
-    """Find the vertices that face a camera and are not occluded.
-
-    Args:
-        tolerance: A surface closer than this in front of a vertex does not occlude it.
-    """
-    caster, found = RayCaster(vertices, faces), torch.zeros_like(vertices[:, 0], dtype=torch.bool)
-    for center in cameras.centers_world.to(vertices):
-        towards = normalize(center - vertices, dim=1)
-        facing = ((towards * normals).sum(dim=1) > 0.1) & ~found
-        found[facing] = ~caster.occluded(vertices[facing], center, tolerance)
-    return found
 
 
 def poisson(cloud: OrientedPoints, cell: float) -> tuple[Vertices, Faces]:

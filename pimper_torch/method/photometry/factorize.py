@@ -28,7 +28,7 @@ from pimper_torch.method.photometry.factor_priors import (
     SurfaceNormals,
 )
 from pimper_torch.method.photometry.fit_light import Illumination, lights_in_patches
-from pimper_torch.method.photometry.light_field import LightField, faces_light, harmonics, is_strong
+from pimper_torch.method.photometry.light_field import LightField, faces_light, harmonics
 from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.method.photometry.sample_estimates import (
     Rows,
@@ -338,7 +338,10 @@ def _lit(
     lights, soft, point_light = lights_in_patches(field, patch_from_world)
     lit = in_row(illuminated, rows.index) & rows.seen & faces_light(point_light, rows.normals)
     shaded = in_row(shadowed, rows.index) | faces_light(-point_light, rows.normals)
-    by_soft = shaded & rows.seen & is_strong(soft, point_light)[..., None]
+    # Directed soft light that shades by much beside a point light.
+    directed, strength = (soft[..., 1:] != 0).any(dim=-1), point_light.norm(dim=-1)
+    strong = directed & (strength > 0) & (soft[..., 0] - soft[..., 3] > strength / 4)
+    by_soft = shaded & rows.seen & strong[..., None]
     in_room = (by_soft.sum(dim=2) > lit.sum(dim=2))[..., None]
     return torch.where(in_room, by_soft, lit), torch.where(in_room, soft, lights)
 

@@ -108,14 +108,6 @@ class LightField(Record):
         return torch.cat([soft[..., :1], soft[..., 1:] + point_light], dim=-1)
 
 
-def is_strong(
-    soft: Float[Tensor, "patch view 4"], point_light: Float[Tensor, "patch view 3"]
-) -> Bool[Tensor, "patch view"]:
-    """Find where directed soft light shades patches by much beside a point light."""
-    directed, strength = (soft[..., 1:] != 0).any(dim=-1), point_light.norm(dim=-1)
-    return directed & (strength > 0) & (soft[..., 0] - soft[..., 3] > strength / 4)
-
-
 def faces_light(
     point_light: Float[Tensor, "patch view 3"], normals: Float[Tensor, "patch sample 3"]
 ) -> Bool[Tensor, "patch view sample"]:
