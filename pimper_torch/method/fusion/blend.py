@@ -192,7 +192,9 @@ def _estimates(
     )
     from_patch = _barycentric_map(corners)
     barycentric = points[..., :2] @ from_patch[..., :2].mT + from_patch[:, None, :, 2]
-    weight = _taper(barycentric, bands)
+    # Weight 0 at the end of the band, 1/2 on the facet's edge, 1 as far inside.
+    fraction = ((barycentric / bands[:, None] + 1) / 2).clamp(0, 1)
+    weight = (fraction * fraction * (3 - 2 * fraction)).prod(dim=-1)
     found = present & hit & (weight > 0)
     xy = points[..., :2]
     raster = templates.origin, templates.spacing
@@ -314,14 +316,6 @@ def _barycentric_map(corners: Float[Tensor, "patch 3 2"]) -> Float[Tensor, "patc
     """
     ones = torch.ones_like(corners[..., :1])
     return torch.linalg.inv_ex(torch.cat([corners, ones], dim=-1).mT).inverse
-
-
-def _taper(
-    barycentric: Float[Tensor, "patch ray 3"], bands: Float[Tensor, "patch 3"]
-) -> Float[Tensor, "patch ray"]:
-    """Weigh a patch: 0 at the end of the band, 1/2 on the facet's edge, 1 as far inside."""
-    fraction = ((barycentric / bands[:, None] + 1) / 2).clamp(0, 1)
-    return (fraction * fraction * (3 - 2 * fraction)).prod(dim=-1)
 
 
 def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
