@@ -5,7 +5,7 @@ from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.records import Cameras
-from pimper_torch.result.viewer.frame import frame_of_cameras
+from pimper_torch.result.viewer.viewer import frame_of_cameras
 
 
 def cameras_on_a_ring(count, distance, height):

@@ -19,10 +19,9 @@ from pimper_torch.records import Mesh
 from pimper_torch.result.report.vertex_layers import surface_layers
 from pimper_torch.result.viewer import layers
 from pimper_torch.result.viewer import server as server_module
-from pimper_torch.result.viewer.frame import frame_of_cameras, frame_of_mesh
 from pimper_torch.result.viewer.server import open_server, require_viser
 from pimper_torch.result.viewer.show import add_found, show
-from pimper_torch.result.viewer.viewer import NO_PHOTOGRAPH, Viewer
+from pimper_torch.result.viewer.viewer import NO_PHOTOGRAPH, Viewer, frame_of_cameras, frame_of_mesh
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
 from tests.viewer.test_frame import cameras_on_a_ring
 

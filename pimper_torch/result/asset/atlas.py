@@ -65,19 +65,15 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
     # Its tolerances are absolute: lengths are in texels, from the mesh's centre.
     places = mesh.vertices_world.detach().double()
     places = ((places - places.median(dim=0).values) / texel).float()
-    order, pieces = _pieces(places, mesh.faces)
-    sources, corners = zip(
-        *(torch.unique(mesh.faces[some], return_inverse=True) for some in pieces), strict=True
-    )
-    source = torch.cat(sources)
+    pieces = _pieces(places, mesh.faces)
+    order = torch.cat(pieces)
     with tempfile.TemporaryDirectory() as folder:
         before, after = Path(folder) / "pieces.npz", Path(folder) / "atlas.npz"
         np.savez(
             before,
-            vertices=places[source].numpy(),
-            faces=torch.cat(corners).numpy().astype(np.uint32),
-            vertex_counts=[len(one) for one in sources],
-            face_counts=[len(one) for one in corners],
+            vertices=places.numpy(),
+            faces=mesh.faces[order].numpy(),
+            counts=[len(some) for some in pieces],
         )
         command = [sys.executable, *_CHILD, str(Path(__file__).with_name("charts.py"))]
         try:
@@ -97,25 +93,20 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
             )
             return None
         with np.load(after, allow_pickle=False) as found:
-            values = {name: torch.from_numpy(found[name]) for name in ("vertex", "faces", "uv")}
-            size, charts = found["size"].tolist(), int(found["charts"])
-    width, height = (min(MAX_SIDE, 2 ** round(math.log2(side))) for side in size)
-    faces = torch.empty_like(mesh.faces)
-    faces[order] = values["faces"]
+            values = {name: torch.from_numpy(found[name]) for name in found}
+    width, height = (min(MAX_SIDE, 2 ** round(math.log2(side))) for side in values["size"])
     return Atlas(
-        vertex=source[values["vertex"]],
-        faces=faces,
+        vertex=values["vertex"],
+        faces=values["faces"][order.argsort()],
         uv=values["uv"],
         width=width,
         height=height,
-        charts=charts,
+        charts=int(values["charts"]),
     )
 
 
-def _pieces(
-    places: Vertices, faces: Faces
-) -> tuple[Int[Tensor, " face"], list[Int[Tensor, " some"]]]:
-    """Halve the faces across their longest side until pieces are small; list them, and joined."""
+def _pieces(places: Vertices, faces: Faces) -> list[Int[Tensor, " some"]]:
+    """Halve the faces across their longest side until pieces are small."""
     centres = places[faces].mean(dim=1)
     pieces = [torch.arange(len(faces))]
     # xatlas takes 7.9 s for 50,000 faces in one piece, 1.4 s in 128, with as many charts.
@@ -126,7 +117,7 @@ def _pieces(
             along = some[centres[some, box.argmax()].argsort(stable=True)]
             halves += [along[: len(some) // 2], along[len(some) // 2 :]]
         pieces = halves
-    return torch.cat(pieces), pieces
+    return pieces
 
 
 def by_triangles(mesh: Mesh, texel: float) -> Atlas:

@@ -91,14 +91,23 @@ def baked(
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
     doubt = torch.zeros_like(full.vertices_world[:, 0]) if doubt is None else doubt
     values = torch.cat([carried_normals(full), colors, doubt[:, None]], dim=1)
-    surface, laid = _Surface(full, few), _laid(atlas)
+    caster, laid = RayCaster(full.vertices_world, full.faces), _laid(atlas)
+    upright = surfaces.unit_face_normals(full.vertices_world, full.faces)
+    # Few faces are off by far less than their sides; a surface farther away is elsewhere.
+    reach = surfaces.side_lengths(few.vertices_world[few.faces]).median()
     own = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
 
     def bake(texels: Int[Tensor, " texel"]) -> tuple[Tensor, Tensor]:
         """Return the values of texels, and whether the surface was met."""
         here = laid.take(texels)
         points = here.interpolate(mesh.vertices_world, mesh.faces)
-        met = surface.nearest(points, here.interpolate(shape, mesh.faces))
+        outward = here.interpolate(shape, mesh.faces)
+        met = caster.cast(points.repeat(2, 1), torch.cat([outward, -outward]), reach)
+        same_side = (upright[met.face] * outward.repeat(2, 1)).sum(dim=1) > 0
+        met = met.replace(face=met.face.where(same_side, -1))
+        distances = met.distance.where(same_side, torch.inf).chunk(2)
+        row = torch.arange(len(points))
+        met = met.take(torch.where(distances[0] <= distances[1], row, row + len(points)))
         found = met.interpolate(values, full.faces)
         axes = frames(here, normals, tangent, mesh.faces)
         columns = [_relative(found[:, :3], axes), found[:, 3:], here.interpolate(own, mesh.faces)]
@@ -126,37 +135,6 @@ def baked(
         reflectance=None if reflectance is None else raster[..., 7:],
         charts=atlas.charts,
     )
-
-
-class _Surface:
-    """A surface that rays from a mesh nearby meet from either side."""
-
-    def __init__(self, full: Mesh, few: Mesh) -> None:
-        self._caster = RayCaster(full.vertices_world, full.faces)
-        self._upright = surfaces.unit_face_normals(full.vertices_world, full.faces)
-        # Few faces are off by far less than their sides; a surface farther away is elsewhere.
-        self._reach = float(surfaces.side_lengths(few.vertices_world[few.faces]).median())
-
-    def nearest(self, points: Float[Tensor, "texel 3"], along: Float[Tensor, "texel 3"]) -> Hits:
-        """Meet the surface outward or inward, in lengths of ``along``; -1 where it is not near."""
-
-        def facing(sign: float) -> Hits:
-            met = self._caster.cast(
-                points, sign * along, torch.full_like(points[:, 0], self._reach)
-            )
-            same_side = (self._upright[met.face.clamp_min(0)] * along).sum(dim=1) > 0
-            return met.replace(
-                face=torch.where(same_side, met.face, -1),
-                distance=torch.where(same_side, met.distance, torch.inf),
-            )
-
-        outward, inward = facing(1.0), facing(-1.0)
-        first = outward.distance <= inward.distance
-        return Hits(
-            face=torch.where(first, outward.face, inward.face),
-            distance=torch.minimum(outward.distance, inward.distance),
-            barycentric=torch.where(first[:, None], outward.barycentric, inward.barycentric),
-        )
 
 
 def _laid(atlas: Atlas) -> Hits:

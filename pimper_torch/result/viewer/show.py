@@ -1,6 +1,5 @@
 """Results in a browser or a notebook, from Python."""
 
-from contextlib import ExitStack
 from pathlib import Path
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
@@ -86,11 +85,10 @@ def show(
         PimperError: viser, the extra ``view``, is missing, there is no such host or port, or the
             folder holds no surface.
     """
-    with ExitStack() as undo:
-        viewer = undo.enter_context(Viewer(host, port))
-        if isinstance(result, Path | str):
-            add_folder(viewer, result)
-        else:
-            add_found(viewer, result)
-        undo.pop_all()
+    viewer = Viewer(host, port)
+    try:
+        (add_folder if isinstance(result, Path | str) else add_found)(viewer, result)
+    except BaseException:
+        viewer.stop()
+        raise
     return viewer

@@ -14,12 +14,12 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity, normalize
 
 from pimper_torch.ground.geometry.pinholes import look_at
-from pimper_torch.ground.geometry.rigid import invert_rigid, transform
+from pimper_torch.ground.geometry.rigid import invert_rigid, rigid, transform
+from pimper_torch.ground.geometry.supporting_plane import fixation
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.ground.shapes import Points
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.result.report.predictions import shrunk
-from pimper_torch.result.viewer.frame import frame_of_cameras, frame_of_mesh
 from pimper_torch.result.viewer.layers import LAYERS, color_bar, layers_of, painted, pane
 from pimper_torch.result.viewer.server import HOST, PORT, open_server
 from pimper_torch.runtime.errors import InputError
@@ -256,6 +256,31 @@ class Viewer:
         self._cameras[NO_PHOTOGRAPH] = pose, fov, 1.0
         _put(self.server.initial_camera, pose, fov)
         self._show_frusta()
+
+
+def frame_of_cameras(cameras: Cameras, reference: int) -> Float[Tensor, "4 4"]:
+    """Return ``viewer_from_world``, a similarity in float64 on the CPU.
+
+    The origin is where the cameras look, about three units away. z is up in the photographs on
+    average.
+
+    Args:
+        reference: View that the x axis points to.
+    """
+    poses = cameras.cam_from_world.detach().cpu().double()
+    up = normalize(-poses[:, 1, :3].mean(dim=0), dim=0)
+    middle = fixation(poses)
+    away = invert_rigid(poses)[reference, :3, 3] - middle.fixation_world
+    x = normalize(away - (away @ up) * up, dim=0)
+    scaled = 3 / middle.distance * torch.stack([x, torch.linalg.cross(up, x), up])
+    return rigid(scaled, -scaled @ middle.fixation_world)
+
+
+def frame_of_mesh(mesh: Mesh) -> Float[Tensor, "4 4"]:
+    """Centre a mesh without cameras and keep its axes; see :func:`frame_of_cameras`."""
+    low, high = mesh.vertices_world.detach().cpu().double().aminmax(dim=0)
+    scaled = 3 / (high - low).norm() * torch.eye(3).double()
+    return rigid(scaled, -scaled @ (low + high) / 2)
 
 
 def _put(camera: Any, pose: Float[Tensor, "4 4"], fov: float) -> None:  # noqa: ANN401 - viser's
