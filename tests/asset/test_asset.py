@@ -24,7 +24,7 @@ from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear
 from pimper_torch.records import Cameras, Mesh, Textured
 from pimper_torch.result.asset import atlas as atlases
 from pimper_torch.result.asset.atlas import MAX_SIDE, by_triangles, unwrapped
-from pimper_torch.result.asset.bake import baked, textured
+from pimper_torch.result.asset.bake import textured
 from pimper_torch.result.asset.inpaint import inpainted
 from pimper_torch.result.asset.placement import Placement, standing
 from pimper_torch.result.asset.tangents import tangents
@@ -107,7 +107,7 @@ def of_surface(full: Mesh, points):
 @pytest.mark.parametrize("packed", ["xatlas", "triangles"])
 def test_normals_and_albedo_are_those_of_the_surface(full, few, asset, packed):
     if packed == "triangles":
-        asset = baked(full, few, by_triangles(few, 0.008))
+        asset = textured(full, few, atlas=by_triangles(few, 0.008))
     points, normals, color = seen(asset)
     wanted, albedo = of_surface(full, points)
     assert angles_deg(wanted, of_surface(few, points)[0]).max() > 2  # the vertices do not tell it

@@ -4,8 +4,6 @@ import re
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from pimper_torch.ground.radiometry import to_bytes
@@ -48,7 +46,10 @@ def compare_thumbnails(views: Views, known: Mapping[str, str], where: str) -> No
     names = [name for name in now if _WRITTEN.fullmatch(str(known.get(name)))]
     if not names:
         return
-    levels, before = _levels(now, names), _levels(known, names)
+    levels, before = (
+        torch.tensor([list(bytes.fromhex(one[name])) for name in names]).double()
+        for one in (now, known)
+    )
     differences = torch.cdist(levels, before) / _SIDE
     nearest, like = differences.min(dim=1)
     own = differences.diagonal()
@@ -65,7 +66,3 @@ def compare_thumbnails(views: Views, known: Mapping[str, str], where: str) -> No
             "as they are. Name the folder of the originals by `--photos DIR` (`photographs=`).",
             stacklevel=4,
         )
-
-
-def _levels(found: Mapping[str, str], names: list[str]) -> Float[Tensor, "view level"]:
-    return torch.tensor([list(bytes.fromhex(found[name])) for name in names]).double()

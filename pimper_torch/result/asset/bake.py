@@ -10,7 +10,7 @@ from pimper_torch.ground.geometry import surfaces
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster
 from pimper_torch.ground.radiometry import to_bytes
-from pimper_torch.ground.shapes import Mask, PerVertex, Vertices
+from pimper_torch.ground.shapes import Mask, Vertices
 from pimper_torch.records import Mesh, Relighting, Textured
 from pimper_torch.result.asset.atlas import Atlas, unwrapped
 from pimper_torch.result.asset.inpaint import INPAINTED, inpainted
@@ -35,43 +35,12 @@ class Texture(Stage):
         return textured(full, few, relighting.materials.at_vertices())
 
 
-def textured(full: Mesh, few: Mesh, reflectance: Vertices | None = None) -> Textured:
-    """Bake a surface onto few faces, without albedo that is implausibly bright.
-
-    Args:
-        full: The surface, on the CPU.
-        few: The same of fewer faces.
-        reflectance: Metallic, roughness and specular of its vertices; matte without.
-    """
-    full, few = (one.detach().to(torch.float32) for one in (full, few))
-    side = float(surfaces.side_lengths(full.vertices_world[full.faces]).median())
-    full, doubt = inpainted(full)
-    return baked(full, few, unwrapped(few, side / _TEXELS_PER_SIDE), reflectance, doubt)
-
-
-def halved(asset: Textured) -> Textured:
-    """Return the same with textures of half the size."""
-
-    def half(texture: Float[Tensor, "height width channel"]) -> Tensor:
-        return avg_pool2d(texture.movedim(-1, 0), 2).movedim(0, -1)
-
-    reflectance = asset.reflectance
-    return asset.replace(
-        base_color=half(asset.base_color.float()).round().to(torch.uint8),
-        normal=half(asset.normal.float()).round().to(torch.uint8),
-        doubt=half(asset.doubt[..., None].float())[..., 0].round().to(torch.uint8),
-        reflectance=None if reflectance is None else half(reflectance),
-    )
-
-
-def baked(
-    full: Mesh,
-    few: Mesh,
-    atlas: Atlas,
-    reflectance: Vertices | None = None,
-    doubt: PerVertex | None = None,
+def textured(
+    full: Mesh, few: Mesh, reflectance: Vertices | None = None, atlas: Atlas | None = None
 ) -> Textured:
     """Read albedo and normals of a surface off onto textures of a mesh that has fewer faces.
+
+    Albedo that is implausibly bright is inpainted before.
 
     From the centre of every texel, on a face of the mesh, a ray along the mesh's blended normals
     meets the surface, outward or inward, where that is nearer. A texel far from all faces, or whose
@@ -79,17 +48,20 @@ def baked(
 
     Args:
         full: The surface, on the CPU.
-        few: The mesh that was laid out, its normals those that the normal map is relative to.
-        reflectance: Metallic, roughness and specular of the mesh's vertices.
-        doubt: About the albedo of the surface's vertices; see
-            :func:`~pimper_torch.result.asset.inpaint.inpainted`.
+        few: The same of fewer faces, its normals those that the normal map is relative to.
+        reflectance: Metallic, roughness and specular of its vertices; matte without.
+        atlas: Of ``few``; laid out by xatlas unless given.
     """
+    full, few = (one.detach().to(torch.float32) for one in (full, few))
+    if atlas is None:
+        side = float(surfaces.side_lengths(full.vertices_world[full.faces]).median())
+        atlas = unwrapped(few, side / _TEXELS_PER_SIDE)
+    full, doubt = inpainted(full)
     normals = carried_normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
     shape = surfaces.vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
     tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
-    doubt = torch.zeros_like(full.vertices_world[:, 0]) if doubt is None else doubt
     values = torch.cat([carried_normals(full), colors, doubt[:, None]], dim=1)
     caster, laid = RayCaster(full.vertices_world, full.faces), _laid(atlas)
     upright = surfaces.unit_face_normals(full.vertices_world, full.faces)
@@ -134,6 +106,21 @@ def baked(
         doubt=(255 * raster[..., 6]).round().to(torch.uint8),
         reflectance=None if reflectance is None else raster[..., 7:],
         charts=atlas.charts,
+    )
+
+
+def halved(asset: Textured) -> Textured:
+    """Return the same with textures of half the size."""
+
+    def half(texture: Float[Tensor, "height width channel"]) -> Tensor:
+        return avg_pool2d(texture.movedim(-1, 0), 2).movedim(0, -1)
+
+    reflectance = asset.reflectance
+    return asset.replace(
+        base_color=half(asset.base_color.float()).round().to(torch.uint8),
+        normal=half(asset.normal.float()).round().to(torch.uint8),
+        doubt=half(asset.doubt[..., None].float())[..., 0].round().to(torch.uint8),
+        reflectance=None if reflectance is None else half(reflectance),
     )
 
 

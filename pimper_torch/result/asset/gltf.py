@@ -3,9 +3,11 @@
 import json
 import struct
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset
 
@@ -103,7 +105,7 @@ def gltf_of(
         tree["scenes"] = [{"nodes": list(range(1 + len(cameras)))}]
     extensions = set(material.get("extensions", ()))
     if images:
-        kinds = [_image_kind(image) for image in images]
+        kinds = [Image.open(BytesIO(image)).get_format_mimetype() for image in images]
         tree["images"] = [
             {"bufferView": viewed(image, None), "mimeType": kind}
             for image, kind in zip(images, kinds, strict=True)
@@ -127,12 +129,6 @@ def gltf_of(
     head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(buffer))
     head += struct.pack("<I4s", len(text), b"JSON") + text
     return head + struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
-
-
-def _image_kind(image: bytes) -> str:
-    if image.startswith(b"\x89PNG"):
-        return "image/png"
-    return "image/webp" if image.startswith(b"RIFF") else "image/jpeg"
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

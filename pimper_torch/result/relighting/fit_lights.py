@@ -98,15 +98,6 @@ def observe_all(
     return list(side_by_side(observed, range(scene.cameras.num_views), tracked=False))
 
 
-# Radiance under lights of strength 1.
-Ambient = Float[Tensor, "*batch pixel #channel"]
-Directed = Float[Tensor, "light pixel #channel"]
-# Ambient and directed strengths of every light and channel, and the mean loss.
-Strengths = tuple[
-    Float[Tensor, "light channel"], Float[Tensor, "light channel"], Float[Tensor, " light"]
-]
-
-
 def loss_scale(seen: Observed) -> float:
     """Return the scale of Cauchy's loss, by a light of first order without any shadow."""
     basis = torch.cat([torch.ones_like(seen.radiance[:, :1]), seen.pixels.normals_world], dim=1)
@@ -120,7 +111,12 @@ def loss_scale(seen: Observed) -> float:
     return CAUCHY_TUNING * max(deviation, 0.002)
 
 
-def fit_strengths(seen: Observed, diffuse: Ambient, response: Directed, scale: float) -> Strengths:
+def fit_strengths(
+    seen: Observed,
+    diffuse: Float[Tensor, "*batch pixel #channel"],
+    response: Float[Tensor, "light pixel #channel"],
+    scale: float,
+) -> tuple[Float[Tensor, "light channel"], Float[Tensor, "light channel"], Float[Tensor, " light"]]:
     """Fit ambient and directed strength for every light, by reweighted least squares.
 
     Args:

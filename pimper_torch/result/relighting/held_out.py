@@ -80,21 +80,16 @@ class Relight(Stage):
         lights = matte
         if bool((materials.specular > 0).any() or (materials.metallic > 0).any()):
             lights = lights_of(surface, observed, materials, matte)
-        if held_out is None:
-            names = scene.views.names
-            judged = judge(surface, observed, names, lights, materials)
-            plain = judge(surface, observed, names, matte)
-        else:
-            names, observed = held_out.views.names, observe_all(surface, held_out, None)
-            judged, plain = (
-                judge(surface, observed, names, lights_of(surface, observed, one), one)
-                for one in (materials, None)
-            )
+        shown, fitted = scene, lights
+        if held_out is not None:
+            shown, observed = held_out, observe_all(surface, held_out, None)
+            fitted, matte = (lights_of(surface, observed, one) for one in (materials, None))
+        names = shown.views.names
         return Relighting(
             lights=lights,
             materials=materials,
-            judged=judged,
-            matte=plain,
+            judged=judge(surface, observed, names, fitted, materials),
+            matte=judge(surface, observed, names, matte),
             held_out=held_out is not None,
         )
 

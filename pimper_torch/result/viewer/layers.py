@@ -48,9 +48,8 @@ def painted(
     if name == "normals":
         right_down_ahead = normals[:, [1, 2, 0]] * normals.new_tensor([1.0, -1.0, -1.0])
         colors = linear_from_srgb(normal_colors(right_down_ahead))
-    layer = next(
-        (one for one in surface_layers(mesh, length_unit(mesh, unit)) if one.title == name), None
-    )
+    layers = {layer.title: layer for layer in surface_layers(mesh, length_unit(mesh, unit))}
+    layer = layers.get(name)
     if layer is not None:
         values = mesh.confidence if layer.attribute == "_support" else mesh.expected_error
         assert values is not None
