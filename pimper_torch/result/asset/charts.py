@@ -22,8 +22,8 @@ def main(pieces: str, found: str) -> None:
     atlas = xatlas.Atlas()
     sources = []
     for triangles in faces:
-        source, corners = np.unique(triangles, return_inverse=True)
-        atlas.add_mesh(vertices[source], corners.reshape(-1, 3).astype(np.uint32))
+        source, own = np.unique(triangles, return_inverse=True)
+        atlas.add_mesh(vertices[source], own.reshape(-1, 3).astype(np.uint32))
         sources.append(source)
     options = xatlas.PackOptions()
     # On textures whose sides are rounded down to powers of two, two texels of every chart are left

@@ -85,8 +85,8 @@ def gltf_of(
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "pimper_torch"},
         "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": list(range(1 + len(cameras)))}],
+        "nodes": [{"mesh": 0}, *({**one, "camera": index} for index, one in enumerate(cameras))],
         "meshes": [{"primitives": [primitive]}],
         "materials": [dict(material)],
         "accessors": accessors,
@@ -101,8 +101,6 @@ def gltf_of(
         tree["nodes"][0]["extras"] = extras
     if cameras:
         tree["cameras"] = [one["camera"] for one in cameras]
-        tree["nodes"] += [{**one, "camera": index} for index, one in enumerate(cameras)]
-        tree["scenes"] = [{"nodes": list(range(1 + len(cameras)))}]
     extensions = set(material.get("extensions", ()))
     if images:
         kinds = [Image.open(BytesIO(image)).get_format_mimetype() for image in images]

@@ -27,11 +27,9 @@ def tangents(
     area = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
     along = (b - a) * other[:, 1:] - (c - a) * one[:, 1:]
     along = along * area.sign()[:, None]
-    total = torch.zeros_like(vertices)
-    signed = torch.zeros_like(vertices[:, 0])
-    for corner in range(3):
-        total = total.index_add(0, faces[:, corner], along)
-        signed = signed.index_add(0, faces[:, corner], area)
+    corners = faces.mT.flatten()
+    total = torch.zeros_like(vertices).index_add(0, corners, along.repeat(3, 1))
+    signed = torch.zeros_like(vertices[:, 0]).index_add(0, corners, area.repeat(3))
     across = total - (total * normals).sum(dim=1, keepdim=True) * normals
     # Where faces have no area on the texture, any direction along the surface will do.
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]

@@ -47,13 +47,14 @@ def write_asset(
     if placement is not None:
         along = placement.placed(vertices, along)[1]
         vertices, normals = placement.placed(vertices, normals)
-    told = {"_EXPECTED_ERROR": mesh.expected_error, "_SUPPORT": mesh.confidence, **(more or {})}
     attributes = {
         "POSITION": vertices,
         "NORMAL": normals,
         "TANGENT": torch.cat([along, asset.tangent[:, 3:]], dim=1),
         "TEXCOORD_0": asset.uv,
-        **{name: values for name, values in told.items() if values is not None},
+        "_EXPECTED_ERROR": mesh.expected_error,
+        "_SUPPORT": mesh.confidence,
+        **(more or {}),
     }
     images = [_encoded(asset.base_color, texture, lossless=False), _encoded(asset.normal, texture)]
     surface = MATTE["pbrMetallicRoughness"] | {"baseColorTexture": {"index": 0}}
@@ -65,7 +66,7 @@ def write_asset(
         material["extras"] = {"albedo_doubt": {"index": len(images)}}
         images.append(_encoded(asset.doubt, "png"))
     data = gltf_of(
-        {name: values.numpy() for name, values in attributes.items()},
+        {name: values.numpy() for name, values in attributes.items() if values is not None},
         mesh.faces.numpy(),
         material,
         images,

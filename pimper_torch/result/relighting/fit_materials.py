@@ -78,11 +78,10 @@ class _Trial:
         most = min(3000, max(1, 20_000 // max(1, len(shown))))
         self.observed = [observed[view].thinned(most) for view in shown]
         self.scales = [loss_scale(seen) for seen in self.observed]
-        self.incidence = []
-        for view, seen in zip(shown, self.observed, strict=True):
-            light = lights.take([view])
-            lit = surface.incidence(seen.pixels, light.direction_world, light.closeness)
-            self.incidence.append(lit)
+        self.incidence = [
+            surface.incidence(seen.pixels, lights.direction_world[[view]], lights.closeness[[view]])
+            for view, seen in zip(shown, self.observed, strict=True)
+        ]
 
     def losses(
         self, cluster: _Clusters, tried: Float[Tensor, "candidate cluster 3"]

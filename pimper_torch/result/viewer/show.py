@@ -87,7 +87,10 @@ def show(
     """
     viewer = Viewer(host, port)
     try:
-        (add_folder if isinstance(result, Path | str) else add_found)(viewer, result)
+        if isinstance(result, Path | str):
+            add_folder(viewer, result)
+        else:
+            add_found(viewer, result)
     except BaseException:
         viewer.stop()
         raise

@@ -3,7 +3,7 @@
 import math
 import threading
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import AbstractContextManager, redirect_stdout
 from io import StringIO
 from typing import Any
 
@@ -35,7 +35,7 @@ _PICTURE_PX = 480  # a choice: 200 photographs take 12 MB, and 120 MB of a graph
 _DIRECT, _AMBIENT = math.pi, 0.2 * math.pi
 
 
-class Viewer:
+class Viewer(AbstractContextManager["Viewer", None]):
     """A scene in a browser, which grows while it is looked at.
 
     Attributes:
@@ -83,9 +83,6 @@ class Viewer:
         for slider in self._light:
             slider.on_update(lambda _: self._turn_lights())
         self.server.on_client_connect(self._welcome)
-
-    def __enter__(self) -> "Viewer":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
