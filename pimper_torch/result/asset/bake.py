@@ -74,6 +74,7 @@ def textured(
         here = laid.take(texels)
         points = here.interpolate(mesh.vertices_world, mesh.faces)
         outward = here.interpolate(shape, mesh.faces)
+        # Rays outward, then those inward.
         met = caster.cast(points.repeat(2, 1), torch.cat([outward, -outward]), reach)
         same_side = (upright[met.face] * outward.repeat(2, 1)).sum(dim=1) > 0
         met = met.replace(face=met.face.where(same_side, -1))
@@ -86,11 +87,12 @@ def textured(
         return torch.cat(columns, dim=1), met.face >= 0
 
     (texels,) = torch.nonzero(laid.face >= 0, as_tuple=True)
-    blocks = list(side_by_side(bake, torch.split(texels, 250_000), tracked=False))
-    raster = values.new_zeros(len(laid.face), values.shape[1] + own.shape[1])
-    raster[texels] = torch.cat([found for found, _ in blocks])
+    blocks = side_by_side(bake, torch.split(texels, 250_000), tracked=False)
+    found, met = (torch.cat(parts) for parts in zip(*blocks, strict=True))
+    raster = found.new_zeros(len(laid.face), found.shape[1])
+    raster[texels] = found
     known = torch.zeros_like(laid.face, dtype=torch.bool)
-    known[texels] = torch.cat([there for _, there in blocks])
+    known[texels] = met
     size = (atlas.height, atlas.width)
     raster = raster[_nearest_known(known.reshape(size))[0]]
     raster[(laid.face >= 0) & ~known, 6] = INPAINTED
