@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset
+from pimper_torch.result.asset.placement import Placement
 
 _ARRAYS, _INDICES = 34962, 34963  # what a view of the buffer is for
 _TRIANGLES, _POINTS = 4, 0
@@ -32,10 +33,7 @@ def gltf_of(
     material: Mapping[str, Any],
     images: Sequence[bytes] = (),
     offset_world: Offset = NO_OFFSET,
-    *,
-    name: str = "",
-    extras: Mapping[str, object] | None = None,
-    cameras: Sequence[Mapping[str, Any]] = (),
+    placement: Placement | None = None,
 ) -> bytes:
     """Return one mesh of one material as a GLB.
 
@@ -46,9 +44,7 @@ def gltf_of(
             names are declared.
         images: PNG, JPEG or WebP files.
         offset_world: The node's ``translation``.
-        name: Of node, mesh and material.
-        extras: Of the node.
-        cameras: Nodes, each with a ``camera`` of its own.
+        placement: Gives the name of node, mesh and material, the node's ``extras``, and cameras.
     """
     buffer, views, accessors = bytearray(), [], []
 
@@ -82,6 +78,7 @@ def gltf_of(
         more = bounds if key == "POSITION" else {}
         primitive["attributes"][key] = stored(rows, _ARRAYS, **more)
     primitive["material"] = 0
+    cameras = [] if placement is None else placement.gltf_cameras()
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "pimper_torch"},
         "scene": 0,
@@ -94,11 +91,10 @@ def gltf_of(
     }
     if offset_world != NO_OFFSET:
         tree["nodes"][0]["translation"] = list(offset_world)
-    if name:
+    if placement is not None:
         for kind in ("nodes", "meshes", "materials"):
-            tree[kind][0]["name"] = name
-    if extras:
-        tree["nodes"][0]["extras"] = extras
+            tree[kind][0]["name"] = placement.name
+        tree["nodes"][0]["extras"] = placement.extras
     if cameras:
         tree["cameras"] = [one["camera"] for one in cameras]
     extensions = set(material.get("extensions", ()))

@@ -70,9 +70,7 @@ def write_asset(
         mesh.faces.numpy(),
         material,
         images,
-        name="" if placement is None else placement.name,
-        extras=None if placement is None else placement.extras,
-        cameras=() if placement is None else placement.gltf_cameras(),
+        placement=placement,
     )
     Path(path).write_bytes(data)
 
