@@ -5,19 +5,18 @@ Numbers are choices, the same for all photographs.
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, Delaunay, cKDTree
 from torch import Tensor
 
 from pimper_torch.ground.geometry.surfaces import barycentric_2d
-from pimper_torch.ground.shapes import Faces, Pixels, Points
+from pimper_torch.ground.shapes import Faces, Pixels, PointMask, Points
 
 PerPoint = Float[Tensor, " point"]
+Nearest = Int[Tensor, "point neighbour"]
 
 
-def behind_others(
-    pixels: Pixels, points_cam: Points, observed: Bool[Tensor, " point"]
-) -> Bool[Tensor, " point"]:
+def behind_others(pixels: Pixels, points_cam: Points, observed: PointMask) -> PointMask:
     """Find points that a nearer surface occludes in the image, or probably does.
 
     Of the 24 nearest points in the image those count that are nearer to the camera by more than 3
@@ -38,7 +37,7 @@ def behind_others(
 
 def neighbours_agree(
     pixels: Pixels, points_cam: Points, *, neighbours: int = 12, max_slope: float = 6.0
-) -> Bool[Tensor, " point"]:
+) -> PointMask:
     """Find points that lie on the same surface as those around them in the image.
 
     A point of another surface is steep against most of them: ``|dz|`` over the lateral distance
@@ -67,7 +66,7 @@ def nearest_in_image(pixels: Pixels, count: int) -> Int[Tensor, "point near"]:
     return torch.as_tensor(index, device=pixels.device)
 
 
-def on_hull(pixels: Pixels) -> Bool[Tensor, " point"]:
+def on_hull(pixels: Pixels) -> PointMask:
     """Find the corners of the points' convex hull in the image.
 
     Chosen before all others, they let the mesh reach as far as the cloud does.
@@ -78,7 +77,7 @@ def on_hull(pixels: Pixels) -> Bool[Tensor, " point"]:
     return marked.to(pixels.device)
 
 
-def well_accompanied(pixels: Pixels) -> Bool[Tensor, " point"]:
+def well_accompanied(pixels: Pixels) -> PointMask:
     """Find all points but isolated corners of the hull, one hull after another.
 
     Isolated are those farther from their third nearest point than 3 times the median of its
@@ -128,14 +127,12 @@ def spread_to_count(pixels: Pixels, quality: PerPoint, target: int) -> Int[Tenso
     return chosen
 
 
-def _steepness(
-    points_cam: Points, nearest: Int[Tensor, "point neighbour"]
-) -> Float[Tensor, "point neighbour"]:
+def _steepness(points_cam: Points, nearest: Nearest) -> Float[Tensor, "point neighbour"]:
     steps = points_cam[nearest] - points_cam[:, None]
     return steps[..., 2].abs() / steps[..., :2].norm(dim=-1).clamp_min(1e-12)
 
 
-def _deviation(points_cam: Points, nearest: Int[Tensor, "point neighbour"]) -> PerPoint:
+def _deviation(points_cam: Points, nearest: Nearest) -> PerPoint:
     """Measure the distance from the neighbours' robust plane, in radii of the neighbourhood."""
     steps = (points_cam[nearest] - points_cam[:, None]).double()
     radius = steps[..., :2].norm(dim=-1).median(dim=1).values.clamp_min(1e-12)

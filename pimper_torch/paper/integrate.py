@@ -20,10 +20,13 @@ from pimper_torch.records import DepthPatches, Depths, PhotometricPatches
 from pimper_torch.runtime.progress import track
 from pimper_torch.runtime.stage import Stage
 
+Heights = Float[Tensor, "*batch height width"]
+StepsRight = Float[Tensor, "*batch height steps_right"]
+StepsDown = Float[Tensor, "*batch steps_down width"]
+Layers = Float[Tensor, "patch channel height width"]
 
-def fill_smoothly(
-    values: Float[Tensor, "patch channel height width"], weight: PatchRaster
-) -> Float[Tensor, "patch channel height width"]:
+
+def fill_smoothly(values: Layers, weight: PatchRaster) -> Layers:
     """Inpaint samples without weight from those around, through a pyramid of halved rasters.
 
     Args:
@@ -58,25 +61,18 @@ def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size}
     return normalize((math.pi / size * frequency[:, None] * (frequency + 0.5)).cos(), dim=1)
 
 
-def differences(
-    heights: Float[Tensor, "*batch height width"],
-) -> tuple[Float[Tensor, "*batch height steps_right"], Float[Tensor, "*batch steps_down width"]]:
+def differences(heights: Heights) -> tuple[StepsRight, StepsDown]:
     """Return the steps to the right and down."""
     return heights.diff(dim=-1), heights.diff(dim=-2)
 
 
-def differences_transposed(
-    right: Float[Tensor, "*batch height steps_right"],
-    down: Float[Tensor, "*batch steps_down width"],
-) -> Float[Tensor, "*batch height width"]:
+def differences_transposed(right: StepsRight, down: StepsDown) -> Heights:
     """Apply the transpose of :func:`differences`: minus the divergence."""
     across = pad(right, (1, 0)) - pad(right, (0, 1))
     return across + pad(down, (0, 0, 1, 0)) - pad(down, (0, 0, 0, 1))
 
 
-def solve_poisson(
-    source: Float[Tensor, "*batch height width"],
-) -> Float[Tensor, "*batch height width"]:
+def solve_poisson(source: Heights) -> Heights:
     r"""Solve :math:`D^T D z = s`, D the steps of :func:`differences`.
 
     Args:

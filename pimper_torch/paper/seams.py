@@ -25,6 +25,7 @@ Transforms = Float[Tensor, "face 4"]
 PerSide = Float[Tensor, "seam 2"]
 PerRay = Float[Tensor, "seam 2 row column 3"]
 PerSeam = Float[Tensor, " seam"]
+Met = Bool[Tensor, "seam row column"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -93,7 +94,7 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
 
 def meet_overlaps(
     seams: Seams, patches: PatchSet, buckets: tuple[Depths, ...], transforms: Transforms
-) -> tuple[PerRay, PerRay, Bool[Tensor, "seam row column"]]:
+) -> tuple[PerRay, PerRay, Met]:
     """Meet both height fields of every seam, as transformed now, with the seam's rays.
 
     Returns:
@@ -177,9 +178,7 @@ def mismatches(pulls: Pulls, transforms: Transforms) -> Float[Tensor, "seam ray 
 
 
 def curvature_along(
-    heights: Float[Tensor, "seam 2 row column"],
-    met: Bool[Tensor, "seam row column"],
-    edge_lengths: PerSeam,
+    heights: Float[Tensor, "seam 2 row column"], met: Met, edge_lengths: PerSeam
 ) -> PerSide:
     r"""Return the mean square of a height field's curvature along the edge, times its length.
 

@@ -21,7 +21,7 @@ from pimper_torch.doors.io.photograph_files import (
 from pimper_torch.doors.io.radiance import OPAQUE, read_pictures, resized_mask
 from pimper_torch.doors.io.responses import tell_cautions
 from pimper_torch.ground.radiometry import FROM_FILES, SATURATED, Encoding
-from pimper_torch.ground.shapes import Map, Mask, Masks
+from pimper_torch.ground.shapes import Images, Map, Mask, Masks, PerView
 from pimper_torch.method.silhouettes.given import around_and_inside
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, caution, some
@@ -154,9 +154,7 @@ def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
     return max(1, round(header.width * factor)), max(1, round(header.height * factor))
 
 
-def shrunk_focals(
-    headers: Sequence[Header], sizes: Sequence[tuple[int, int]]
-) -> Float[Tensor, " view"]:
+def shrunk_focals(headers: Sequence[Header], sizes: Sequence[tuple[int, int]]) -> PerView:
     """Compute focal lengths in pixels of photographs shrunk to these sizes; NaN where unknown."""
     scales = [
         max(size) / max(header.width, header.height)
@@ -258,7 +256,7 @@ def _on_object(levels: Sequence[Float[Tensor, "_ _"]]) -> Sequence[Float[Tensor,
 
 
 def _judge(
-    images: Float[Tensor, "view channel height width"],
+    images: Images,
     drawn: Masks,
     sizes: Sequence[tuple[int, int]],
     names: tuple[str, ...],

@@ -18,7 +18,7 @@ from pimper_torch.doors.io.responses import response_of
 from pimper_torch.ground.radiometry import SATURATED, Curve, Encoding, Response, Srgb
 from pimper_torch.ground.radiometry.primaries import in_srgb_primaries
 from pimper_torch.ground.radiometry.saturation import PIXELS, find_saturation
-from pimper_torch.ground.shapes import Mask, Scalar
+from pimper_torch.ground.shapes import Images, Mask, Scalar
 from pimper_torch.runtime.errors import InputError, caution
 from pimper_torch.runtime.mapped import zeros
 from pimper_torch.runtime.parallel import side_by_side
@@ -39,7 +39,6 @@ class _Kind(NamedTuple):
     response: Response
 
 
-Images = Float[Tensor, "view channel height width"]
 Planes = Float[Tensor, "channel height width"]
 Levels = Float[Tensor, " channel"]  # fractions of full scale, one a colour
 Sizes = Sequence[tuple[int, int]]  # width and height

@@ -153,9 +153,7 @@ def surroundings(faces: Faces, broken: FaceMask, num_vertices: int) -> FaceMask:
 def _components_with(faces: Faces, among: VertexMask, some: VertexMask) -> VertexMask:
     """Find the connected components of vertices ``among`` that have some of others."""
     label = topology.vertex_components(faces, among)
-    named = torch.zeros_like(among)
-    named[label[among & some]] = True
-    return among & named[label]
+    return among & torch.isin(label, label[among & some])
 
 
 def _with_neighbours(faces: Faces, free: VertexMask) -> VertexMask:

@@ -14,6 +14,7 @@ from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.parallel import side_by_side
 
 SampleMask = Bool[Tensor, "patch sample"]
+SampleVectors = Float[Tensor, "patch sample 3"]
 
 
 def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
@@ -41,9 +42,7 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
 
 
-def _lines(
-    templates: Templates,
-) -> tuple[Float[Tensor, "patch sample 3"], Float[Tensor, "patch sample 3"]]:
+def _lines(templates: Templates) -> tuple[SampleVectors, SampleVectors]:
     """Return places on the facets' planes, and the way inward through them; world."""
     world_from_patch = invert_rigid(templates.patch_from_world)
     flat = templates.replace(depth=torch.zeros_like(templates.depth)).points_patch
@@ -77,8 +76,8 @@ def _on_surface(
 
 def _nearest(
     caster: RayCaster,
-    positions: Float[Tensor, "patch sample 3"],
-    inward: Float[Tensor, "patch sample 3"],
+    positions: SampleVectors,
+    inward: SampleVectors,
     surface: Mesh,
     reach: Float[Tensor, "patch 1"],
 ) -> tuple[Hits, SampleMask]:

@@ -1,21 +1,23 @@
 """The views that a facet is seen in, of many: the best ones, shared by blocks of like facets."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.ground.shapes import Scalar
+from pimper_torch.ground.shapes import Scalar, ViewMask, ViewVectors
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.runtime.parallel import side_by_side
+
+Weights = Float[Tensor, "facet view"]
 
 
 def view_blocks(
     mesh: Mesh, cameras: Cameras, spacing: Scalar, count: int
-) -> list[tuple[Int[Tensor, " facet"], Bool[Tensor, " view"]]]:
+) -> list[tuple[Int[Tensor, " facet"], ViewMask]]:
     """Divide facets into blocks of like place and direction, and choose the views of each.
 
     Args:
@@ -65,7 +67,7 @@ def view_weights(
     cameras: Cameras,
     spacing: Scalar,
     caster: RayCaster,
-) -> Float[Tensor, "facet view"]:
+) -> Weights:
     """Return the pixels that each view has on a sample of each facet, 1 at most.
 
     Args:
@@ -91,9 +93,7 @@ def view_weights(
     return weight.mT.contiguous()
 
 
-def best_views(
-    weight: Float[Tensor, "facet view"], directions: Float[Tensor, "view 3"], count: int
-) -> Bool[Tensor, " view"]:
+def best_views(weight: Weights, directions: ViewVectors, count: int) -> ViewMask:
     r"""Choose the views of a block of facets, one after the other.
 
     The next is always the one of the largest gain

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import reduce
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt, label
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
@@ -21,7 +21,7 @@ from pimper_torch.ground.geometry.supporting_plane import (
     well_tracked,
 )
 from pimper_torch.ground.geometry.visual_hull import Hull
-from pimper_torch.ground.shapes import Map, Maps, Masks, ViewMask
+from pimper_torch.ground.shapes import Map, Maps, Masks, PointMask, ViewMask
 from pimper_torch.method.silhouettes import parallax
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Cameras, Record, SilhouettePrior, SparseScene, Views
@@ -293,7 +293,7 @@ def split_cloud(
     plane: Plane | None,
     tolerance: float,
     box_world: Float[Tensor, "2 3"] | None,
-) -> tuple[Bool[Tensor, " point"], Bool[Tensor, " point"]]:
+) -> tuple[PointMask, PointMask]:
     """Find the points of the object, and those that certainly are not; others may be either.
 
     With a plane they are the points above it near the fixation point, without one those near that
@@ -322,7 +322,7 @@ def split_cloud(
 
 
 def pixels_of(
-    scene: SparseScene, cameras: Cameras, chosen: Bool[Tensor, " point"], observed: bool = True
+    scene: SparseScene, cameras: Cameras, chosen: PointMask, observed: bool = True
 ) -> tuple[Float[Tensor, "_ 2"], ...]:
     """Return where the chosen points are in each view.
 

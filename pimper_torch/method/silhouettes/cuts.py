@@ -28,7 +28,7 @@ from pimper_torch.ground.geometry.opencv import (
     without_specks,
 )
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
-from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, Pixels, Scalar, ViewMask
+from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, PerView, Pixels, Scalar, ViewMask
 from pimper_torch.method.silhouettes.cues import FEW, MIN_POINTS, Cues, pointed_at
 from pimper_torch.method.silhouettes.parallax import DISPUTED, of_views
 from pimper_torch.records import Record, Silhouettes
@@ -69,6 +69,7 @@ _SHADOW = 0.7
 DOUBT_OFF_PLANE, _DOUBT = 0.375, 0.25
 
 Cutter = Callable[[Tensor, Tensor, int], Tensor]  # grab_cut, or one like it
+Labels = UInt8[Tensor, "height width"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -86,8 +87,8 @@ class Cuts(Record):
 
     masks: Masks
     margins_px: Maps
-    exposed: Float[Tensor, " view"]
-    held: Float[Tensor, " view"]
+    exposed: PerView
+    held: PerView
     doubted: ViewMask
     agreement: Maps | None
     hidden: Masks | None = None
@@ -112,7 +113,7 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
         cues = cues.relearned(masks)
         masks = _filled(cues, masks)
         abstain = by_view(torch.bitwise_or, unknown, _in_front(cues, masks))
-        seen = _voted(cues, by_view(_abstaining, masks.float(), abstain), voting)
+        seen = _voted(cues, masks.float().masked_fill_(abstain, 0.5), voting)
         if seen is None:
             return None
         cues, voting = cues.seen_in(seen), None
@@ -122,7 +123,7 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
     hidden, shown = _in_front(cues, masks), masks.float()  # the probability of the object
     if cues.agreement is not None:
         shown = by_view(lambda mask, at: torch.where(mask, 1, doubt_of(at)), masks, cues.agreement)
-    seen = _voted(cues, by_view(_abstaining, shown, hidden))
+    seen = _voted(cues, shown.masked_fill_(hidden, 0.5))
     if seen is None:
         return None
     masks = repaired(masks, seen, None if cues.plane is None else cues.pictures.grey)
@@ -234,9 +235,7 @@ def _again(cues: Cues, masks: Masks, seen: Maps, unknown: Masks) -> Masks:
     return of_views(again, cues.num_views)
 
 
-def _cut(
-    how: Cutter, cues: Cues, view: int, labels: UInt8[Tensor, "height width"], margin: Map
-) -> Mask:
+def _cut(how: Cutter, cues: Cues, view: int, labels: Labels, margin: Map) -> Mask:
     """Cut a view, by colours that shadows change little where there is a plane for them to fall on.
 
     Those do not distinguish the grey inside of a vessel from a grey table: pixels well inside are
@@ -272,15 +271,8 @@ def doubt_of(agreement: Map) -> Map:
     return torch.where(agreement < _OFF_PLANE, DOUBT_OFF_PLANE, doubt)
 
 
-def _abstaining(inside: Map, unknown: Mask) -> Map:
-    return inside.masked_fill(unknown, 0.5)
-
-
 def _voted(
-    cues: Cues,
-    inside: Maps,
-    voting: ViewMask | None = None,
-    disagreeing: float = _DISAGREEING,
+    cues: Cues, inside: Maps, voting: ViewMask | None = None, disagreeing: float = _DISAGREEING
 ) -> Maps | None:
     """Build the hull above the plane, of what is pointed at, and see it in every view.
 
@@ -292,11 +284,7 @@ def _voted(
         voting = torch.ones(len(inside), dtype=torch.bool)
     silhouettes = Silhouettes(inside=inside, reliable=voting, source="found")
     hull = visual_hull(
-        silhouettes,
-        cameras,
-        cues.box_world,
-        num_voxels=NUM_VOXELS,
-        disagreeing=disagreeing,
+        silhouettes, cameras, cues.box_world, num_voxels=NUM_VOXELS, disagreeing=disagreeing
     )
     if hull is None:
         return None
@@ -318,7 +306,7 @@ def labels_from_points(
     background_px: Float[Tensor, "other 2"],
     agreement: Map | None,
     size_px: tuple[int, int],
-) -> UInt8[Tensor, "height width"]:
+) -> Labels:
     """Seed with the points that a view observes, the object's and others, and with parallax.
 
     Without parallax a strip along the border is background.
@@ -342,7 +330,7 @@ def labels_from_points(
 
 def labels_from_hull(
     margin: Map, cut: Mask, object_px: Pixels, agreement: Map | None, unknown: Mask | None = None
-) -> UInt8[Tensor, "height width"]:
+) -> Labels:
     """Seed with a view's last cut, the projection of the hull, points in it, and parallax.
 
     Nothing is certain where the vote on the hull was ``unknown``, none by default.
@@ -364,9 +352,7 @@ def labels_from_hull(
     return labels
 
 
-def labels_from_soft(
-    labels: UInt8[Tensor, "height width"], mask: Mask, margin: Map
-) -> UInt8[Tensor, "height width"]:
+def labels_from_soft(labels: Labels, mask: Mask, margin: Map) -> Labels:
     """Seed with a soft mask where the hull agrees: colours cut near their borders alone."""
     border, reach = signed_distance(mask), 1 / 160 * max(mask.shape)
     labels = torch.where((border > reach) & (margin > 0), OBJECT, labels)

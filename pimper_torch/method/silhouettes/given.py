@@ -22,7 +22,7 @@ from pimper_torch.ground.geometry.pixels import grid_from_pixels, scale_intrinsi
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.supporting_plane import well_tracked
 from pimper_torch.ground.geometry.visual_hull import box_round
-from pimper_torch.ground.shapes import Maps, Mask, ViewMask
+from pimper_torch.ground.shapes import Maps, Mask, PerView, ViewMask
 from pimper_torch.method.silhouettes.cues import points_at, soft_masks_of
 from pimper_torch.records import Cameras, SilhouettePrior, Silhouettes, SparseScene, Views
 from pimper_torch.runtime.errors import InputError, caution
@@ -42,6 +42,7 @@ _REFUSED = 0.5  # of the points in the masks of the median view: more than half;
 _SUSPECTS, _TRIED, _VIEWS = 4, 4, 40
 
 Raster = Shaped[Tensor, "_ _"]
+Places = Bool[Tensor, "view other pixel place"]
 _TURNS = {
     2: "mirrored",
     3: "turned by a half turn",
@@ -316,9 +317,7 @@ class _Evidence:
             return _MOST if reading.inverted else 1.0
         return wrong / total
 
-    def of_pixels(
-        self, reading: Reading, names: Sequence[str]
-    ) -> tuple[float, Float[Tensor, " view"]]:
+    def of_pixels(self, reading: Reading, names: Sequence[str]) -> tuple[float, PerView]:
         """Return the fraction of the masks' pixels that others deny, and how each takes part in it.
 
         Args:
@@ -343,10 +342,8 @@ _IN_CONFLICT = 0.25
 
 
 def _in_conflict(
-    denied: Bool[Tensor, "view other pixel place"],
-    seen: Bool[Tensor, "view other pixel place"],
-    chosen: ViewMask,
-) -> tuple[Float[Tensor, " view"], Float[Tensor, "view other"]]:
+    denied: Places, seen: Places, chosen: ViewMask
+) -> tuple[PerView, Float[Tensor, "view other"]]:
     """Compute the fraction of each view's pixels in conflict, and in conflict with each view.
 
     Args:
@@ -401,9 +398,7 @@ def contradictory(scene: SparseScene) -> ViewMask:
     return doubted
 
 
-def _denied(
-    borders: Maps, cameras: Cameras, count: int
-) -> tuple[Bool[Tensor, "view other pixel place"], Bool[Tensor, "view other pixel place"]] | None:
+def _denied(borders: Maps, cameras: Cameras, count: int) -> tuple[Places, Places] | None:
     """Find which views deny, and see, places on rays through pixels of each mask.
 
     Args:

@@ -26,6 +26,7 @@ from pimper_torch.records import Cameras, Record, Views
 from pimper_torch.runtime.mapped import by_view, stacked, zeros
 from pimper_torch.runtime.parallel import side_by_side
 
+Homographies = Float[Tensor, "view 3 3"]
 _FAINT = 0.03  # of white; ratios of darker colours tell noise
 _RATIO = 100.0  # grey levels for a ratio of e
 
@@ -117,7 +118,7 @@ class Raster(Record):
             view that does not see the background.
     """
 
-    pixels_from_raster: Float[Tensor, "view 3 3"]
+    pixels_from_raster: Homographies
     size_px: tuple[int, int]
 
 
@@ -136,9 +137,7 @@ def plane_agreement(
 
 
 def room_agreement(
-    pictures: WorkingPictures,
-    background_from_view: Float[Tensor, "view 3 3"],
-    hidden: Masks | None = None,
+    pictures: WorkingPictures, background_from_view: Homographies, hidden: Masks | None = None
 ) -> Maps:
     """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
 
@@ -274,9 +273,7 @@ def _plane_raster(
     return Raster(pixels_from_raster=cameras.intrinsics @ cam_from_raster, size_px=(size, size))
 
 
-def _room_raster(
-    pictures: WorkingPictures, background_from_view: Float[Tensor, "view 3 3"]
-) -> Raster:
+def _room_raster(pictures: WorkingPictures, background_from_view: Homographies) -> Raster:
     """Lay a raster over the room, of working pixels where it is at rest, as far as views see."""
     height, width = pictures.grey.shape[1:]
     scale = torch.diag(torch.tensor([*pictures.factors, 1.0]).double())

@@ -28,14 +28,16 @@ from pimper_torch.ground.kernels.switch import compiled_for
 from pimper_torch.records import Cameras, Observations, Photometry, Record, Templates
 
 PerView = Float[Tensor, "sample view"]
+SeenBy = Bool[Tensor, "sample view"]
+PerSample = Float[Tensor, " sample"]
 _Array = NDArray[Any]
 
 
 def inconsistency(
     radiance: Float[Tensor, "sample view hypothesis"],
     shading: PerView,
-    seen: Bool[Tensor, "sample view"],
-    scale: Float[Tensor, " sample"],
+    seen: SeenBy,
+    scale: PerSample,
     iterations: int = 2,
 ) -> Float[Tensor, "sample hypothesis"]:
     r"""Return the robust cost of every hypothesis.
@@ -67,7 +69,7 @@ def inconsistency(
 
 
 def best_views(
-    score: PerView, usable: Bool[Tensor, "sample view"], count: int
+    score: PerView, usable: SeenBy, count: int
 ) -> tuple[Int[Tensor, "sample chosen"], Bool[Tensor, "sample chosen"]]:
     """Choose, for every sample, the usable views of the best scores, ``count`` of them at most.
 
@@ -83,9 +85,7 @@ def best_views(
     return best.indices, best.values > -torch.inf
 
 
-def poses_first(
-    score: PerView, usable: Bool[Tensor, "sample view"], poses: Int[Tensor, " view"]
-) -> PerView:
+def poses_first(score: PerView, usable: SeenBy, poses: Int[Tensor, " view"]) -> PerView:
     """Rate the best usable view of every pose before the second of any, and so on.
 
     Views of one pose say nothing of a height: they agree whatever it is.
@@ -320,9 +320,7 @@ def _compared(given: Hypotheses, num_views: int, min_views: int) -> _Samples:
     )
 
 
-def _footprint(
-    points: Float[Tensor, "sample 3"], spacing: Float[Tensor, " sample"], cameras: Cameras
-) -> PerView:
+def _footprint(points: Float[Tensor, "sample 3"], spacing: PerSample, cameras: Cameras) -> PerView:
     """Return the pixels that a sample would span in each view if it faced it."""
     focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
     axes = cameras.cam_from_world[:, 2]

@@ -6,10 +6,11 @@ from torch import Tensor
 
 from pimper_torch.ground.shapes import Scalars
 
+Costs = Float[Tensor, "*batch hypothesis"]
+
 
 def parabola_minimum(
-    cost: Float[Tensor, "*batch hypothesis"],
-    prior: Float[Tensor, "*batch hypothesis"] | None = None,
+    cost: Costs, prior: Costs | None = None
 ) -> tuple[Scalars, Scalars, Bool[Tensor, "*batch"]]:
     """Fit a parabola to the least cost and the two beside it.
 
@@ -40,9 +41,7 @@ def parabola_minimum(
     return position, torch.where(bent, curvature, 0), bent
 
 
-def posterior_variance(
-    cost: Float[Tensor, "*batch hypothesis"], position: Scalars, curvature: Scalars
-) -> Scalars:
+def posterior_variance(cost: Costs, position: Scalars, curvature: Scalars) -> Scalars:
     r"""Return the variance of the minimum's position, in squared steps.
 
     Costs are taken for negative log likelihoods, :math:`p_k \propto e^{-C_k}`. The variance is
@@ -65,7 +64,7 @@ def posterior_variance(
     return torch.where(bent, beyond + 1 / torch.where(bent, curvature, 1), torch.inf)
 
 
-def _variance(cost: Float[Tensor, "*batch hypothesis"]) -> Scalars:
+def _variance(cost: Costs) -> Scalars:
     """Return the variance of the hypotheses' index under their likelihoods."""
     steps = torch.arange(cost.shape[-1], device=cost.device, dtype=cost.dtype)
     likelihood = torch.softmax(-cost, dim=-1)

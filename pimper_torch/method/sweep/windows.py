@@ -9,10 +9,10 @@ from torch.nn.functional import pad
 
 from pimper_torch.ground.shapes import PatchRaster
 
+Layers = Float[Tensor, "patch channel height width"]
 
-def window_mean(
-    values: Float[Tensor, "patch channel height width"], weight: PatchRaster, radius: float
-) -> Float[Tensor, "patch channel height width"]:
+
+def window_mean(values: Layers, weight: PatchRaster, radius: float) -> Layers:
     """Average with a Gaussian of standard deviation ``radius``, in samples.
 
     Args:

@@ -30,6 +30,10 @@ from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 
 Matrices = Float[Tensor, "batch row column"]
+Matrix = Float[Tensor, "row column"]
+LeftFactors = Float[Tensor, "batch row rank"]
+Vectors = Float[Tensor, "*batch rank"]
+Columns = Float[Tensor, "*batch rank sample"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,36 +43,30 @@ class Free:
     rank: int = 3
     flat: ClassVar[bool] = True
 
-    def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
+    def project(self, shading: Vectors) -> Vectors:
         """Return the vector itself: it is on the manifold, and so is the end of every step."""
         return shading
 
     retract = project
 
     def curvature(
-        self,
-        shading: Float[Tensor, "*batch rank sample"],
-        slope: Float[Tensor, "*batch rank sample"],
+        self, shading: Columns, slope: Columns
     ) -> Float[Tensor, "*batch sample rank rank"]:
         """Return the manifold's part of second derivatives: flat, it has none."""
         return slope.new_zeros(*slope.shape[:-2], slope.shape[-1], self.rank, self.rank)
 
-    def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
+    def tangents(self, shading: Columns) -> list[Tensor]:
         """Return the axes of the space."""
         eye = torch.eye(self.rank, dtype=shading.dtype, device=shading.device)
         return [axis[:, None].expand_as(shading) for axis in eye]
 
-    def split(
-        self, shading: Float[Tensor, "*batch rank"]
-    ) -> tuple[Scalars, Float[Tensor, "*batch rank"]]:
+    def split(self, shading: Vectors) -> tuple[Scalars, Vectors]:
         """Return lengths and directions: albedo and normals with rank three."""
         length = shading.norm(dim=-1)
         return length, shading / torch.where(length > 0, length, 1)[..., None]
 
 
-def low_rank_problem(
-    matrix: Matrices, weight: Matrices, start: Float[Tensor, "batch row rank"]
-) -> Bilinear:
+def low_rank_problem(matrix: Matrices, weight: Matrices, start: LeftFactors) -> Bilinear:
     r"""Return the problem :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
 
     Args:
@@ -113,7 +111,7 @@ def singular_left(
     rank: int,
     guess: Matrices | None = None,
     imputations: int = 20,
-) -> Float[Tensor, "batch row rank"]:
+) -> LeftFactors:
     """Initialize by singular vectors of the matrix, missing entries imputed iteratively.
 
     Missing entries start from a guess, by default the mean of their row, and are replaced by the
@@ -130,9 +128,7 @@ def singular_left(
     return left
 
 
-def brightness_guess(
-    matrix: Float[Tensor, "row column"], weight: Float[Tensor, "row column"]
-) -> Float[Tensor, "row column"]:
+def brightness_guess(matrix: Matrix, weight: Matrix) -> Matrix:
     """Return the product of each row's and each column's brightness, for missing entries."""
     gain = (weight * matrix).sum(dim=1, keepdim=True)
     gain = gain / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
@@ -140,9 +136,7 @@ def brightness_guess(
     return gain * (weight * matrix).sum(dim=0, keepdim=True) / level
 
 
-def random_left(
-    batch: int, rows: int, rank: int, generator: torch.Generator
-) -> Float[Tensor, "batch row rank"]:
+def random_left(batch: int, rows: int, rank: int, generator: torch.Generator) -> LeftFactors:
     """Draw orthonormal left factors, evenly over all subspaces."""
     drawn = torch.randn(batch, rows, rank, generator=generator, dtype=torch.float64)
     return torch.linalg.qr(drawn).Q
@@ -164,8 +158,8 @@ class Restarted(Record):
 
 
 def factorize_from_many(
-    matrix: Float[Tensor, "row column"],
-    weight: Float[Tensor, "row column"],
+    matrix: Matrix,
+    weight: Matrix,
     rank: int,
     generator: torch.Generator,
     *,

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.ground.shapes import Map
-from pimper_torch.paper.integrate import differences
+from pimper_torch.paper.integrate import StepsDown, StepsRight, differences
 from pimper_torch.records import Convergence, Record, StopCause
 from pimper_torch.runtime.progress import report
 from pimper_torch.single_view.integration.raster_system import RasterSystem
@@ -58,8 +58,8 @@ class Continuity(Record):
         convergence: Of the weights; the residual is that of continuous steps, in pixels.
     """
 
-    right: Float[Tensor, "height steps_right"]
-    down: Float[Tensor, "steps_down width"]
+    right: StepsRight
+    down: StepsDown
     convergence: Convergence
 
 

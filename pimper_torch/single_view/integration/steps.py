@@ -19,12 +19,15 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
-from pimper_torch.ground.shapes import Mask, Matrix3, Scalars
+from pimper_torch.ground.shapes import Mask, Matrix3, Scalars, VectorMap
 from pimper_torch.paper.integrate import fill_smoothly
 from pimper_torch.records import Record
 
 Changes = Float[Tensor, "line step"]
 Known = Bool[Tensor, "line step"]
+PerStep = Shaped[Tensor, " step"]
+StepsRight = Shaped[Tensor, "height steps_right"]
+StepsDown = Shaped[Tensor, "steps_down width"]
 
 # Cosine between ray and normal below which a normal is not used: a choice, its slope is 1000.
 _GRAZING = 1e-3
@@ -67,37 +70,31 @@ class Steps(Record):
         return joined(self.units[0] * right, self.units[1] * down)
 
     @property
-    def target(
-        self,
-    ) -> tuple[Float[Tensor, "height steps_right"], Float[Tensor, "steps_down width"]]:
+    def target(self) -> tuple[StepsRight, StepsDown]:
         """The differences in units of the unknown, to the right and down."""
         return self.split(self.slope * self.unit)
 
-    def split(
-        self, values: Shaped[Tensor, " step"]
-    ) -> tuple[Shaped[Tensor, "height steps_right"], Shaped[Tensor, "steps_down width"]]:
+    def split(self, values: PerStep) -> tuple[StepsRight, StepsDown]:
         """Return the values of steps to the right and of those down, as rasters."""
         height, width = self.inside.shape
         many = height * (width - 1)
         return values[:many].view(height, width - 1), values[many:].view(height - 1, width)
 
 
-def joined(
-    right: Shaped[Tensor, "height steps_right"], down: Shaped[Tensor, "steps_down width"]
-) -> Shaped[Tensor, " step"]:
+def joined(right: StepsRight, down: StepsDown) -> PerStep:
     """Join the values of steps to the right and down; see :meth:`Steps.split`."""
     return torch.cat([right.flatten(), down.flatten()])
 
 
 def at_both_ends(
     combine: Callable[[Tensor, Tensor], Tensor], raster: Shaped[Tensor, "height width"]
-) -> Shaped[Tensor, " step"]:
+) -> PerStep:
     """Combine the values of the pixels at both ends of every step."""
     return joined(combine(raster[:, 1:], raster[:, :-1]), combine(raster[1:], raster[:-1]))
 
 
 def orthographic_steps(
-    normals: Float[Tensor, "height width 3"], mask: Mask, spacing: tuple[float, float] = (1.0, 1.0)
+    normals: VectorMap, mask: Mask, spacing: tuple[float, float] = (1.0, 1.0)
 ) -> Steps:
     """Return the steps of depth under parallel rays, differentiable in the normals.
 
@@ -110,9 +107,7 @@ def orthographic_steps(
     return _steps(normals, towards.expand(*mask.shape, 3), (0.0, 0.0), mask, spacing)
 
 
-def perspective_steps(
-    normals: Float[Tensor, "height width 3"], mask: Mask, intrinsics: Matrix3
-) -> Steps:
+def perspective_steps(normals: VectorMap, mask: Mask, intrinsics: Matrix3) -> Steps:
     r"""Return the steps of the logarithm of depth under rays through a pinhole.
 
     On a step the tangent planes of both pixels meet at the ray half-way, which is exact for
@@ -147,8 +142,8 @@ def _between_planes(first: Scalars, second: Scalars, unit: float) -> tuple[Scala
 
 
 def _steps(
-    normals: Float[Tensor, "height width 3"],
-    rays: Float[Tensor, "height width 3"],
+    normals: VectorMap,
+    rays: VectorMap,
     bend: tuple[float, float],
     mask: Mask,
     unit: tuple[float, float],

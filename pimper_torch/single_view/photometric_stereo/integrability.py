@@ -25,6 +25,7 @@ from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, rob
 from pimper_torch.ground.shapes import Mask, Matrix3, Vectors
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.single_view.factorization.bas_relief import PerPixel, Shading
 
 # Differences are taken over cells of 1/64 of the object's size, and equations averaged over blocks
 # of 1/16: averages lose no signal, as the unknowns are constant, and reduce the noise of the
@@ -55,7 +56,7 @@ def wedge(one: Vectors, other: Vectors) -> Vectors:
     return one[..., first] * other[..., second] - one[..., second] * other[..., first]
 
 
-def curls(pseudo: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"], mask: Mask) -> Curls:
+def curls(pseudo: Shading, weight: PerPixel, mask: Mask) -> Curls:
     """Assemble the equations of integrability over a raster.
 
     Pseudo-normals are whitened and normalized first, so that neither albedo nor its edges enter
@@ -108,9 +109,7 @@ def curls(pseudo: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"], mas
     )
 
 
-def integrable(
-    pseudo: Float[Tensor, "3 pixel"], weight: Float[Tensor, " pixel"], mask: Mask
-) -> Matrix3:
+def integrable(pseudo: Shading, weight: PerPixel, mask: Mask) -> Matrix3:
     """Find ``A`` that makes pseudo-normals the normals of a surface: shading is ``A s``.
 
     The six unknowns are the least generalised eigenvector of the equations' squares against

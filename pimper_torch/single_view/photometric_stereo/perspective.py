@@ -22,8 +22,9 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, pad
 
 from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
-from pimper_torch.ground.shapes import Mask, Matrix3
+from pimper_torch.ground.shapes import Images, Mask, Matrix3, VectorMap, ViewVectors
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.single_view.factorization.bas_relief import Shading
 from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
 # Minimum ratio of the second smallest residual to the smallest: a choice; on a ball it is about 1.
@@ -31,13 +32,13 @@ _DISTINCT = 1.5
 
 
 def factorize_in_perspective(
-    images: Float[Tensor, "view channel height width"],
+    images: Images,
     mask: Mask,
     intrinsics: Matrix3,
     seen: Bool[Tensor, "view pixel"] | None = None,
     *,
     radius: int = 3,
-) -> tuple[Float[Tensor, "3 pixel"], Float[Tensor, "view 3"]]:
+) -> tuple[Shading, ViewVectors]:
     """Estimate albedo times normal and the lights from photographs of one viewpoint.
 
     The images, channels added, are factorized to rank three; the integrability of the normalized
@@ -88,10 +89,7 @@ def factorize_in_perspective(
 
 
 def integrability_equations(
-    vectors: Float[Tensor, "3 pixel"],
-    along_x: Float[Tensor, "3 pixel"],
-    along_y: Float[Tensor, "3 pixel"],
-    rays: Float[Tensor, "3 pixel"],
+    vectors: Shading, along_x: Shading, along_y: Shading, rays: Shading
 ) -> Float[Tensor, "pixel 9"]:
     """Return the coefficients of the integrability constraint by the entries of P, row by row.
 
@@ -107,12 +105,7 @@ def integrability_equations(
 
 
 def _between(
-    right: Float[Tensor, "3 pixel"],
-    mask: Mask,
-    inside: Mask,
-    intrinsics: Matrix3,
-    rays: Float[Tensor, "height width 3"],
-    radius: int,
+    right: Shading, mask: Mask, inside: Mask, intrinsics: Matrix3, rays: VectorMap, radius: int
 ) -> Matrix3:
     """Find the matrix under which the vectors are normals times albedo, up to a factor."""
     moment = right @ right.mT / inside.sum().clamp_min(1)

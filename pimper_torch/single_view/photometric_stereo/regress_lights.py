@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
+from pimper_torch.ground.shapes import ViewVectors
 from pimper_torch.method.photometry.quadratics import PackedCholesky, outer, unpacked
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
@@ -26,6 +27,7 @@ from pimper_torch.single_view.factorization.low_rank import brightness_guess, lo
 Samples = Float[Tensor, "view pixel"]
 Lights = Float[Tensor, "view unknown"]
 Colours = Float[Tensor, "view channel pixel"]
+ChannelPixels = Float[Tensor, "channel pixel"]
 
 # The scale of the weights starts at this multiple and is multiplied by the second per iteration,
 # down to 1: choices, so that the initial fit does not decide which samples are outliers.
@@ -126,13 +128,13 @@ class StereoSolution(Record):
     """
 
     normals: Float[Tensor, "3 pixel"]
-    albedo: Float[Tensor, "channel pixel"]
-    lights: Float[Tensor, "view 3"]
+    albedo: ChannelPixels
+    lights: ViewVectors
     weight: Samples
 
 
 def calibrated_stereo(
-    radiance: Colours, weight: Samples, lights: Float[Tensor, "view 3"], *, robust: bool = True
+    radiance: Colours, weight: Samples, lights: ViewVectors, *, robust: bool = True
 ) -> StereoSolution:
     r"""Recover normals and albedos of pixels under known distant lights; constant to autograd.
 
@@ -163,9 +165,7 @@ def calibrated_stereo(
         )
 
 
-def chromatic_albedo(
-    radiance: Colours, weight: Samples, shade: Samples
-) -> Float[Tensor, "channel pixel"]:
+def chromatic_albedo(radiance: Colours, weight: Samples, shade: Samples) -> ChannelPixels:
     """Fit the albedo of each colour, not negative, to the shading of albedo 1."""
     x = torch.where((weight > 0)[:, None], radiance, 0).to(shade)
     square = (weight * shade * shade).sum(dim=0)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.shapes import Mask, Masks, Matrix3
+from pimper_torch.ground.shapes import Images, Mask, Masks, Matrix3, VectorMap, ViewVectors
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization import bas_relief
@@ -53,9 +53,9 @@ class PhotometricStereo(Record):
         free: The remaining ambiguity, in words.
     """
 
-    normals: Float[Tensor, "height width 3"]
+    normals: VectorMap
     albedo: Float[Tensor, "height width channel"]
-    lights: Float[Tensor, "view 3"]
+    lights: ViewVectors
     lit: Masks
     valid: Mask
     applied: bas_relief.BasRelief | None = None
@@ -63,7 +63,7 @@ class PhotometricStereo(Record):
 
 
 def photometric_stereo(
-    images: Float[Tensor, "view channel height width"],
+    images: Images,
     mask: Bool[Tensor, "rows columns"],
     *,
     method: str,
