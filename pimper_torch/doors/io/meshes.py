@@ -63,9 +63,7 @@ def write_ply(
         for name, column in zip(names.split(), values.unbind(dim=1), strict=True)
     }
     row = [(name, array.dtype.newbyteorder("<")) for name, array in arrays.items()]
-    vertices = np.empty(len(mesh.vertices_world), row)
-    for name, array in arrays.items():
-        vertices[name] = array
+    vertices = np.rec.fromarrays(list(arrays.values()), dtype=row)
     kind = [("count", "u1"), ("corners", "<i4", 3)]
     faces = np.empty(len(mesh.faces), kind if measured is None else [*kind, ("measured", "u1")])
     faces["count"], faces["corners"] = 3, mesh.faces.cpu().numpy()

@@ -40,6 +40,7 @@ class _Kind(NamedTuple):
 
 
 Planes = Float[Tensor, "channel height width"]
+Shrunk = Float[Tensor, "channel {height} {width}"]
 Levels = Float[Tensor, " channel"]  # fractions of full scale, one a colour
 Sizes = Sequence[tuple[int, int]]  # width and height
 _Whites = Mapping[_Kind, Levels]  # of saturation, where it was found
@@ -98,7 +99,7 @@ def read_pictures(
     return images, opaque
 
 
-def resized(planes: Planes, width: int, height: int) -> Float[Tensor, "channel {height} {width}"]:
+def resized(planes: Planes, width: int, height: int) -> Shrunk:
     """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
     if tuple(planes.shape[-2:]) == (height, width):
         return planes
@@ -107,9 +108,7 @@ def resized(planes: Planes, width: int, height: int) -> Float[Tensor, "channel {
     )[0]
 
 
-def resized_radiance(
-    radiance: Planes, width: int, height: int
-) -> Float[Tensor, "channel {height} {width}"]:
+def resized_radiance(radiance: Planes, width: int, height: int) -> Shrunk:
     """Shrink radiance; a pixel made of some that are saturated is saturated, colour by colour.
 
     The radiance of saturated pixels is unknown, and so is their mean with others.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pimper_torch.doors.io.version import installed_version
 from pimper_torch.ground.geometry.rigid import rotate
+from pimper_torch.paper.seams import by_facet
 from pimper_torch.records import Failure, Reconstruction, Relighting
 
 # What JSON can hold.
@@ -89,14 +90,13 @@ def common_lights(result: Reconstruction) -> tuple[Float[Tensor, "view 4"], Int[
 def _determined_by(result: Reconstruction) -> Float[Tensor, "patch 4 4"]:
     """Sum ``rho^2 (1, n) (1, n)^T`` over each patch's samples, world frame, order of facets."""
     photometric = result.patches.photometric
-    facets, sums = [], []
+    sums = []
     for templates, found in zip(photometric.patches.buckets, photometric.buckets, strict=True):
         weight = found.albedo.double().mean(dim=-1).square() * found.valid
         normals = rotate(templates.patch_from_world.mT, found.normals_patch.flatten(1, 2)).double()
         shading = torch.cat([torch.ones_like(normals[..., :1]), normals], dim=-1)
         sums.append(shading.mT @ (weight.flatten(1)[..., None] * shading))
-        facets.append(templates.facet)
-    return torch.cat(sums)[torch.cat(facets).argsort()]
+    return by_facet(photometric.patches, sums)
 
 
 def world_lights(
@@ -109,17 +109,16 @@ def world_lights(
     Returns:
         In the order of the facets: the facet, its lights, whether they were determined.
     """
-    photometric = result.patches.photometric
-    facets, lights, determined = [], [], []
-    for templates, found in zip(photometric.patches.buckets, photometric.buckets, strict=True):
+    patches, buckets = result.patches.photometric.patches, result.patches.photometric.buckets
+    lights = []
+    for templates, found in zip(patches.buckets, buckets, strict=True):
         world_from_patch = templates.patch_from_world.mT  # only its rotation is used
         directed = rotate(world_from_patch, found.lights_patch[..., 1:4])
         own = torch.cat([found.lights_patch[..., :1], directed], dim=-1)
         lights.append(templates.among_all(own))
-        facets.append(templates.facet)
-        determined.append(found.determined)
-    order = torch.cat(facets).argsort()
-    return torch.cat(facets)[order], torch.cat(lights)[order], torch.cat(determined)[order]
+    facets = by_facet(patches, (templates.facet for templates in patches.buckets))
+    determined = by_facet(patches, (found.determined for found in buckets))
+    return facets, by_facet(patches, lights), determined
 
 
 def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Report:

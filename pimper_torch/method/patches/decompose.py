@@ -1,7 +1,7 @@
 """Decomposition: every facet of the coarse mesh becomes a patch with a template."""
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -9,7 +9,7 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
-from pimper_torch.ground.shapes import Faces, Scalar, Vertices
+from pimper_torch.ground.shapes import Faces, Pose, Scalar, Vertices, ViewMask
 from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.method.patches.transfer import transfer
 from pimper_torch.method.patches.view_choice import view_blocks
@@ -18,6 +18,8 @@ from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.failures import skipped_patches
 from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.stage import Stage
+
+Indices = Int[Tensor, " bucket"]
 
 
 class Decompose(Stage):
@@ -74,9 +76,26 @@ class Decompose(Stage):
         ]
         if bool((faced > limit).any()):
             blocks = view_blocks(coarse.mesh, cameras, spacing, limit)
-        frames = patch_from_world, corners, enlarged, low, spacing
+
+        def templates(facets: Indices, raster: tuple[int, int], views: ViewMask) -> Templates:
+            height, width = raster
+            grid = spacing * (pixel_centers(width, height, like=low) - 0.5)
+            positions = low[facets, None, None] + grid
+            barycentric = recomputed(barycentric_2d, positions, corners[facets, None, None])
+            within = barycentric_2d(positions.detach(), enlarged.detach()[facets, None, None])
+            return Templates(
+                facet=facets,
+                patch_from_world=patch_from_world[facets],
+                origin=low[facets],
+                spacing=spacing.expand(len(facets)),
+                depth=torch.zeros_like(barycentric[..., 0]),
+                barycentric=barycentric,
+                inside=(within >= 0).all(dim=-1),
+                views=None if bool(views.all()) else views,
+            )
+
         buckets = tuple(
-            _templates(some[facets], raster, views > 0, *frames)
+            templates(some[facets], raster, views > 0)
             for some, views in blocks
             for facets, raster in group_by_size(
                 sides[some], max(1, self.config.bucket_entries // int(views.sum()))
@@ -105,7 +124,7 @@ def with_area(coarse: CoarseMesh) -> CoarseMesh:
 
 
 def facet_frames(
-    vertices: Vertices, faces: Faces, cam_from_world: Float[Tensor, "4 4"]
+    vertices: Vertices, faces: Faces, cam_from_world: Pose
 ) -> Float[Tensor, "face 4 4"]:
     """Return ``patch_from_world`` of every facet: the paper's R_mu, and the facet's centroid.
 
@@ -160,7 +179,7 @@ def enlarge(corners: Float[Tensor, "patch 3 2"], distance: Scalar) -> Float[Tens
 
 def group_by_size(
     sides: Int[Tensor, "patch 2"], bucket_samples: int
-) -> list[tuple[Int[Tensor, " bucket"], tuple[int, int]]]:
+) -> list[tuple[Indices, tuple[int, int]]]:
     """Batch templates of like size.
 
     Args:
@@ -175,7 +194,7 @@ def group_by_size(
     groups: dict[tuple[int, int], list[int]] = {}
     for facet, (width, height) in enumerate(keys.tolist()):
         groups.setdefault((height, width), []).append(facet)
-    buckets: list[tuple[Int[Tensor, " bucket"], tuple[int, int]]] = []
+    buckets: list[tuple[Indices, tuple[int, int]]] = []
     for members in (groups[key] for key in sorted(groups)):
         facets = torch.tensor(members, device=sides.device)
         width, height = (int(side) for side in sides[facets].amax(dim=0))
@@ -183,30 +202,3 @@ def group_by_size(
         starts = range(0, len(facets), count)
         buckets += [(facets[start : start + count], (height, width)) for start in starts]
     return buckets
-
-
-def _templates(
-    facets: Int[Tensor, " bucket"],
-    raster: tuple[int, int],
-    views: Bool[Tensor, " view"],
-    patch_from_world: Float[Tensor, "face 4 4"],
-    corners: Float[Tensor, "face 3 2"],
-    enlarged: Float[Tensor, "face 3 2"],
-    low: Float[Tensor, "face 2"],
-    spacing: Scalar,
-) -> Templates:
-    height, width = raster
-    grid = spacing * (pixel_centers(width, height, like=low) - 0.5)
-    positions = low[facets, None, None] + grid
-    barycentric = recomputed(barycentric_2d, positions, corners[facets, None, None])
-    within = barycentric_2d(positions.detach(), enlarged.detach()[facets, None, None])
-    return Templates(
-        facet=facets,
-        patch_from_world=patch_from_world[facets],
-        origin=low[facets],
-        spacing=spacing.expand(len(facets)),
-        depth=torch.zeros_like(barycentric[..., 0]),
-        barycentric=barycentric,
-        inside=(within >= 0).all(dim=-1),
-        views=None if bool(views.all()) else views,
-    )

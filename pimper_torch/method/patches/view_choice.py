@@ -130,9 +130,7 @@ def best_views(weight: Weights, directions: ViewVectors, count: int) -> ViewMask
     return chosen
 
 
-def halves(
-    points: Float[Tensor, "point axis"],
-) -> tuple[Int[Tensor, " half"], Int[Tensor, " other"]]:
+def halves(points: Float[Tensor, "point axis"]) -> tuple[Int[Tensor, " _"], ...]:
     """Divide points at the median of the axis along which they vary most."""
     order = points[:, points.var(dim=0).argmax()].argsort(stable=True)
-    return order[: len(order) // 2], order[len(order) // 2 :]
+    return order.tensor_split((len(order) // 2,))

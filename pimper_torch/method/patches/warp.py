@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -26,7 +26,7 @@ from pimper_torch.ground.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.ground.kernels.arrays import as_array, pulled_back
 from pimper_torch.ground.kernels.signatures import FractionRows, PictureRows, Projection, Samples
 from pimper_torch.ground.kernels.switch import compiled_for
-from pimper_torch.ground.shapes import PatchMasks
+from pimper_torch.ground.shapes import PatchMask, PatchMasks
 from pimper_torch.method.patches.patches_config import WarpConfig
 from pimper_torch.method.patches.template_priors import merged
 from pimper_torch.records import (
@@ -230,66 +230,39 @@ class Warp(Stage):
         if images.dtype == torch.float32 and compiled_for(images.detach()):
             steepest = math.cos(math.radians(self.config.max_tilt_deg))
             return resampled(cameras, sources, templates, rows, steepest, dark_level)
-        return self._reference(cameras, sources, rows, templates, dark_level)
-
-    def _reference(
-        self,
-        cameras: Cameras,
-        sources: Sources,
-        rows: Int[Tensor, " view"],
-        templates: Templates,
-        dark_level: float,
-    ) -> Observations:
         world_from_patch = invert_rigid(templates.patch_from_world)
-        num, height, width = templates.depth.shape
-        points = transform(world_from_patch, templates.points_patch.reshape(num, -1, 3))
-        points_world = points.reshape(num, height, width, 3)
+        points = transform(world_from_patch, templates.points_patch.flatten(1, 2))
+        points_world = points.reshape(*templates.depth.shape, 3)
         outward = -world_from_patch[:, None, None, :3, 2].expand_as(points_world)
         if templates.normals_patch is not None:
-            transferred = templates.normals_patch.detach().reshape(num, -1, 3)
+            transferred = templates.normals_patch.detach().flatten(1, 2)
             outward = rotate(world_from_patch, transferred).reshape(points_world.shape)
-        seen = [
-            self._seen_by(view, row, templates, points_world, outward, cameras, sources, dark_level)
-            for view, row in enumerate(rows.tolist())
-        ]
-        return Observations(
-            radiance=torch.stack([radiance for radiance, _ in seen], dim=1),
-            valid=torch.stack([valid for _, valid in seen], dim=1),
-        )
 
-    def _seen_by(
-        self,
-        view: int,
-        row: int,
-        templates: Templates,
-        points_world: Float[Tensor, "patch height width 3"],
-        outward: Float[Tensor, "patch height width 3"],
-        cameras: Cameras,
-        sources: Sources,
-        dark_level: float,
-    ) -> tuple[Float[Tensor, "patch channel height width"], Bool[Tensor, "patch height width"]]:
-        center = cameras.centers_world[view]
-        facing = (normalize(center - points_world, dim=-1) * outward).sum(-1)
-        steepest = torch.deg2rad(facing.new_tensor(self.config.max_tilt_deg)).cos()
-        pixels, depth = project(
-            points_world.reshape(-1, 3), cameras.cam_from_world[view], cameras.intrinsics[view]
-        )
-        pixels = pixels.reshape(*points_world.shape[:-1], 2)
-        wanted = templates.inside & (facing > steepest) & (depth.reshape(facing.shape) > 0)
-        if not wanted.any():
-            finest = sources.images.finest
-            return finest.new_zeros(len(facing), finest.shape[1], *facing.shape[1:]), wanted
-        level = pyramid_level(pixels)
-        # A sample whose footprint touches the border, or is unusable by a tenth, is missing.
-        margin = 0.5 * 2 ** level.detach()[..., None]
-        size = cameras.sizes_px[view].to(pixels)
-        within = ((pixels >= margin) & (pixels <= size - margin)).all(dim=-1)
-        wanted = wanted & within
-        found = look_up(sources.images.levels(row), pixels[wanted], level[wanted])
-        fractions = [fraction.to(found) for fraction in sources.unusable.levels(row)]
-        lost = look_up(fractions, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
-        usable = (lost < 0.1) & (found.mean(dim=1) > dark_level)
-        radiance = found.new_zeros(*wanted.shape, found.shape[1])
-        radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
-        valid = torch.zeros_like(wanted).index_put((wanted,), usable)
-        return radiance * valid[:, None], valid
+        def seen_by(view: int, row: int) -> tuple[Tensor, PatchMask]:
+            center = cameras.centers_world[view]
+            facing = (normalize(center - points_world, dim=-1) * outward).sum(-1)
+            steepest = torch.deg2rad(facing.new_tensor(self.config.max_tilt_deg)).cos()
+            pixels, depth = project(
+                points_world.reshape(-1, 3), cameras.cam_from_world[view], cameras.intrinsics[view]
+            )
+            pixels = pixels.reshape(*facing.shape, 2)
+            wanted = templates.inside & (facing > steepest) & (depth.reshape(facing.shape) > 0)
+            if not wanted.any():
+                return images.new_zeros(len(facing), images.shape[1], *facing.shape[1:]), wanted
+            level = pyramid_level(pixels)
+            # A sample whose footprint touches the border, or is unusable by a tenth, is missing.
+            margin = 0.5 * 2 ** level.detach()[..., None]
+            size = cameras.sizes_px[view].to(pixels)
+            wanted = wanted & ((pixels >= margin) & (pixels <= size - margin)).all(dim=-1)
+            found = look_up(sources.images.levels(row), pixels[wanted], level[wanted])
+            fractions = [fraction.to(found) for fraction in sources.unusable.levels(row)]
+            lost = look_up(fractions, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
+            usable = (lost < 0.1) & (found.mean(dim=1) > dark_level)
+            radiance = found.new_zeros(*wanted.shape, found.shape[1])
+            radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
+            valid = torch.zeros_like(wanted).index_put((wanted,), usable)
+            return radiance * valid[:, None], valid
+
+        seen = [seen_by(view, row) for view, row in enumerate(rows.tolist())]
+        radiance, valid = (torch.stack(one, dim=1) for one in zip(*seen, strict=True))
+        return Observations(radiance=radiance, valid=valid)

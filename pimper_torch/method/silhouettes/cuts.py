@@ -110,17 +110,15 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
     doubted = _doubted(cues, masks)
     cues, voting = cues.without(doubted)
     for _ in range(_ITERATIONS):
-        cues = cues.relearned(masks)
-        masks = _filled(cues, masks)
-        abstain = by_view(torch.bitwise_or, unknown, _in_front(cues, masks))
-        seen = _voted(cues, masks.float().masked_fill_(abstain, 0.5), voting)
+        cues, masks, hidden = _compared(cues, masks)
+        abstain = by_view(torch.bitwise_or, unknown, hidden)
+        seen = _voted(cues, by_view(Tensor.float, masks).masked_fill_(abstain, 0.5), voting)
         if seen is None:
             return None
         cues, voting = cues.seen_in(seen), None
         masks, unknown = _again(cues, masks, seen, unknown), torch.zeros_like(unknown)
-    cues = cues.relearned(masks)
-    masks = _filled(cues, masks)
-    hidden, shown = _in_front(cues, masks), masks.float()  # the probability of the object
+    cues, masks, hidden = _compared(cues, masks)
+    shown = by_view(Tensor.float, masks)  # the probability of the object
     if cues.agreement is not None:
         shown = by_view(lambda mask, at: torch.where(mask, 1, doubt_of(at)), masks, cues.agreement)
     seen = _voted(cues, shown.masked_fill_(hidden, 0.5))
@@ -184,19 +182,20 @@ def _without_shadow(mask: Mask, margin: Map, grey: Map) -> Mask:
     return mask & ~components_of(shadow, margin < -far)
 
 
-def _filled(cues: Cues, masks: Masks) -> Masks:
+def _compared(cues: Cues, masks: Masks) -> tuple[Cues, Masks, Masks]:
+    """Learn the backgrounds' texture anew where cuts do not hide it, and compare them with it.
+
+    Returns:
+        The cues, the cuts with their holes filled, and what may hide the object in each view, so
+        that its cut says nothing there.
+    """
+    cues = cues.relearned(masks)
     agreement = cues.agreement
     if agreement is None:
-        return masks
-    return of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
-
-
-def _in_front(cues: Cues, masks: Masks) -> Masks:
-    """Find what may hide the object in each view, so that its cut says nothing there."""
-    agreement = cues.agreement
-    if agreement is None:
-        return torch.zeros_like(masks)
-    return of_views(lambda view: in_front(masks[view], agreement[view]), len(masks))
+        return cues, masks, torch.zeros_like(masks)
+    whole = of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
+    hidden = of_views(lambda view: in_front(whole[view], agreement[view]), len(masks))
+    return cues, whole, hidden
 
 
 def _first(cues: Cues) -> Masks:

@@ -254,8 +254,7 @@ def by_series(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) ->
     """
     if not len(scene.series):
         return find(scene)
-    chosen = [scene.series == number for number in sorted(set(scene.series.tolist()))]
-    views = [one.nonzero()[:, 0] for one in chosen]
+    views = [(scene.series == number).nonzero()[:, 0] for number in torch.unique(scene.series)]
     found = [find(part(scene, one.tolist())) for one in views]
     doubtful = sum(one.source == "everything" for one in found)
     leave_out("silhouettes.by_series", doubtful, total=len(found))

@@ -141,12 +141,30 @@ def room_agreement(
 ) -> Maps:
     """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
 
+    The raster is of working pixels where the room is at rest, as far as views see.
+
     Args:
         background_from_view: From pixels of each photograph to those where the room is at rest;
             NaN for views that show too little of it.
         hidden: Where views do not show the room, as far as is known.
     """
-    raster = _room_raster(pictures, background_from_view.cpu().double())
+    height, width = pictures.grey.shape[1:]
+    scale = torch.diag(torch.tensor([*pictures.factors, 1.0]).double())
+    maps = scale @ background_from_view.cpu().double() @ torch.linalg.inv(scale)
+    corners = maps.new_tensor([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
+    ends = (maps @ corners.mT).mT.reshape(-1, 3)
+    ends = (ends[:, :2] / ends[:, 2:])[ends.isfinite().all(dim=1)]
+    size = maps.new_tensor([width, height])
+    # A room that shifts by more than the picture's size is not looked at.
+    low = torch.maximum(ends.amin(dim=0), -size).floor()
+    high = torch.minimum(ends.amax(dim=0), 2 * size).ceil()
+    shift = torch.eye(3).to(maps)
+    shift[:2, 2] = low
+    to_pixels = torch.full_like(maps, torch.nan)
+    seen = maps.isfinite().flatten(1).all(dim=1)
+    to_pixels[seen] = torch.linalg.inv(maps[seen]) @ shift
+    columns, rows = (high - low).int().tolist()
+    raster = Raster(pixels_from_raster=to_pixels.to(pictures.grey), size_px=(columns, rows))
     return texture_agreement(pictures, raster, raster, hidden)
 
 
@@ -271,27 +289,6 @@ def _plane_raster(
     cam_from_raster = cameras.cam_from_world[:, :3, :3] @ world_from_raster
     cam_from_raster[:, :, 2] += cameras.cam_from_world[:, :3, 3]
     return Raster(pixels_from_raster=cameras.intrinsics @ cam_from_raster, size_px=(size, size))
-
-
-def _room_raster(pictures: WorkingPictures, background_from_view: Homographies) -> Raster:
-    """Lay a raster over the room, of working pixels where it is at rest, as far as views see."""
-    height, width = pictures.grey.shape[1:]
-    scale = torch.diag(torch.tensor([*pictures.factors, 1.0]).double())
-    maps = scale @ background_from_view @ torch.linalg.inv(scale)
-    corners = maps.new_tensor([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]])
-    ends = (maps @ corners.mT).mT.reshape(-1, 3)
-    ends = (ends[:, :2] / ends[:, 2:])[ends.isfinite().all(dim=1)]
-    size = maps.new_tensor([width, height])
-    # A room that shifts by more than the picture's size is not looked at.
-    low = torch.maximum(ends.amin(dim=0), -size).floor()
-    high = torch.minimum(ends.amax(dim=0), 2 * size).ceil()
-    shift = torch.eye(3).to(maps)
-    shift[:2, 2] = low
-    to_pixels = torch.full_like(maps, torch.nan)
-    seen = maps.isfinite().flatten(1).all(dim=1)
-    to_pixels[seen] = torch.linalg.inv(maps[seen]) @ shift
-    columns, rows = (high - low).int().tolist()
-    return Raster(pixels_from_raster=to_pixels.to(pictures.grey), size_px=(columns, rows))
 
 
 def _textured(grey: Map, hidden: Mask, longer: int) -> Map:

@@ -63,9 +63,8 @@ def silhouettes_of(cuts: Cuts, views: Views) -> Silhouettes:
             own = doubt_of(cuts.agreement[view]).masked_fill(is_deep(-margin), 0)
             doubt = torch.maximum(doubt, own)
         layers = torch.stack([signed_distance(cut), margin.clamp(-100, 100), doubt])
-        border, hull, doubt = interpolate(layers[None], size, mode="bilinear", align_corners=False)[
-            0
-        ]
+        wide = interpolate(layers[None], size, mode="bilinear", align_corners=False)
+        border, hull, doubt = wide[0]
         inside = torch.sigmoid(border / 0.5)
         inside = torch.where((border > 2) & (hull < -2), _UNSURE_INSIDE, inside)
         return torch.where(border < -2, torch.maximum(inside, doubt), inside)

@@ -178,14 +178,7 @@ def costs_of(given: Hypotheses, num_views: int, min_views: int) -> Costs:
     gray = given.sources.gray.finest
     if gray.dtype == torch.float32 and compiled_for(gray.detach()):
         return _compiled_costs(given, num_views, min_views)
-    samples = _compared(given, num_views, min_views)
-    cost = inconsistency(
-        _look_up(given, samples), samples.shading, samples.seen, given.scale[samples.patch]
-    )
-    raster = given.templates.depth
-    flat = cost.new_zeros(raster.numel(), cost.shape[1]).index_copy(0, samples.index, cost)
-    swept = torch.zeros_like(raster).flatten().index_fill(0, samples.index, 1.0)
-    return flat.reshape(*raster.shape, -1).movedim(-1, 1), swept.reshape(raster.shape)
+    return _reference_costs(given, num_views, min_views)
 
 
 def _compiled_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
@@ -260,28 +253,7 @@ class _Compiled(torch.autograd.Function):
         return None, *pulled_back(add_to, ctx.saved_tensors, of_pictures)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class _Samples(Record):
-    """The samples of a bucket that are swept, in a row.
-
-    Attributes:
-        index: In the flattened rasters.
-        outward: Along which it is swept; unit, world.
-        shading: Of albedo 1 in these.
-        gains: Factors of radiance in these.
-    """
-
-    index: Int[Tensor, " sample"]
-    patch: Int[Tensor, " sample"]
-    points_world: Float[Tensor, "sample 3"]
-    outward: Float[Tensor, "sample 3"]
-    chosen: Int[Tensor, "sample chosen"]
-    seen: Bool[Tensor, "sample chosen"]
-    shading: Float[Tensor, "sample chosen"]
-    gains: Float[Tensor, "sample chosen"]
-
-
-def _compared(given: Hypotheses, num_views: int, min_views: int) -> _Samples:
+def _reference_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
     templates, cameras, poses = given.templates, given.cameras, given.poses
     tested = given.photometry.observed & templates.inside
     tested = tested & (given.registered.valid.sum(dim=1) >= min_views)
@@ -308,16 +280,16 @@ def _compared(given: Hypotheses, num_views: int, min_views: int) -> _Samples:
         enough = seen.sum(dim=1) >= min_views
         if poses is not None:
             enough = (seen & (score.gather(1, chosen) > 0)).sum(dim=1) >= min_views
-    return _Samples(
-        index=index[enough],
-        patch=patch[enough],
-        points_world=points[enough],
-        outward=outward[enough],
-        chosen=chosen[enough],
-        seen=seen[enough],
-        shading=shading.gather(1, chosen)[enough],
-        gains=gains[patch].gather(1, chosen)[enough],
-    )
+    index, patch, chosen, seen = index[enough], patch[enough], chosen[enough], seen[enough]
+    points, outward = points[enough], outward[enough]
+    radiance = _look_up(given, patch, points, outward, torch.where(seen, chosen, -1))
+    radiance = gains[patch].gather(1, chosen)[..., None] * radiance
+    shading = shading[enough].gather(1, chosen)
+    cost = inconsistency(radiance, shading, seen, given.scale[patch])
+    raster = templates.depth
+    flat = cost.new_zeros(raster.numel(), cost.shape[1]).index_copy(0, index, cost)
+    swept = torch.zeros_like(raster).flatten().index_fill(0, index, 1.0)
+    return flat.reshape(*raster.shape, -1).movedim(-1, 1), swept.reshape(raster.shape)
 
 
 def _footprint(points: Float[Tensor, "sample 3"], spacing: PerSample, cameras: Cameras) -> PerView:
@@ -328,25 +300,31 @@ def _footprint(points: Float[Tensor, "sample 3"], spacing: PerSample, cameras: C
     return spacing[:, None] * focal / depth.clamp_min(torch.finfo(depth.dtype).eps)
 
 
-def _look_up(given: Hypotheses, samples: _Samples) -> Float[Tensor, "sample chosen hypothesis"]:
-    spacing = given.templates.spacing[samples.patch]
+def _look_up(
+    given: Hypotheses,
+    patch: Int[Tensor, " sample"],
+    points: Float[Tensor, "sample 3"],
+    outward: Float[Tensor, "sample 3"],
+    chosen: Int[Tensor, "sample chosen"],
+) -> Float[Tensor, "sample chosen hypothesis"]:
+    """Look samples up at all heights in their views; -1 for none. World frame."""
+    spacing = given.templates.spacing[patch]
     moves = STEP * spacing[:, None] * given.ladder.to(spacing)
-    radiance = moves.new_zeros(*samples.chosen.shape, moves.shape[1]).flatten(0, 1)
-    width = samples.chosen.shape[1]
+    radiance = moves.new_zeros(*chosen.shape, moves.shape[1]).flatten(0, 1)
     for view in range(given.cameras.num_views):
-        (slot,) = torch.nonzero(((samples.chosen == view) & samples.seen).flatten(), as_tuple=True)
+        (slot,) = torch.nonzero((chosen == view).flatten(), as_tuple=True)
         if len(slot) == 0:
             continue
-        sample = slot // width
-        outward, start = samples.outward[sample], samples.points_world[sample]
-        moved = start[:, None] + moves[sample, :, None] * outward[:, None]
+        sample = slot // chosen.shape[1]
+        start, along = points[sample], outward[sample]
+        moved = start[:, None] + moves[sample, :, None] * along[:, None]
         camera = given.cameras.take([view])
         pixels, _ = project(moved.reshape(-1, 3), camera.cam_from_world[0], camera.intrinsics[0])
         across = _footprint(start, spacing[sample], camera)[:, 0]
         away = normalize(camera.centers_world - start, dim=-1)
-        squeezed = (away * outward).sum(dim=-1).clamp_min(_MIN_FACING)
+        squeezed = (away * along).sum(dim=-1).clamp_min(_MIN_FACING)
         level = (across * squeezed.sqrt()).clamp_min(1).log2()
         level = level[:, None].expand(-1, moves.shape[1]).flatten()
         looked_up = look_up(given.sources.gray.levels(int(given.images[view])), pixels, level)
         radiance = radiance.index_copy(0, slot, looked_up.reshape(len(slot), -1).to(radiance))
-    return samples.gains[..., None] * radiance.reshape(*samples.chosen.shape, moves.shape[1])
+    return radiance.reshape(*chosen.shape, moves.shape[1])

@@ -107,6 +107,7 @@ def enough(used: Seen, rank: int) -> Seen:
 MIN_GAMMA, MAX_GAMMA = 0.4, 4.0
 # Exponents of the grid search, a choice: even in their logarithm, 1.4 times one another.
 _TRIALS = 8
+_STEP = (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
 
 # Maximum relative standard error: a choice, twice as much would not distinguish 1.8 from 2.2.
 _MAX_UNCERTAIN = 0.1
@@ -274,9 +275,9 @@ def _chosen_by_fit(fit: EncodedFit) -> EncodedFit:
 
 
 def _grid_search(fit: EncodedFit, iterations: int) -> tuple[float, EncodedFit]:
-    found, step = [], (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
+    found = []
     for trial in range(_TRIALS):
-        gamma = MIN_GAMMA * step**trial
+        gamma = MIN_GAMMA * _STEP**trial
         fit = fit_encoded(fit, Gamma(exponent=gamma), iterations)
         found.append((gamma, fit))
     return min(found, key=lambda one: float(one[1].loss.sum()))
@@ -321,8 +322,7 @@ def _consistent_minimum(fit: EncodedFit) -> tuple[float, float, EncodedFit]:
     Ambient light in attached shadows is not first-order: it biases the estimate from all entries.
     """
     best, fit = _grid_search(fit, 1)
-    step = (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
-    found = [_minimise(fit, best / step, best * step)]
+    found = [_minimise(fit, best / _STEP, best * _STEP)]
     fit = found[0][2]
     for fraction in _DARKEST_FRACTIONS:
         level = fit.predicted[fit.used].quantile(fraction)
