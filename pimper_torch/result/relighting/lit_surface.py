@@ -143,7 +143,7 @@ class LitSurface:
         closeness: Float[Tensor, " light"],
         *,
         shadows: bool = True,
-    ) -> "Incidence":
+    ) -> Incidence:
         """Return the directions to lights at pixels, and the light that arrives.
 
         Args:
