@@ -84,7 +84,7 @@ BARS = {
     "lines of signatures": 4536,
     "lines of imports": 4230,
     "words of the list in docstrings, comments and messages": 1221,
-    "words of the list in documents": 480,
+    "words of the list in documents": 469,
 }
 
 
