@@ -43,9 +43,10 @@ def main(folder: Path, count: int, seed: int) -> None:
     small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1 --seed 1"
     assert forked(["render", "balls", "-o", str(scene), *small.split()]) == 0
     command = ["reconstruct", str(scene / "photos"), "--sparse", str(scene / "truth" / "sparse")]
-    whole, former = folder / "whole", folder / "former"
+    # An asset has the name of its result's folder.
+    whole, former = folder / "whole" / "out", folder / "former" / "out"
     assert forked([*command, "-o", str(former), *FORMER]) == 0
-    forked([*command, "-o", str(folder / "first"), *SETTINGS])  # what is loaded once
+    forked([*command, "-o", str(folder / "first" / "out"), *SETTINGS])  # what is loaded once
     began = time.perf_counter()
     assert forked([*command, "-o", str(whole), *SETTINGS]) == 0
     seconds = time.perf_counter() - began
