@@ -143,8 +143,8 @@ def test_what_does_not_hear_a_signal_is_killed_within_five_seconds(tmp_path, mon
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["evaluate", "reconstruct"])
-def test_a_command_inside_a_library_ends_within_five_seconds_of_a_signal(tmp_path, command):
+@pytest.mark.parametrize(("command", "after"), [("evaluate", 8), ("reconstruct", 20)])
+def test_a_command_inside_a_library_ends_within_five_seconds_of_a_signal(tmp_path, command, after):
     """Ten million samples keep one call of a library busy for longer, as features may."""
     vertices, faces = icosphere(7)
     mesh, cloud = tmp_path / "mesh.ply", tmp_path / "cloud.ply"
@@ -159,7 +159,7 @@ def test_a_command_inside_a_library_ends_within_five_seconds_of_a_signal(tmp_pat
         stderr=subprocess.PIPE,
         text=True,
     )
-    time.sleep(20)  # inside of the call, for most
+    time.sleep(after)  # inside of the call, for most
     began = time.monotonic()
     ran.terminate()
     _, err = ran.communicate(timeout=30)
