@@ -9,7 +9,7 @@ from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.ground.geometry.pinholes import look_at, pinholes
 from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.ground.geometry.topology import half_edges
-from pimper_torch.records import Mesh
+from pimper_torch.records import Mesh, SparseScene
 
 # A square of side 1 and its two facets.
 CORNERS = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
@@ -45,6 +45,21 @@ def write_ball(path: Path, *shape, **options) -> Path:
     """Write a ball as PLY."""
     write_ply(ball(*shape, **options), path)
     return path
+
+
+def observed(views, cameras, points, pixels, seen, lens):
+    """Return a scene of points without noise, each observed where a view sees it."""
+    view, point = seen.nonzero(as_tuple=True)
+    return SparseScene(
+        views=views,
+        cameras=cameras,
+        points_world=points,
+        reprojection_errors_px=torch.zeros(len(points)),
+        observation_point=point,
+        observation_view=view,
+        observation_pixels=pixels[view, point],
+        lenses=(lens,) * len(pixels),
+    )
 
 
 def observing(scene, kept):

@@ -2,6 +2,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from scenes import observed
 from torch import Tensor
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
@@ -95,20 +96,10 @@ def _cloud(views: Views, cameras, generator: torch.Generator) -> SparseScene:
     faces = (normal * rays).sum(-1) < -0.2 * rays.norm(dim=-1) * normal.norm(dim=-1)
     hidden[:, len(table) :] = False
     framed = (pixels > 2).all(-1) & (pixels < torch.tensor([238.0, 178.0])).all(-1)
-    view, point = (faces & ~hidden & framed).nonzero(as_tuple=True)
     lens = Lens(
         camera=1, model="PINHOLE", params=(300.0, 300.0, 120.0, 90.0), width=240, height=180
     )
-    return SparseScene(
-        views=views,
-        cameras=cameras,
-        points_world=points,
-        reprojection_errors_px=torch.zeros(len(points)),
-        observation_point=point,
-        observation_view=view,
-        observation_pixels=pixels[view, point],
-        lenses=(lens,) * 12,
-    )
+    return observed(views, cameras, points, pixels, faces & ~hidden & framed, lens)
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 import torch
-from scenes import observing
+from scenes import observed, observing
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
@@ -14,7 +14,7 @@ from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.silhouettes.given import AS_THEY_ARE, Reading, right_reading
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
-from pimper_torch.records import Lens, SilhouettePrior, SparseScene, Views
+from pimper_torch.records import Lens, SilhouettePrior, Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from pimper_torch.runtime.stage import Stage
 from tests.silhouettes.shapes import FOCAL, HEIGHT, WIDTH, all_round, silhouettes_of
@@ -54,7 +54,7 @@ def scene(truth):
     faces = (normalize(away, dim=-1) * outward).sum(dim=-1) > 0.2
     on_ball = torch.arange(len(points)) < len(points) - 300
     # A ball may hide another one's points, which are inside all the same.
-    view, point = (framed & torch.where(on_ball, faces & inside, ~inside)).nonzero(as_tuple=True)
+    seen = framed & torch.where(on_ball, faces & inside, ~inside)
     middle = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     lens = Lens(camera=1, model="PINHOLE", params=middle, width=WIDTH, height=HEIGHT)
     views = Views(
@@ -64,16 +64,7 @@ def scene(truth):
         focals_px=torch.full((VIEWS,), torch.nan),
         orientations=torch.tensor([1, 3] * (VIEWS // 2)),
     )
-    return SparseScene(
-        views=views,
-        cameras=cameras,
-        points_world=points,
-        reprojection_errors_px=torch.zeros(len(points)),
-        observation_point=point,
-        observation_view=view,
-        observation_pixels=pixels[view, point],
-        lenses=(lens,) * VIEWS,
-    )
+    return observed(views, cameras, points, pixels, seen, lens)
 
 
 def hard(views, masks):
