@@ -33,6 +33,9 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two hold published 
 MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
 
+LABELS = 32
+"""Whole numbers of a mask or of a map that are all below this are labels. A choice."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Decoded(Record):

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.doors.io.decode import decode, read_header, rotated
+from pimper_torch.doors.io.decode import LABELS, decode, read_header, rotated
 from pimper_torch.doors.io.header import Header
 from pimper_torch.doors.io.photograph_files import (
     MIN_PHOTOGRAPHS,
@@ -238,7 +238,7 @@ def _brightness(path: Path) -> Map:
     """Read the brightness of a mask; 1 on the object if it has labels or transparency."""
     decoded = decode(path)
     brightest = decoded.samples.amax(dim=0)
-    labelled = not decoded.lossy and float(brightest.max()) * decoded.full < 32
+    labelled = not decoded.lossy and float(brightest.max()) * decoded.full < LABELS
     coloured = (brightest > 0).float()
     if decoded.alpha is None or bool((decoded.alpha >= OPAQUE).all()):
         return coloured if labelled else brightest

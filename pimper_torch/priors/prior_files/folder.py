@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pimper_torch.doors.io.decode import LABELS
 from pimper_torch.priors.from_maps import Maps, stacked
-from pimper_torch.priors.prior_files.map_file import FORMATS, LABELS, VARIANCE, Layer, read_layer
+from pimper_torch.priors.prior_files.map_file import FORMATS, VARIANCE, Layer, read_layer
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, some
 from pimper_torch.runtime.file_names import match_poses
@@ -27,7 +28,7 @@ _ADDED = re.compile(rf"([ _.-]({'|'.join(_WORDS.values())})s?)+$", re.IGNORECASE
 _OF_VARIANCE = re.compile(rf"[ _.-]{VARIANCE}$", re.IGNORECASE)
 # How deep files are looked for: in folders of poses, each with a folder a photograph.
 _LEVELS = ("*", "*/*", "*/*/*")
-_OTHER = 2
+_OTHER = 2  # rank of a map whose name says a different kind; 0 says this kind, 1 says none
 
 
 def read_maps(

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 from pimper_torch.doors.exchange.openexr import read_exr
-from pimper_torch.doors.io.decode import MAX_PIXELS, decode
+from pimper_torch.doors.io.decode import LABELS, MAX_PIXELS, decode
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.numpy_files import read_npy, read_npz
 
@@ -16,9 +16,6 @@ FORMATS = (".npz", ".npy", ".exr", *PICTURES)
 """Of several files of one photograph, the first of these is read: least is lost in it."""
 
 VARIANCE = "variance"
-
-LABELS = 32
-"""Whole numbers that are all below are labels, as they are where masks of photographs are read."""
 
 
 class Layer(NamedTuple):

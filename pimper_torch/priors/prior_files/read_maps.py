@@ -6,10 +6,11 @@ from typing import Literal
 
 import numpy as np
 
+from pimper_torch.doors.io.decode import LABELS
 from pimper_torch.priors import from_maps
 from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.priors.prior_files.folder import read_maps, single
-from pimper_torch.priors.prior_files.map_file import LABELS, Layer
+from pimper_torch.priors.prior_files.map_file import Layer
 from pimper_torch.records import DepthPrior, NormalPrior, Views
 from pimper_torch.runtime.errors import InputError, caution, some
 
