@@ -22,7 +22,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.method.patches.decompose import Decompose
 from pimper_torch.method.patches.patches_config import DecomposeConfig
-from pimper_torch.paper.align import Align
+from pimper_torch.published.align import Align
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,

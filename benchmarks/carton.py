@@ -27,13 +27,13 @@ from torch import Tensor
 
 from pimper_bench.datasets import read_llff, write_colmap
 from pimper_bench.truth import Capture
-from pimper_torch.doors.exchange.picture_files import file_names
+from pimper_torch.doors.export.picture_files import file_names
 from pimper_torch.doors.io.meshes import read_mesh, write_ply
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.method.chains.chain_config import PublishedConfig, load_config
 from pimper_torch.method.chains.presets import load_chain
 from pimper_torch.method.sfm.sparse_scene import write_model
-from pimper_torch.records import Cameras, Lens, Mesh, SparseScene
+from pimper_torch.records import CameraModel, Cameras, Mesh, SparseScene
 from pimper_torch.result.viz.render import crop
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.stage import Given
@@ -199,7 +199,7 @@ def carton_scene(
     kept = seen.sum(dim=0) >= 3
     point, view = seen[:, kept].T.nonzero(as_tuple=True)
     lenses = tuple(
-        Lens(
+        CameraModel(
             camera=1,
             model="PINHOLE",
             params=(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])),

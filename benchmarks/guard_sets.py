@@ -45,7 +45,7 @@ def stamped(folder: Path) -> list[str]:
         place = picture.width - 8, picture.height - 4
         size = picture.height / 16
         ImageDraw.Draw(picture).text(
-            place, "2026-03-14 15:09", "orange", anchor="rs", font_size=size
+            place, "2026-03-14 15:09", "orange", prior_mean="rs", font_size=size
         )
         picture.save(path)
     return []
@@ -93,9 +93,9 @@ SETS = {
         for seed in (1, 2)
     },
     "turned-over": Set("mug", 20, 480, TURNED, ("sfm.moved_object",)),
-    "room": Set("mug", 24, 640, ROOM, ("sfm.room",)),
+    "room": Set("mug", 24, 640, ROOM, ("sfm.static_background",)),
     "room-shifts": Set("mug", 24, 640, ROOM | {"pan_jitter_px": 40.0}, ("sfm.moved_object",)),
-    "stamp": Set("mug", 16, 480, ROUND | PATTERN, ("sfm.room",), stamped),
+    "stamp": Set("mug", 16, 480, ROUND | PATTERN, ("sfm.static_background",), stamped),
     "foreign": Set("jar", 16, 480, PATTERN, ("sfm.weak_views", "sfm.misplaced"), foreign),
     "mouth": Set("mug", 20, 640, ROUND | PATTERN, ("coarse.seen_through",)),
     "flaps": Set("skull", 8, 900, {}, ("extract.borders", "coarse.fringes", "extract.pieces")),

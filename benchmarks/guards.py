@@ -70,10 +70,10 @@ def everything(like: int) -> Callable[..., Tensor]:
 
 # What stands in for each guard that can be switched off, and settings that switch it off.
 PATCHES: dict[str, dict[str, object]] = {
-    "sfm.room": {"sfm.static_background.StaticBackground.room": False},
-    "sfm.moved_object": {"sfm.registration.tie_series": lambda *_: ()},
+    "sfm.static_background": {"sfm.static_background.StaticBackground.detected": False},
+    "sfm.moved_object": {"sfm.registration.link_sessions": lambda *_: ()},
     "sfm.weak_views": {"sfm.registration.drop_weak_views": lambda model, _: model},
-    "sfm.misplaced": {"sfm.doubt._MIN_AGREEMENT": 0.0},
+    "sfm.misplaced": {"sfm.diagnose._MIN_AGREEMENT": 0.0},
     "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
     "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},
     "silhouettes.shadows": {"silhouettes.cuts._without_shadow": lambda mask, *_: mask},
@@ -126,7 +126,7 @@ class Judge:
         """Return the fraction of what was taken that was right; ``None`` where nothing tells."""
         if entry.what == "photographs" and entry.names:
             return sum(name not in self.spoilt for name in entry.names) / len(entry.names)
-        if entry.what == "doubt" and self.good is not None:
+        if entry.what == "warning" and self.good is not None:
             return float(self.good)
         if places is not None and self.surface is not None and self.truth_from_world is not None:
             distance = self.surface.query(transform(self.truth_from_world, places)).distance

@@ -129,7 +129,7 @@ def pose(
         radiance=radiance,
         weight=weight,
         lights=lights,
-        anchor=lights,
+        prior_mean=lights,
         shading=shading,
         regularization=regularization,
         prior=0.1 * level[:, None, None] * Cone().normal_prior(normals.mT),

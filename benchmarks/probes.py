@@ -24,8 +24,8 @@ from pimper_torch import load_chain, load_views
 from pimper_torch.ground.geometry.pyramids import Sources
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.chains.published import Published
-from pimper_torch.paper.paper_config import TriangulateConfig
-from pimper_torch.paper.triangulate import Triangulate
+from pimper_torch.published.published_config import TriangulateConfig
+from pimper_torch.published.triangulate import Triangulate
 from pimper_torch.records import (
     CoarseMesh,
     PatchViews,

@@ -46,8 +46,8 @@ from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.cli.options import Job, parse
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.doors.io.results import write_result
-from pimper_torch.doors.outputs.folders import held_output
-from pimper_torch.doors.outputs.marker import STAGES
+from pimper_torch.doors.result_folder.folders import held_output
+from pimper_torch.doors.result_folder.marker import STAGES
 from pimper_torch.method.chains.presets import make_chain
 from pimper_torch.records import StageReport, Views
 from pimper_torch.runtime.cores import usable_cores
@@ -401,7 +401,7 @@ def costs_of(found: Mapping[str, Any]) -> list[Cost]:
     return [Cost(**cost) for cost in found["costs"]]
 
 
-def rows_of(found: Mapping[str, Any], scales: bool = False) -> list[Cost]:
+def gather_samples(found: Mapping[str, Any], scales: bool = False) -> list[Cost]:
     """Return the stages, all of them, and all after structure from motion."""
     costs = costs_of(found)
     names = [cost.stage for cost in costs]
@@ -425,7 +425,7 @@ def print_table(found: Mapping[str, Any], scales: bool) -> None:
         f"{found['machine']['cpu']}, {cores} cores; copies {floors['copy_gb_per_s']:.1f} GB/s, "
         f"batched products {floors['batched_product_gflop_per_s']:.1f} GFLOP/s.\n"
     )
-    rows = rows_of(found, scales)
+    rows = gather_samples(found, scales)
     table(("stage", *COLUMNS), [[row.stage, *row.cells(cores)] for row in rows])
     left = found["clock_seconds"] - rows[-1].seconds
     aside = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found["aside"].items())
@@ -437,10 +437,10 @@ def print_table(found: Mapping[str, Any], scales: bool) -> None:
 
 def print_ratios(found: Mapping[str, Any], earlier: Mapping[str, Any]) -> None:
     """Print each stage's figures over those of an earlier run."""
-    before = {row.stage: row for row in rows_of(earlier)}
+    before = {row.stage: row for row in gather_samples(earlier)}
     names = ("seconds", "cpu_seconds", "page_faults", "peak_mb")
     rows = []
-    for row in rows_of(found):
+    for row in gather_samples(found):
         was = before.get(row.stage)
         pairs = [(getattr(row, name), getattr(was, name)) for name in names] if was else []
         rows.append([row.stage, *(number(now / old if old else math.nan) for now, old in pairs)])
@@ -455,7 +455,7 @@ def print_scaling(runs: Sequence[Mapping[str, Any]]) -> None:
     cores = runs[0]["machine"]["cores"]
     say(f"\nSamples in views: {', '.join(f'{count:,.0f}' for count in samples)}; most patches: ")
     say(f"{', '.join(f'{count:,.0f}' for count in patches)}; {cores} cores.\n")
-    tables = [{row.stage: row for row in rows_of(run)} for run in runs]
+    tables = [{row.stage: row for row in gather_samples(run)} for run in runs]
     rows = []
     for stage in tables[-1]:
         row = [rows_of_run[stage] for rows_of_run in tables if stage in rows_of_run]

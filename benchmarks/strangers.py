@@ -32,7 +32,7 @@ from pimper_bench.truth import Capture, Truth
 from pimper_torch.ground.geometry.lens_models import undistort_pixels
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.records import Lens, Views
+from pimper_torch.records import CameraModel, Views
 
 RENDERED_FOCAL = 1.3  # widths of a picture that all cameras' pictures are cut from
 NOISELESS = SensorConfig(read_noise=0.0, shot_noise=0.0, exposure=0.4)
@@ -59,12 +59,14 @@ class Camera:
     radial: float
     aspect: float
 
-    def lens(self, rendered: int) -> Lens:
+    def lens(self, rendered: int) -> CameraModel:
         """Return the lens in pixels, for rendered pictures of a width."""
         width = round(self.width * rendered)
         height = round(self.aspect * width)
         params = self.focal * width, width / 2, height / 2, self.radial
-        return Lens(camera=0, model="SIMPLE_RADIAL", params=params, width=width, height=height)
+        return CameraModel(
+            camera=0, model="SIMPLE_RADIAL", params=params, width=width, height=height
+        )
 
 
 CAMERAS = (
@@ -108,7 +110,7 @@ def scene_of(options: argparse.Namespace) -> Scene:
     )
 
 
-def taken(radiance: Tensor, lens: Lens, focal_px: float) -> Tensor:
+def taken(radiance: Tensor, lens: CameraModel, focal_px: float) -> Tensor:
     """Return the radiance in a lens's picture, cut from a rendered picture."""
     pixels = pixel_centers(lens.width, lens.height, like=radiance.double()).reshape(-1, 2)
     rays = undistort_pixels(lens, pixels)

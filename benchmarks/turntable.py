@@ -62,7 +62,7 @@ def row(
     except PimperError as error:
         return [f"{type(error).__name__}: {str(error).split(';')[0]}", "", "", "", ""]
     errors = center_errors(scene, names, true)
-    doubt = getattr(scene, "doubt", None)  # commits before the one that brought it are compared
+    doubt = getattr(scene, "diagnosis", None)  # commits before the one that brought it are compared
     return [
         f"{scene.views.num_views} of {views.num_views}",
         str(len(scene.points_world)),

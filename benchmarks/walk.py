@@ -39,11 +39,11 @@ PARTS = (
     (registration, "match_guided", "matching"),
     (registration, "verified_pairs", "matching"),
     (registration, "map_views", "mapping"),
-    (registration, "judged", "doubts"),
+    (registration, "verify_model", "doubts"),
     (registration, "count_views_with_depth", "doubts"),
-    (registration, "doubt", "doubts"),
-    (registration, "leave_out_room", "others"),
-    (registration, "tie_series", "others"),
+    (registration, "diagnose", "doubts"),
+    (registration, "remove_static_features", "others"),
+    (registration, "link_sessions", "others"),
     (reconstruct, "refine_tracks", "tracks"),
 )
 COLUMNS = (*dict.fromkeys(part for _, _, part in PARTS), "rest", "all", "growth")

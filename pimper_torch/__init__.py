@@ -31,17 +31,19 @@ _public, _, _names = lazy_loader.attach_stub(__name__, __file__)
 _ROOMS = {
     "batches": "cli",
     "errors": "runtime",
-    "exchange": "doors",
+    "export": "doors",
     "prior_files": "priors",
     "radiometry": "ground",
-    "size": "doors",
+    "scale": "doors",
     "store": "runtime",
     "viz": "result",
 }
 
+_RENAMED = {"exchange": "export", "settled": "resolve_prior_conventions", "size": "scale"}
+
 __all__ = [
-    *("batches", "errors", "exchange", "prior_files", "priors", "radiometry", "records"),
-    *("single_view", "size", "stages", "store", "viz"),
+    *("batches", "errors", "export", "prior_files", "priors", "radiometry", "records"),
+    *("single_view", "scale", "stages", "store", "viz"),
     *("load_views", "scene_of", "read_mesh", "load_chain", "load_config", "find_scale", "show"),
     *("write_result", "read_result", "PimperError", "__version__"),
 ]
@@ -52,6 +54,10 @@ def __getattr__(name: str) -> object:
         from pimper_torch.doors.io.version import installed_version
 
         return installed_version()
+    if name in _RENAMED:
+        from pimper_torch.runtime.renamed import renamed
+
+        return __getattr__(renamed(f"pimper_torch.{name}", _RENAMED[name]))
     if name in _ROOMS:
         return import_module(f"{__name__}.{_ROOMS[name]}.{name}")
     return _public(name)

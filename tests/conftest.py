@@ -95,11 +95,11 @@ def reconstruction():
     from pimper_torch.ground.geometry.rigid import rigid
     from pimper_torch.ground.geometry.surfaces import vertex_normals
     from pimper_torch.records import (
+        CameraModel,
         CoarseMesh,
         Convergence,
         DepthPatches,
         Depths,
-        Lens,
         Mesh,
         PatchSet,
         PhotometricPatches,
@@ -144,7 +144,9 @@ def reconstruction():
     points = vertices[::8]
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
     count = len(points)
-    lens = Lens(camera=1, model="PINHOLE", params=(90.0, 90.0, 30.0, 20.0), width=60, height=40)
+    lens = CameraModel(
+        camera=1, model="PINHOLE", params=(90.0, 90.0, 30.0, 20.0), width=60, height=40
+    )
     scene = SparseScene(
         views=views,
         cameras=cameras,

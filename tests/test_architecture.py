@@ -22,13 +22,13 @@ ROOT = Path(__file__).parents[1]
 # (the command line names its verbs there, and imports one when it is called). viz stands above io,
 # which draws the contact sheet of a result with it.
 ROOMS = [
-    *("journal", "errors", "mapped", "config", "progress", "cores", "file_names"),
+    *("journal", "errors", "renamed", "mapped", "config", "progress", "cores", "file_names"),
     *("user_cache", "scratch"),
     *("numpy_files", "shapes", "kernels", "radiometry", "records", "ledger", "failures"),
     *("parallel", "stage", "store", "geometry", "memory", "linalg", "camera_files", "sfm"),
-    *("silhouettes", "coarse", "patches", "photometry", "sweep", "fusion", "paper", "meshing"),
-    *("size", "reporting", "priors", "viz", "asset", "relighting", "chains", "stages"),
-    *("report", "outputs", "io", "exchange", "prior_files", "viewer", "doctor", "video", "cli"),
+    *("silhouettes", "coarse", "patches", "photometry", "sweep", "fusion", "published", "meshing"),
+    *("scale", "reporting", "priors", "viz", "asset", "relighting", "chains", "stages"),
+    *("report", "result_folder", "io", "export", "prior_files", "viewer", "doctor", "video", "cli"),
     *("batches", "single_view", "__main__"),
 ]
 
@@ -46,7 +46,7 @@ SOLE_IMPORTERS = {
     "cv2": {
         "ground/geometry/opencv.py",
         "doors/io/decode.py",
-        "doors/size/aruco.py",
+        "doors/scale/aruco.py",
         "cli/video/choose.py",
     },
     "av": {"cli/video/read.py"},

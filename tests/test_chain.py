@@ -23,10 +23,10 @@ from pimper_bench.scenes.textures import random_speckle
 from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.method.chains.coarse_to_fine import held_apart
+from pimper_torch.method.chains.coarse_to_fine import split_held_out
 from pimper_torch.method.coarse.surface import CoarseSurface
-from pimper_torch.paper.paper_config import TriangulateConfig
-from pimper_torch.paper.triangulate import Triangulate
+from pimper_torch.published.published_config import TriangulateConfig
+from pimper_torch.published.triangulate import Triangulate
 from pimper_torch.records import (
     CoarseMesh,
     Mesh,
@@ -153,7 +153,7 @@ def test_one_light_for_all_views_is_told_and_geometry_delivered(preset):
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 def test_held_out_photographs_leave_the_surface_to_the_others():
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=48))
-    used, held = held_apart(scene, 3)
+    used, held = split_held_out(scene, 3)
 
     def of(some, hold_out):
         stages = {"silhouettes": Given(pt.Silhouettes.everything(used.views))}

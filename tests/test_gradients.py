@@ -13,7 +13,7 @@ import pimper_torch as pt
 from pimper_bench.scenes import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.method.photometry import lights
-from pimper_torch.method.photometry.factor_priors import FactorPrior, Known
+from pimper_torch.method.photometry.factor_priors import FactorPrior, PriorTerms
 from pimper_torch.method.photometry.light_field import harmonics
 from pimper_torch.records import Silhouettes
 from pimper_torch.runtime.stage import Given
@@ -148,7 +148,7 @@ class Network(FactorPrior):
         inner = self.entry(torch.stack([samples.radiance - predicted, predicted], dim=-1)).tanh()
         shown = samples.seen[..., None]
         mean = (inner * shown).sum(dim=1) / shown.sum(dim=1).clamp_min(1)
-        return Known(
+        return PriorTerms(
             normals=normalize(samples.normals + 0.1 * self.tilt(mean), dim=-1),
             normal_weight=torch.full_like(samples.albedo, 0.5),
             inlier=self.inlier(inner)[..., 0].sigmoid(),

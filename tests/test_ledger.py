@@ -26,12 +26,12 @@ def test_a_mask_is_counted_and_names_are_those_of_its_photographs():
         leave_out("silhouettes.empty", torch.tensor([True, False, True]), names=("a", "b", "c"))
         leave_out("extract.borders", torch.tensor([False, True, False, False]))
         leave_out("sfm.missing", 1, total=8, names=["d"])
-        leave_out("sfm.doubt", bool("why"))
+        leave_out("sfm.diagnosis", bool("why"))
     assert left_out_of(entries) == (
         entry("silhouettes.empty", 2, 3, ("a", "c")),
         entry("extract.borders", 1, 4),
         entry("sfm.missing", 1, 8, ("d",)),
-        entry("sfm.doubt", 1, 1),
+        entry("sfm.diagnosis", 1, 1),
     )
 
 
@@ -88,7 +88,7 @@ def test_the_closing_line_names_photographs_and_what_is_more_than_a_twentieth():
         entry("sfm.missing", 2, 8, ("IMG_1", "IMG_2")),
         entry("remesh.data", 500, 1000),
         entry("warp", 90, 100),
-        entry("sfm.doubt", 1, 1),
+        entry("sfm.diagnosis", 1, 1),
         entry("remesh.data", 60, 1000),
         entry("extract.spikes", 5, 100),
         entry("extract.borders", 8, 100),

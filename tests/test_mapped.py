@@ -12,11 +12,11 @@ from PIL import Image
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.geometry.pyramids import prepare
 from pimper_torch.method.sfm.undistort import undistort
-from pimper_torch.records import Lens, Silhouettes
+from pimper_torch.records import CameraModel, Silhouettes
 from pimper_torch.runtime import mapped
 from pimper_torch.runtime.errors import OutputError
 from pimper_torch.runtime.memory import resident_bytes
-from pimper_torch.runtime.store import digest, settled
+from pimper_torch.runtime.store import digest, realigned
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
 
@@ -137,7 +137,7 @@ def test_parts_copies_and_selections_are_what_they_are_in_memory(request):
     picked = torch.tensor([4, 0, 0]), torch.tensor([True, False, True, False, True])
     plain = [tensor[index] for index in picked]
     request.getfixturevalue("small")
-    found = [mapped.taken(tensor, index) for index in picked]
+    found = [mapped.take_rows(tensor, index) for index in picked]
     assert all(map(torch.equal, plain, found))
     assert all(map(is_mapped, found))
     assert torch.equal(mapped.copied(tensor.T), tensor.T)
@@ -159,14 +159,14 @@ def chain_of(photos):
     """Load photographs, bend them, take masks for silhouettes and build pyramids."""
     views = load_views(photos, masks=photos.with_name("masks"))
     params = (30.0, 15.0, 10.0, -0.1)
-    lens = Lens(camera=1, model="SIMPLE_RADIAL", params=params, width=30, height=20)
+    lens = CameraModel(camera=1, model="SIMPLE_RADIAL", params=params, width=30, height=20)
     views, _ = undistort(views.take([2, 0, 3]), (lens, lens, lens))
     inside = mapped.by_view(torch.Tensor.float, views.masks)
     found = Silhouettes(inside=inside, reliable=torch.ones(3, dtype=torch.bool), source="masks")
     sources = prepare(views.replace(masks=found.masks & views.inside))
     pyramids = sources.images, sources.gray, sources.unusable
     arrays = [one for pyramid in pyramids for one in (pyramid.finest, pyramid.coarser)]
-    return [*arrays, views.masks, settled(found).inside], digest(sources)
+    return [*arrays, views.masks, realigned(found).inside], digest(sources)
 
 
 def test_stages_give_the_same_bits_from_photographs_on_disk(photos, request):

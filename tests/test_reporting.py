@@ -111,7 +111,7 @@ def test_every_second_of_a_call_belongs_to_one_line(monkeypatch):
                 with aside("keep"):
                     clock.sleep(2)
                 called("first", tetrahedron)
-                current().tell(kept)
+                current().note(kept)
                 clock.sleep(4)
         so_far = accounted()
         clock.sleep(8)

@@ -172,7 +172,7 @@ def test_photographs_that_a_bucket_is_not_seen_in_change_no_bit_of_it(given, ker
         field = light.field
         spread = {
             name: torch.zeros(len(own), *value.shape[1:]).index_copy(0, own.nonzero()[:, 0], value)
-            for name in ("soft", "point_light", "closeness", "gain", "exposure")
+            for name in ("soft", "point_light", "inverse_distance", "gain", "exposure")
             if (value := getattr(field, name)) is not None
         }
         of_all = light.replace(field=field.replace(**spread))
@@ -203,7 +203,7 @@ def test_light_is_fitted_to_the_photographs_that_buckets_have_as_if_others_were_
     )
     found = FitLight()(Warp()(views, cameras, patches.replace(buckets=buckets))).field
     expected = FitLight()(missing).field
-    for name in ("soft", "point_light", "closeness", "gain", "exposure", "origin"):
+    for name in ("soft", "point_light", "inverse_distance", "gain", "exposure", "origin"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
 
 

@@ -39,11 +39,11 @@ def run(job: _Job, output: Output) -> None:
     from pimper_torch.runtime.reporting import stage
 
     findings = list(machine())
-    _tell(output, findings)
+    _print(output, findings)
     if job.photos is not None:
         with output.observer(), stage("examine"):
             found = examine_folder(job.photos, job.photographs, job.max_size_px)
-        _tell(output, found)
+        _print(output, found)
         findings += found
     output.result(warnings=[one.check for one in findings if one.severity == "warning"])
 
@@ -56,7 +56,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
     return job
 
 
-def _tell(output: Output, findings: Iterable[Finding]) -> None:
+def _print(output: Output, findings: Iterable[Finding]) -> None:
     for one in findings:
         output.event("finding", **dataclasses.asdict(one))
-        output.say(f"{one.severity:<8} {one.check:<11} {one}")
+        output.emit(f"{one.severity:<8} {one.check:<11} {one}")

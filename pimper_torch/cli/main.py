@@ -25,11 +25,11 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from typing import Any
 
-from pimper_torch.cli.deaths import write_report
+from pimper_torch.cli.crash_report import write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
 from pimper_torch.doors.io.version import versions
-from pimper_torch.doors.outputs.files import require_name
+from pimper_torch.doors.result_folder.files import require_name
 from pimper_torch.runtime.cores import usable_cores
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperError, PimperWarning
 
@@ -72,7 +72,7 @@ _COMMANDS = {
     "doctor": "pimper_torch.cli.doctor_command",
     "demo": "pimper_torch.cli.options",
     "config": "pimper_torch.cli.settings",
-    "export": "pimper_torch.cli.export",
+    "export": "pimper_torch.cli.export_command",
     "gamma": "pimper_torch.single_view.cli.gamma",
     "view": "pimper_torch.cli.view",
     "frames": "pimper_torch.cli.frames",

@@ -9,8 +9,8 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.outputs.files import file_written_whole, prepare_file
-from pimper_torch.doors.size.sheet import SIDE_MM, TITLE, Paper, layout
+from pimper_torch.doors.result_folder.files import file_written_whole, prepare_file
+from pimper_torch.doors.scale.sheet import SIDE_MM, TITLE, Paper, layout
 from pimper_torch.runtime.config import require
 
 

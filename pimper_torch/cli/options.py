@@ -12,9 +12,9 @@ import tyro
 from pimper_torch.cli.arguments import Flag, Option, options_of, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.doors.io.photograph_files import image_name, list_images
-from pimper_torch.doors.outputs.files import require_name
-from pimper_torch.doors.outputs.folders import prepare_output, require_apart
-from pimper_torch.doors.size import given
+from pimper_torch.doors.result_folder.files import require_name
+from pimper_torch.doors.result_folder.folders import prepare_output, require_apart
+from pimper_torch.doors.scale import given
 from pimper_torch.method.chains.chain_config import Config, PublishedConfig, load_config
 from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.result.asset.mesh_files import MeshFiles, MeshFormat, TextureFormat

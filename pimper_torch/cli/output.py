@@ -64,7 +64,7 @@ class Output:
             sys.stdout.write(line + "\n")
             sys.stdout.flush()
 
-    def say(self, text: str) -> None:
+    def emit(self, text: str) -> None:
         """Report on standard output what a command was asked for."""
         if not self.as_json:
             sys.stdout.write(text.rstrip("\n") + "\n")
@@ -72,7 +72,7 @@ class Output:
     def remark(self, text: str) -> None:
         """Report on standard output where a result is; ``--quiet`` leaves it out."""
         if self.shows("info"):
-            self.say(text)
+            self.emit(text)
 
     def result(self, paths: Mapping[str, Path] | None = None, **figures: object) -> None:
         """Write the event that a command succeeded."""

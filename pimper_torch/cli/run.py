@@ -14,19 +14,19 @@ from pimper_torch.cli.doctor.cost import planned
 from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.cli.options import Job
 from pimper_torch.cli.output import Output
-from pimper_torch.cli.view import tell_place
+from pimper_torch.cli.view import print_address
 from pimper_torch.doors.io.decode import read_header
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.photograph_files import image_name, list_images
 from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.doors.io.results import RESULT_NAMES, write_result
-from pimper_torch.doors.outputs.folders import held_output
-from pimper_torch.doors.outputs.marker import STAGES
-from pimper_torch.doors.outputs.stages import PREVIEW
-from pimper_torch.doors.size import given
-from pimper_torch.doors.size.find_scale import find_scale
-from pimper_torch.doors.size.scale import Scale
-from pimper_torch.doors.size.scaled import scaled
+from pimper_torch.doors.result_folder.folders import held_output
+from pimper_torch.doors.result_folder.marker import STAGES
+from pimper_torch.doors.result_folder.stages import PREVIEW
+from pimper_torch.doors.scale import given
+from pimper_torch.doors.scale.find_scale import find_scale
+from pimper_torch.doors.scale.scale import Scale
+from pimper_torch.doors.scale.scaled import scaled
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.chains.presets import make_chain
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
@@ -51,7 +51,7 @@ def carry_out(job: Job, output: Output) -> None:
         )
     with Viewer() if job.common.view else nullcontext() as viewer:
         if viewer is not None:
-            tell_place(viewer, output)
+            print_address(viewer, output)
         _carry_out(job, output, viewer)
 
 
@@ -86,10 +86,10 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
             _write(job, result, scale)
         result = result.replace(report=(imports, *accounted()))
     if scale is not None:
-        output.remark(told_size(scale))
+        output.remark(scale_message(scale))
     _conclude(output, job, result)
     if viewer is not None and not output.as_json:
-        output.say(f"The viewer stays at {viewer.address} until Ctrl-C.")
+        output.emit(f"The viewer stays at {viewer.address} until Ctrl-C.")
         with suppress(KeyboardInterrupt):
             viewer.wait()
 
@@ -183,8 +183,8 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
     ]
     rows = ["stage             seconds   peak MB", *costs, headline(result)]
     output.remark("\n".join(rows))
-    if result.scene.doubt:
-        output.warning(result.scene.doubt)
+    if result.scene.diagnosis:
+        output.warning(result.scene.diagnosis)
     if left_out := closing_line(result.left_out):
         output.remark(left_out)
     shown = job.out / ("overview.png" if job.common.no_report else "report.html")
@@ -233,7 +233,7 @@ def sized(
     return (result, None) if scale is None else (scaled(result, scale.factor), scale)
 
 
-def told_size(scale: Scale) -> str:
+def scale_message(scale: Scale) -> str:
     """State in a sentence what the size was taken from."""
     if scale.count == 1:
         return f"Lengths are in {scale.unit}, by one {scale.source.removesuffix('s')}."

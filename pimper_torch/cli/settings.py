@@ -39,7 +39,7 @@ def run(job: _Job, output: Output) -> None:
             if name == one.names[0]:
                 lines.append(f"# option: {', '.join(one.names)} {one.value}".rstrip())
         value = {".".join(job.path): value}
-    output.say("\n".join([*lines, *_yaml(job.config, job.path)]).lstrip("\n"))
+    output.emit("\n".join([*lines, *_yaml(job.config, job.path)]).lstrip("\n"))
     output.result(settings=value)
 
 

@@ -61,7 +61,7 @@ def main() -> int:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as by nohup
             signal.signal(number, heard)
     if worker == 0:
-        die_with(watcher)
+        exit_with_parent(watcher)
         faulthandler.enable()  # a crash writes where every thread was
         code = _carry_out()  # signals wait until they can be raised
         if code > 128:  # interrupted: whoever waits does not wait for libraries to tidy up
@@ -75,7 +75,7 @@ def main() -> int:
     ended = os.waitstatus_to_exitcode(status)
     if ended >= 0:
         return ended
-    from pimper_torch.cli.deaths import what_killed
+    from pimper_torch.cli.crash_report import what_killed
     from pimper_torch.cli.output import Output
 
     remove_scratch()
@@ -94,7 +94,7 @@ def _carry_out() -> int:
     return carry_out()
 
 
-def die_with(watcher: int) -> None:
+def exit_with_parent(watcher: int) -> None:
     """End this process when the watcher is killed, so that nobody works unwatched."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)

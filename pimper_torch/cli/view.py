@@ -42,16 +42,16 @@ def run(job: _Job, output: Output) -> None:
 
     # Ctrl-C ends the page and no work.
     with Viewer(job.host, job.port) as viewer, suppress(KeyboardInterrupt):
-        tell_place(viewer, output, job.port)
+        print_address(viewer, output, job.port)
         add_folder(viewer, job.out, job.photos)
         viewer.wait()
 
 
-def tell_place(viewer: "Viewer", output: Output, port: int = PORT) -> None:
+def print_address(viewer: "Viewer", output: Output, port: int = PORT) -> None:
     """Print the address of the page."""
     output.event("view", address=viewer.address)
     taken = f" (port {port} is taken)" if port not in (0, viewer.server.get_port()) else ""
-    output.say(f"The viewer is at {viewer.address}{taken}; Ctrl-C ends it.")
+    output.emit(f"The viewer is at {viewer.address}{taken}; Ctrl-C ends it.")
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:

@@ -38,7 +38,7 @@ _OURS = (False, "axis", "scene")
 _FEWEST, _STEPS, _WORSE, _FLAT, _ROUGH = 8, 20, 2.0, 0.03, 3e-4
 
 
-def settled_depth(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
+def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
     """Decide the meaning of depth, and convert it to scene units along the camera's axis.
 
     If it is left open it is found, and a warning states it: whether it is one over depth, along the

@@ -76,7 +76,7 @@ class _Samples(Record):
     on_outline: Bool[Tensor, " sample"]
 
 
-def settled_normals(
+def resolve_normal_conventions(
     prior: NormalPrior, scene: SparseScene, silhouettes: Silhouettes | None
 ) -> NormalPrior:
     """Convert normals to our axes of the camera, or leave them in the world.
@@ -119,7 +119,9 @@ def settled_normals(
         if what != _BGR:
             raise refused(f"are {what}", "Turn maps and vectors like the photographs.")
         caution(f"{where} have {_BGR}; they are exchanged back.", stacklevel=4)
-        return settled_normals(prior.replace(normals=prior.normals.flip(-1)), scene, silhouettes)
+        return resolve_normal_conventions(
+            prior.replace(normals=prior.normals.flip(-1)), scene, silhouettes
+        )
     index = int(means[: _WORLD + 1].argmax())
     if prior.axes:
         index = _WORLD if prior.frame == "world" else list(AXES).index(prior.axes)

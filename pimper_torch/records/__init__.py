@@ -2,10 +2,10 @@
 
 from pimper_torch.records.finished import Closed as Closed
 from pimper_torch.records.finished import Finished as Finished
-from pimper_torch.records.finished import Judged as Judged
 from pimper_torch.records.finished import Materials as Materials
 from pimper_torch.records.finished import Relighting as Relighting
 from pimper_torch.records.finished import Textured as Textured
+from pimper_torch.records.finished import ViewErrors as ViewErrors
 from pimper_torch.records.finished import ViewLights as ViewLights
 from pimper_torch.records.patches import AlignStatus as AlignStatus
 from pimper_torch.records.patches import Convergence as Convergence
@@ -37,19 +37,22 @@ from pimper_torch.records.reconstruction import LeftOut as LeftOut
 from pimper_torch.records.reconstruction import Reconstruction as Reconstruction
 from pimper_torch.records.reconstruction import StageReport as StageReport
 from pimper_torch.records.record import Record as Record
+from pimper_torch.records.scene import CameraModel as CameraModel
 from pimper_torch.records.scene import CoarseMesh as CoarseMesh
 from pimper_torch.records.scene import FacetPoints as FacetPoints
-from pimper_torch.records.scene import Lens as Lens
 from pimper_torch.records.scene import Mesh as Mesh
 from pimper_torch.records.scene import SparseScene as SparseScene
 from pimper_torch.records.scene import Support as Support
 from pimper_torch.records.scene import pairs_table as pairs_table
 from pimper_torch.records.silhouettes import ContourPoints as ContourPoints
 from pimper_torch.records.silhouettes import ContourRays as ContourRays
-from pimper_torch.records.silhouettes import Explained as Explained
 from pimper_torch.records.silhouettes import OrientedPoints as OrientedPoints
+from pimper_torch.records.silhouettes import SilhouetteCoverage as SilhouetteCoverage
 from pimper_torch.records.silhouettes import Silhouettes as Silhouettes
 from pimper_torch.records.stored import load_record as load_record
 from pimper_torch.records.stored import save_record as save_record
 from pimper_torch.records.views import Cameras as Cameras
 from pimper_torch.records.views import Views as Views
+from pimper_torch.runtime.renamed import renamed_names
+
+__getattr__ = renamed_names(__name__, {"Lens": "CameraModel"})

@@ -58,7 +58,7 @@ class ViewLights(Record):
     """
 
     direction_world: Float[Tensor, "view 3"]
-    closeness: Float[Tensor, " view"]
+    inverse_distance: Float[Tensor, " view"]
     ambient: Float[Tensor, "view channel"]
     directed: Float[Tensor, "view channel"]
 
@@ -95,7 +95,7 @@ class Materials(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Judged(Record):
+class ViewErrors(Record):
     """Errors of a surface in photographs, each under the light that suits it best.
 
     Attributes:
@@ -119,10 +119,10 @@ class Relighting(Record):
 
     lights: ViewLights
     materials: Materials
-    judged: Judged
-    matte: Judged
+    errors: ViewErrors
+    matte: ViewErrors
     held_out: bool
-    textured: Judged | None = None
+    textured: ViewErrors | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -148,7 +148,7 @@ class Textured(Record):
     tangent: Float[Tensor, "copy 4"]
     base_color: UInt8[Tensor, "height width 3"]
     normal: UInt8[Tensor, "height width 3"]
-    doubt: UInt8[Tensor, "height width"]
+    uncertainty: UInt8[Tensor, "height width"]
     reflectance: Float[Tensor, "height width 3"] | None
     charts: int
 

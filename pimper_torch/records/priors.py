@@ -3,7 +3,7 @@
 Maps belong to photographs by name, cover the whole photograph at any resolution, and those of
 unlike sizes are padded on the right and at the bottom. Variance is infinite where nothing is
 guessed. Axes of a camera are x right, y down, z forward: what faces it has normal (0, 0, -1).
-What is left open, or has other axes, :func:`~pimper_torch.priors.settled.settled` decides.
+:func:`~pimper_torch.priors.conventions.resolve_prior_conventions` finds axes that are not given.
 """
 
 from dataclasses import dataclass

@@ -13,7 +13,9 @@ from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
 from pimper_torch.records.silhouettes import Silhouettes
 from pimper_torch.records.views import Cameras
 
-What = Literal["photographs", "features", "matches", "points", "pixels", "facets", "faces", "doubt"]
+What = Literal[
+    "photographs", "features", "matches", "points", "pixels", "facets", "faces", "warning"
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

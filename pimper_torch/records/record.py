@@ -15,7 +15,7 @@ from torch.utils import _pytree as pytree
 
 from pimper_torch.records.value_checks import Faults
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.runtime.mapped import taken
+from pimper_torch.runtime.mapped import take_rows
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -118,7 +118,7 @@ class Record:
                 changes[name] = value.take(index)
             elif value is not None:
                 place = index.to(value.device) if isinstance(index, Tensor) else index
-                changes[name] = taken(value, place)
+                changes[name] = take_rows(value, place)
         return self.replace(**changes)
 
     @classmethod

@@ -12,10 +12,11 @@ from pimper_torch.ground.shapes import Faces, PerVertex, Points, VertexMask, Ver
 from pimper_torch.records.record import Record
 from pimper_torch.records.value_checks import Faults, beyond, faults_in, not_finite
 from pimper_torch.records.views import Cameras, Views
+from pimper_torch.runtime.renamed import renamed_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Lens(Record):
+class CameraModel(Record):
     """Intrinsics of one photograph before undistortion, in COLMAP's words.
 
     Attributes:
@@ -37,11 +38,12 @@ def no_maps() -> Float[Tensor, "0 3 3"]:
     return torch.zeros(0, 3, 3)
 
 
-def no_series() -> Int[Tensor, "0"]:
+def no_sessions() -> Int[Tensor, "0"]:
     """Return no numbers of series."""
     return torch.zeros(0, dtype=torch.long)
 
 
+@renamed_fields(doubt="diagnosis", series="sessions")
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SparseScene(Record):
     """Cameras, undistorted photographs and a sparse cloud with its tracks.
@@ -74,12 +76,12 @@ class SparseScene(Record):
     observation_point: Int[Tensor, " observation"]
     observation_view: Int[Tensor, " observation"]
     observation_pixels: Float[Tensor, "observation 2"]
-    lenses: tuple[Lens, ...]
+    lenses: tuple[CameraModel, ...]
     unregistered: tuple[str, ...] = ()
-    doubt: str = ""
+    diagnosis: str = ""
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
     offset_world: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    series: Int[Tensor, " divided"] = field(default_factory=no_series)
+    sessions: Int[Tensor, " divided"] = field(default_factory=no_sessions)
 
     def faults(self) -> Faults:
         """List what does not belong together."""
@@ -91,7 +93,7 @@ class SparseScene(Record):
         for what, of in (("point", count), ("view", views)):
             name, needed = f"observation_{what}", f"indices of {of} {what}s"
             yield from faults_in(name, needed, beyond, getattr(self, name), of)
-        for name in ("background_from_view", "series"):
+        for name in ("background_from_view", "sessions"):
             if len(found := getattr(self, name)) not in (0, views):
                 yield name, f"are {len(found)}", f"none, or one for each of {views} views"
         if count:
@@ -127,7 +129,7 @@ def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
     index = kept.nonzero()[:, 0].tolist()
     observed = kept.to(scene.observation_view.device)[scene.observation_view]
     number = kept.long().cumsum(dim=0).to(scene.observation_view.device) - 1
-    maps, series, names = scene.background_from_view, scene.series, scene.views.names
+    maps, sessions, names = scene.background_from_view, scene.sessions, scene.views.names
     left_out = tuple(name for name, keep in zip(names, kept.tolist(), strict=True) if not keep)
     return scene.replace(
         views=scene.views.take(index),
@@ -138,7 +140,7 @@ def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
         lenses=tuple(scene.lenses[view] for view in index) if scene.lenses else (),
         unregistered=(*scene.unregistered, *left_out),
         background_from_view=maps[kept.to(maps.device)] if len(maps) else maps,
-        series=series[kept.to(series.device)] if len(series) else series,
+        sessions=sessions[kept.to(sessions.device)] if len(sessions) else sessions,
     )
 
 
@@ -155,7 +157,7 @@ def with_points(scene: SparseScene, kept: Bool[Tensor, " point"]) -> SparseScene
     )
 
 
-class OneAPose(NamedTuple):
+class ViewPerPose(NamedTuple):
     """A scene with one photograph of every pose.
 
     Attributes:

@@ -117,7 +117,7 @@ class OrientedPoints(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Explained(Record):
+class SilhouetteCoverage(Record):
     """How a surface differs from silhouettes, in fractions of the area of each.
 
     Attributes:

@@ -54,7 +54,7 @@ def caution(message: str, stacklevel: int = 1) -> None:
         stacklevel: As of :func:`warnings.warn`, counted from the caller.
     """
     journal = current()
-    journal.tell(message)
+    journal.note(message)
     if not journal.quiet:
         warnings.warn(message, PimperWarning, stacklevel=stacklevel + 1)
 

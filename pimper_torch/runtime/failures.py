@@ -65,7 +65,7 @@ def collecting(
         raise
     for event in events[before:]:
         if not isinstance(event, Failure | LeftOut):
-            outer.tell(event)
+            outer.note(event)
 
 
 def skipped(*failures: Failure, error: BaseException | None = None) -> None:
@@ -85,7 +85,7 @@ def skipped(*failures: Failure, error: BaseException | None = None) -> None:
         warn_of(failures)
         return
     for failure in failures:
-        journal.tell(failure)
+        journal.note(failure)
 
 
 def skipped_patches(

@@ -54,7 +54,7 @@ class Journal:
         """Return the list of events; a new one where nobody collects them."""
         return [] if self.events is None else self.events
 
-    def tell(self, event: object) -> None:
+    def note(self, event: object) -> None:
         """Add an event, if anybody collects them."""
         if self.events is not None:
             self.events.append(event)

@@ -1,4 +1,4 @@
-"""The ledger of guards: whatever leaves something out, or raises a doubt, enters it here.
+"""The ledger of guards: whatever leaves something out, or warns, records it here.
 
 Entries of a call of a chain are in :attr:`~pimper_torch.records.Reconstruction.left_out`, in the
 order they were made: a guard that acts in several passes has one of each.
@@ -17,23 +17,23 @@ from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.journal import Journal, current, writing
 
 GUARDS: dict[str, tuple[What, str]] = {
-    "sfm.room": ("features", "at rest while others move"),
-    "sfm.moved_object": ("matches", "of the surroundings, between series"),
+    "sfm.static_background": ("features", "static while others move"),
+    "sfm.moved_object": ("matches", "of the surroundings, between capture sessions"),
     "sfm.weak_views": ("photographs", "see too few points"),
-    "sfm.misplaced": ("doubt", "their strongest pairs contradict the model"),
-    "sfm.small_series": ("photographs", "of a series of few"),
+    "sfm.misplaced": ("warning", "their strongest pairs contradict the model"),
+    "sfm.small_sessions": ("photographs", "of a capture session with few"),
     "sfm.tracks": ("points", "reproject far off"),
     "sfm.missing": ("photographs", "not registered"),
-    "sfm.doubt": ("doubt", "points tell no depth"),
+    "sfm.diagnosis": ("warning", "point depths are undetermined"),
     "sfm.sound_points": ("points", "not finite"),
     "sfm.sound_views": ("photographs", "show nothing or stand nowhere"),
-    "silhouettes.doubt": ("doubt", "silhouettes agree too little"),
-    "silhouettes.by_series": ("doubt", "silhouettes of a series tell nothing"),
+    "silhouettes.disagreement": ("warning", "silhouettes agree too little"),
+    "silhouettes.by_session": ("warning", "no silhouettes found in a capture session"),
     "silhouettes.shadows": ("pixels", "dark, and the hull denies them"),
     "silhouettes.unreliable": ("photographs", "their silhouette contradicts the others"),
     "silhouettes.empty": ("photographs", "their silhouette is empty"),
-    "contours.hull": ("doubt", "silhouettes have no place in common"),
-    "depth_points.doubt": ("doubt", "depth maps agree by chance"),
+    "contours.hull": ("warning", "silhouettes have no place in common"),
+    "depth_points.disagreement": ("warning", "depth maps agree by chance"),
     "depth_points.points": ("points", "too few views show them"),
     "coarse.reliable": ("points", "few views, large residuals or small angles"),
     "coarse.hull": ("points", "outside the silhouettes"),
@@ -77,7 +77,7 @@ Listener = Callable[[LeftOut, Tensor | None, Tensor | None], None]
 # Fraction up to which the closing message is silent: a choice. It says nothing of pixels, as most
 # views see most facets from behind, and nothing of doubts, which are warned of.
 _NEGLIGIBLE = 0.05
-_SILENT = ("pixels", "doubt")
+_SILENT = ("pixels", "warning")
 
 
 def leave_out(
@@ -110,7 +110,7 @@ def leave_out(
         guard=guard, what=what, count=int(taken), total=total, reason=reason, names=tuple(names)
     )
     if journal.collects:
-        journal.tell(entry)
+        journal.note(entry)
     if journal.masks is not None:
         journal.masks(entry, mask, at[0][at[1]].mean(dim=1) if isinstance(at, tuple) else at)
 

@@ -63,7 +63,7 @@ def copied(tensor: Tensor) -> Tensor:
     return zeros(tensor.shape, tensor.dtype, tensor.device).copy_(tensor)
 
 
-def taken(tensor: Tensor, index: slice | Tensor) -> Tensor:
+def take_rows(tensor: Tensor, index: slice | Tensor) -> Tensor:
     """Index the first axis, into a file where the result is large."""
     if isinstance(index, slice) or tensor.nbytes < LARGE or tensor.requires_grad:
         return tensor[index]

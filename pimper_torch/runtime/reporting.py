@@ -19,13 +19,13 @@ from pimper_torch.ground.geometry.topology import boundary_loops
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
-    Explained,
     Mesh,
     OrientedPoints,
     PatchSet,
     PatchStatus,
     PatchViews,
     PhotometricPatches,
+    SilhouetteCoverage,
     Silhouettes,
     SparseScene,
     StageReport,
@@ -36,7 +36,7 @@ from pimper_torch.runtime.journal import HASH, KEEP, Journal, current, writing
 
 R = TypeVar("R")
 
-_telling = Lock()
+_counting = Lock()
 
 
 @runtime_checkable
@@ -139,17 +139,17 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
     Yields:
         The figures to be told, empty at first.
     """
-    told: dict[str, int | float] = {}
+    metrics: dict[str, int | float] = {}
     journal, began = current(), time.perf_counter()
     if journal.observer is None:
-        yield told
+        yield metrics
         return
     events = journal.so_far()
     before = len(events)
     journal.observer.started(name)
-    with writing(replace(journal, observer=None, figures=told)):
-        yield told
-    report = reported(name, time.perf_counter() - began, told)
+    with writing(replace(journal, observer=None, figures=metrics)):
+        yield metrics
+    report = reported(name, time.perf_counter() - began, metrics)
     events[before:] = [one for one in events[before:] if not isinstance(one, StageReport)]
     events.append(report)
     journal.observer.finished(report)
@@ -160,22 +160,22 @@ def part(name: str) -> Iterator[None]:
     """Add the seconds of the ``with`` block, in whichever thread, to the figures of its stage."""
     began = time.perf_counter()
     yield
-    tell({f"{name}_seconds": time.perf_counter() - began})
+    add_counts({f"{name}_seconds": time.perf_counter() - began})
 
 
-def tell(counts: Mapping[str, int | float]) -> None:
+def add_counts(counts: Mapping[str, int | float]) -> None:
     """Add counts to the figures of the stage that runs, from any of its threads."""
-    told = current().figures
-    with _telling:
+    metrics = current().figures
+    with _counting:
         for name, count in counts.items():
-            told[name] = told.get(name, 0) + count
+            metrics[name] = metrics.get(name, 0) + count
 
 
 def called(name: str, call: Callable[..., R], *inputs: object) -> R:
     """Call a stage, and report it with the figures of its record."""
-    with stage(name) as told:
+    with stage(name) as metrics:
         record = call(*inputs)
-        told |= figures(record)
+        metrics |= figures(record)
     return record
 
 
@@ -203,7 +203,7 @@ def _(scene: SparseScene) -> dict[str, int | float]:
         "sparse_points": len(scene.points_world),
         "mean_track_length": len(scene.observation_point) / max(1, len(scene.points_world)),
         "mean_reprojection_px": _mean(scene.reprojection_errors_px),
-        "doubtful": int(bool(scene.doubt)),
+        "doubtful": int(bool(scene.diagnosis)),
     }
 
 
@@ -217,7 +217,7 @@ def _(silhouettes: Silhouettes) -> dict[str, int | float]:
 
 
 @figures.register
-def _(found: Explained) -> dict[str, int | float]:
+def _(found: SilhouetteCoverage) -> dict[str, int | float]:
     if not len(found.uncovered):
         return {}
     return {
@@ -294,27 +294,29 @@ def _(swept: SweptPatches) -> dict[str, int | float]:
             square = (guess.offset - height.offset)[both].square()
             claim = 1 / guess.offset_information[both] + 1 / height.information[both]
             depths.append((square / claim).detach())
-    told: dict[str, int | float] = {}
+    metrics: dict[str, int | float] = {}
     if sum(map(len, normals)):
         # Medians of squares of Gaussian noise in two components, and in one.
-        told["prior_normals_deg"] = math.degrees(float(torch.cat(angles).median()) ** 0.5)
-        told["prior_normals_over_claim"] = float(torch.cat(normals).median() / math.log(2)) ** 0.5
+        metrics["prior_normals_deg"] = math.degrees(float(torch.cat(angles).median()) ** 0.5)
+        metrics["prior_normals_over_claim"] = (
+            float(torch.cat(normals).median() / math.log(2)) ** 0.5
+        )
     if sum(map(len, depths)):
-        told["prior_depths_over_claim"] = float(torch.cat(depths).median() / 0.4549) ** 0.5
-    return told
+        metrics["prior_depths_over_claim"] = float(torch.cat(depths).median() / 0.4549) ** 0.5
+    return metrics
 
 
 @figures.register
 def _(depths: DepthPatches) -> dict[str, int | float]:
-    told: dict[str, int | float] = {
+    metrics: dict[str, int | float] = {
         "valid_depths": sum(int(bucket.valid.sum()) for bucket in depths.buckets)
     }
     if all(bucket.status is not None for bucket in depths.buckets):
-        told["aligned_patches"] = sum(int(bucket.aligned.sum()) for bucket in depths.buckets)
+        metrics["aligned_patches"] = sum(int(bucket.aligned.sum()) for bucket in depths.buckets)
     if depths.mismatch is not None:
-        told["mismatch_before"] = float(depths.mismatch[0])
-        told["mismatch"] = float(depths.mismatch[-1])
-    return told
+        metrics["mismatch_before"] = float(depths.mismatch[0])
+        metrics["mismatch"] = float(depths.mismatch[-1])
+    return metrics
 
 
 @figures.register

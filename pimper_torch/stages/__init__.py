@@ -36,7 +36,7 @@ from pimper_torch.method.sfm.reconstruct import Reconstruct as Reconstruct
 from pimper_torch.method.silhouettes.find import FindSilhouettes as FindSilhouettes
 from pimper_torch.method.silhouettes.trace import TraceContours as TraceContours
 from pimper_torch.method.sweep.sweep import Sweep as Sweep
-from pimper_torch.paper.triangulate import Triangulate as Triangulate
+from pimper_torch.published.triangulate import Triangulate as Triangulate
 from pimper_torch.result.asset.bake import Texture as Texture
 from pimper_torch.result.asset.finish import Simplify as Simplify
 from pimper_torch.result.relighting.held_out import Relight as Relight

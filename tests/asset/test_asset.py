@@ -313,12 +313,14 @@ def test_albedo_too_bright_to_be_true_is_the_neighbours_and_marked(full, few):
     assert made[speck].max() <= albedo.max()
     assert torch.equal(made[~speck], albedo[~speck])
     asset = textured(glowing, few)
-    points, _, doubt = seen(asset.replace(base_color=asset.doubt[..., None].expand(-1, -1, 3)))
+    points, _, uncertainty = seen(
+        asset.replace(base_color=asset.uncertainty[..., None].expand(-1, -1, 3))
+    )
     inside = (points[:, 0] > 0.45) & (points[:, 2] > 0.65)
     lit = points[:, 2] < 0.4
     plain = (points[:, 0] < 0.3) & (points[:, 2] > 0.6)
     for where, level in ((inside, 255), (plain, 128), (lit, 0)):
-        assert_close(doubt[where], torch.full_like(doubt[where], level), atol=1, rtol=0)
+        assert_close(uncertainty[where], torch.full_like(uncertainty[where], level), atol=1, rtol=0)
     dim = glowing.replace(albedo=albedo)
     assert torch.equal(inpainted(dim)[0].albedo, albedo)
     none = full.replace(confidence=torch.zeros_like(z))
@@ -326,8 +328,8 @@ def test_albedo_too_bright_to_be_true_is_the_neighbours_and_marked(full, few):
 
 
 def test_the_mask_of_doubtful_albedo_is_a_texture_of_the_glb(full, few, asset, tmp_path):
-    assert not asset.doubt.any()
-    doubtful = asset.replace(doubt=torch.full_like(asset.doubt, 128))
+    assert not asset.uncertainty.any()
+    doubtful = asset.replace(uncertainty=torch.full_like(asset.uncertainty, 128))
     for one, name in ((asset, "sure"), (doubtful, "doubtful")):
         write_asset(one, tmp_path / f"{name}.glb")
         assert validated(tmp_path / f"{name}.glb") == []
@@ -338,7 +340,7 @@ def test_the_mask_of_doubtful_albedo_is_a_texture_of_the_glb(full, few, asset, t
     raw = (tmp_path / "doubtful.glb").read_bytes()
     start = 28 + int.from_bytes(raw[12:16], "little") + view["byteOffset"]
     with Image.open(io.BytesIO(raw[start : start + view["byteLength"]])) as mask:
-        assert np.array_equal(np.asarray(mask), doubtful.doubt)
+        assert np.array_equal(np.asarray(mask), doubtful.uncertainty)
 
 
 def test_a_usdz_is_complete_and_in_metres(asset, placement, tmp_path):

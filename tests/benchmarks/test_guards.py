@@ -42,7 +42,7 @@ def test_photographs_are_right_unless_spoilt():
 
 @pytest.mark.parametrize("good", [True, False])
 def test_a_doubt_takes_what_is_right_where_cameras_are_good(good):
-    assert fractions(judge(good=good), "sfm.doubt", 1) == [float(good)]
+    assert fractions(judge(good=good), "sfm.diagnosis", 1) == [float(good)]
 
 
 def test_places_are_right_near_the_true_surface_in_its_frame():

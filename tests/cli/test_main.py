@@ -19,7 +19,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.doors.io.results import RESULT_NAMES, write_result
 from pimper_torch.doors.io.version import installed_version
-from pimper_torch.doors.outputs.marker import MARKER
+from pimper_torch.doors.result_folder.marker import MARKER
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig, load_config
 from pimper_torch.method.silhouettes.find import FindSilhouettes
 from pimper_torch.records import LeftOut, Mesh, Silhouettes

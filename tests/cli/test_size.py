@@ -10,12 +10,12 @@ from PIL import Image
 
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
-from pimper_torch.cli.run import bars_in_files, told_size
+from pimper_torch.cli.run import bars_in_files, scale_message
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.doors.size.given import Mark
-from pimper_torch.doors.size.marks import place_of
-from pimper_torch.doors.size.scale import Scale
+from pimper_torch.doors.scale.given import Mark
+from pimper_torch.doors.scale.marks import place_of
+from pimper_torch.doors.scale.scale import Scale
 from pimper_torch.method.sfm.model_files import read_model
 
 # The surface of the small result has a random confidence.
@@ -129,7 +129,7 @@ def test_lengths_that_mean_nothing_are_refused(more, told, photos, tmp_path, cap
 )
 def test_what_tells_the_size_is_said(count, told):
     scale = Scale(factor=2.0, unit="m", source="camera distances", residual=0.0012, count=count)
-    assert told_size(scale) == told
+    assert scale_message(scale) == told
 
 
 def test_a_sheet_is_written_once_and_replaced_where_that_is_asked_for(tmp_path, capsys):

@@ -196,7 +196,7 @@ def test_the_worker_dies_with_the_watcher(tmp_path):
 
 
 def test_what_goes_well_goes_well(tmp_path):
-    code = at_run(f"{READY}\noutput.say('h\\u00e9')\nsys.stderr.write('shown\\n')")
+    code = at_run(f"{READY}\noutput.emit('h\\u00e9')\nsys.stderr.write('shown\\n')")
     returned, out, err = Ran(tmp_path, code).end()
     assert (returned, out, err) == (0, "h\u00e9\n", "shown\n")
     returned, _, err = Ran(tmp_path, at_run(f"{READY} 1 / 0")).end()
@@ -220,7 +220,7 @@ def test_a_reader_who_has_read_enough_of_a_table_is_no_crash(tmp_path):
 
 def test_a_character_that_cannot_be_printed_is_written_otherwise(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONIOENCODING", "ascii:strict")
-    code = at_run(f"{READY}\noutput.say('h\\u00e9')\noutput.warning('\\udcff')\noutput.event('a')")
+    code = at_run(f"{READY}\noutput.emit('h\\u00e9')\noutput.warning('\\udcff')\noutput.event('a')")
     returned, out, err = Ran(tmp_path, code).end()
     assert returned == 0
     assert out == "h\\xe9\n"

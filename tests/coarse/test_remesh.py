@@ -11,7 +11,7 @@ from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, 
 from pimper_torch.ground.geometry.topology import boundary_vertices
 from pimper_torch.method.coarse.coarse_config import RemeshConfig
 from pimper_torch.method.coarse.remesh import remesh
-from pimper_torch.paper.cloud_filters import delaunay
+from pimper_torch.published.cloud_filters import delaunay
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh
 from pimper_torch.runtime.errors import InputError
 

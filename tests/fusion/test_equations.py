@@ -9,7 +9,7 @@ from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.method.fusion.equations import (
     BaseSurface,
-    Common,
+    SharedError,
     cloud_points,
     contour_tangents,
     kept_slopes,
@@ -75,7 +75,7 @@ def test_an_angles_error_moves_an_edges_end_by_its_length(subdivision):
     found = slopes(edges, subdivision.points, along, along, variance)
     length = (subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]]).norm(dim=1)
     assert_close(1 / found.information, 4e-4 * length.square())
-    common = Common(variance=variance[0] / 2, count=torch.full_like(variance, 6.0))
+    common = SharedError(variance=variance[0] / 2, count=torch.full_like(variance, 6.0))
     together = slopes(edges, subdivision.points, along, along, variance, common)
     assert_close(together.information, found.information / 4)
     # Each edge errs by its own variance and the common one: 1.5 of the 4.
@@ -141,7 +141,7 @@ def test_heights_that_err_alike_know_no_more_together_than_their_common_error_le
     count = 1000
     nothing = torch.zeros(count, dtype=torch.float64)
     own = torch.full_like(nothing, 25.0)
-    common = Common(variance=torch.tensor(0.01).double(), count=torch.full_like(own, count))
+    common = SharedError(variance=torch.tensor(0.01).double(), count=torch.full_like(own, count))
     terms = nothing, nothing, own, torch.ones_like(own), torch.full_like(own, 4.0)
     alone, found = swept_heights(*terms), swept_heights(*terms, common)
     assert_close(alone.information.sum(), own.sum())

@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.ground.geometry.subdivision import subdivide
 from pimper_torch.method.fusion.equations import swept_heights
-from pimper_torch.method.fusion.normal_bias import common, common_variance, normal_bias
+from pimper_torch.method.fusion.normal_bias import common_variance, normal_bias, shared_error
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_the_variance_of_tilts_is_told_whatever_their_number():
     normals = torch.cat([tilts, torch.ones(600, 1).double()], dim=1)[subdivision.facet]
     known = torch.ones(len(shape), dtype=torch.bool)
     variance = normal_bias(subdivision, facets, normals, shape, known).variance()
-    found = common(variance, subdivision.facet, known)
+    found = shared_error(variance, subdivision.facet, known)
     assert float(found.variance) == pytest.approx(0.02**2, rel=0.15)
     assert_close(found.count, torch.bincount(subdivision.facet).double()[subdivision.facet])
 
@@ -85,7 +85,7 @@ def test_what_heights_of_a_facet_are_off_by_together_is_told_where_it_can_be():
         nothing, shared[facet] + 0.1 * own, information, *torch.ones(2, len(nothing))
     )
     variance = common_variance(found, nothing, facet, torch.arange(400).repeat(2))
-    shared = common(variance, facet, information > 0)
+    shared = shared_error(variance, facet, information > 0)
     assert float(shared.variance) == pytest.approx(0.3**2, rel=0.15)
     assert shared.count[facet != 399].unique().tolist() == [50]
     assert shared.count[facet == 399].unique().tolist() == [0]

@@ -17,7 +17,7 @@ from pimper_torch.method.fusion.detail import spacing_of
 from pimper_torch.method.fusion.estimate import fuse_terms
 from pimper_torch.method.fusion.fuse import Fuse
 from pimper_torch.method.fusion.fuse_config import FuseConfig
-from pimper_torch.method.fusion.problem import laid, pose
+from pimper_torch.method.fusion.problem import build_problem, subdivide_facets
 from pimper_torch.method.fusion.terms import KeptSlopes, Normals, SweptHeights
 from pimper_torch.method.patches.decompose import Decompose
 from pimper_torch.method.patches.patches_config import DecomposeConfig
@@ -42,12 +42,12 @@ def off_sphere(points):
 
 
 def cameras():
-    pose = torch.eye(4, dtype=torch.float64)[None].clone()
-    pose[0, 2, 3] = 4
+    build_problem = torch.eye(4, dtype=torch.float64)[None].clone()
+    build_problem[0, 2, 3] = 4
     focal = 4 / SPACING
     return Cameras(
         intrinsics=torch.tensor([[[focal, 0, 50], [0, focal, 50], [0, 0, 1]]]).double(),
-        cam_from_world=pose,
+        cam_from_world=build_problem,
         sizes_px=torch.tensor([[100, 100]]),
     )
 
@@ -237,7 +237,9 @@ def test_heights_have_a_noise_of_their_own_where_normals_are_coarse(cap):
     swept = cap.replace(
         photometric=cap.photometric.replace(buckets=tuple(photometry)), buckets=tuple(heights)
     )
-    problem = pose(swept, laid(swept, vertex_spacing(swept.patches, 1.0)), True)
+    problem = build_problem(
+        swept, subdivide_facets(swept, vertex_spacing(swept.patches, 1.0)), True
+    )
     own, coarse = kinds = SweptHeights().equations(problem)
     assert not torch.isin(own.unknowns, coarse.unknowns).any()
     kinds += [*Normals().equations(problem), *KeptSlopes().equations(problem)]

@@ -25,7 +25,7 @@ from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.cli.video.read import luma_frames
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.read_cameras import read_cameras
-from pimper_torch.doors.exchange.openexr import write_exr
+from pimper_torch.doors.export.openexr import write_exr
 from pimper_torch.doors.io.decode import decode, write_deep_png
 from pimper_torch.doors.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.doors.io.photographs import load_views

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from sparse_models import observed
 
-from pimper_torch.doors.exchange.alicevision import write_sfm
-from pimper_torch.doors.exchange.nerfstudio import write_transforms
+from pimper_torch.doors.export.alicevision import write_sfm
+from pimper_torch.doors.export.nerfstudio import write_transforms
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
 from pimper_torch.method.sfm import colmap
 from pimper_torch.records import Cameras, Views

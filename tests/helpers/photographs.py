@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from pimper_torch.doors.exchange.picture_files import write_picture
+from pimper_torch.doors.export.picture_files import write_picture
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.records import Cameras, Views

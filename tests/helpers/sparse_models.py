@@ -6,7 +6,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.records import Cameras, Lens, Views
+from pimper_torch.records import CameraModel, Cameras, Views
 
 
 def views_of(images: Tensor, sizes: list[tuple[int, int]] | None = None, **more: object) -> Views:
@@ -26,7 +26,7 @@ def observed(
     points: Tensor,
     seen: Tensor | None = None,
     *,
-    lens: Lens | None = None,
+    lens: CameraModel | None = None,
     noise_px: float = 0.0,
     generator: torch.Generator | None = None,
 ) -> SparseModel:

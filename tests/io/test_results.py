@@ -19,8 +19,8 @@ from pimper_torch.doors.io.estimates import read_estimate
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.reports import common_lights, lights_report, summary_report, world_lights
 from pimper_torch.doors.io.results import RESULT_NAMES, write_result
-from pimper_torch.doors.outputs.folders import prepare_output
-from pimper_torch.doors.outputs.marker import MARKER
+from pimper_torch.doors.result_folder.folders import prepare_output
+from pimper_torch.doors.result_folder.marker import MARKER
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.radiometry import srgb_from_linear
@@ -64,7 +64,7 @@ def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
     assert summary["preset"] == "paper"
     assert summary["unregistered"] == ["d.png"]
     assert (summary["views"], summary["registered"]) == (4, 3)
-    assert summary["doubt"] is None
+    assert summary["diagnosis"] is None
     lights = json.loads((out / "lights.json").read_text())
     assert [view["name"] for view in lights["views"]] == ["a.png", "b.png", "c.png"]
 
@@ -166,8 +166,8 @@ def test_the_common_light_is_what_the_patches_see_of_one_light(reconstruction):
 
 def test_the_summary_counts(reconstruction):
     summary = summary_report(reconstruction, {})
-    doubted = reconstruction.replace(scene=reconstruction.scene.replace(doubt="All is flat."))
-    assert summary_report(doubted, {})["doubt"] == "All is flat."
+    doubted = reconstruction.replace(scene=reconstruction.scene.replace(diagnosis="All is flat."))
+    assert summary_report(doubted, {})["diagnosis"] == "All is flat."
     wanted = {
         "mesh_points": 4,
         "triangles": 2,

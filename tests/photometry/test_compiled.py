@@ -159,7 +159,10 @@ def test_views_and_samples_without_data_make_no_difference(problem, generator):
     given = given.replace(weight=weight, radiance=weight * given.radiance)
     keep = torch.arange(12) != 3
     small = given.replace(
-        **{name: getattr(given, name)[:, keep] for name in ("lights", "anchor", "regularization")},
+        **{
+            name: getattr(given, name)[:, keep]
+            for name in ("lights", "prior_mean", "regularization")
+        },
         radiance=given.radiance[:, keep, :50].contiguous(),
         weight=given.weight[:, keep, :50].contiguous(),
         shading=given.shading[..., :50].contiguous(),
@@ -168,6 +171,6 @@ def test_views_and_samples_without_data_make_no_difference(problem, generator):
     found = solve(given, "numba")
     alone = solve(small, "torch")
     assert_close(found.lights[:, keep], alone.lights, rtol=0, atol=2e-3)
-    assert_close(found.lights[:, 3], given.anchor[:, 3])
+    assert_close(found.lights[:, 3], given.prior_mean[:, 3])
     assert_close(found.shading[..., 50:], given.shading[..., 50:])
     assert (found.weight[:, 3] == 0).all()

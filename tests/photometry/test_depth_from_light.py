@@ -38,7 +38,7 @@ def scene_of(num_views=VIEWS, texture=None):
         origin=torch.zeros(3).double(),
         soft=torch.nn.functional.pad(ambient, (0, 8)),
         point_light=lamp,
-        closeness=torch.zeros(num_views).double(),
+        inverse_distance=torch.zeros(num_views).double(),
     )
     return scene, contours, field
 

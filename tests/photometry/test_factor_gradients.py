@@ -37,7 +37,7 @@ def noisy(generator):
             radiance=lights @ shading + 0.1 * draw(patches, views, samples),
             weight=weight,
             lights=lights,
-            anchor=lights + 0.05 * draw(*lights.shape),
+            prior_mean=lights + 0.05 * draw(*lights.shape),
             shading=shading,
             regularization=torch.full((patches, views), 2.0, dtype=torch.float64),
             prior=0.5 * prior,
@@ -58,9 +58,9 @@ def test_gradients_are_those_of_the_solver(noisy, manifold, generator):
     start = solved(problem)
     assert start.convergence.converged.all()
 
-    def answer(radiance, anchor, regularization, prior, solve):
+    def answer(radiance, prior_mean, regularization, prior, solve):
         given = problem.replace(
-            radiance=radiance, anchor=anchor, regularization=regularization, prior=prior
+            radiance=radiance, prior_mean=prior_mean, regularization=regularization, prior=prior
         )
         found = solve(given)
         return torch.cat([found.lights.flatten(1), found.shading.flatten(1)], dim=1)
@@ -68,7 +68,7 @@ def test_gradients_are_those_of_the_solver(noisy, manifold, generator):
     def again(given):
         return solved(given.replace(lights=start.lights, shading=start.shading))
 
-    data = [problem.radiance, problem.anchor, problem.regularization, problem.prior]
+    data = [problem.radiance, problem.prior_mean, problem.regularization, problem.prior]
     leaves = [one.clone().requires_grad_() for one in data]
     found = answer(*leaves, lambda given: differentiable(given, start))
     assert_close(found, answer(*data, lambda _: start))
@@ -115,7 +115,7 @@ def test_the_compiled_adjoint_is_that_of_the_reference(noisy, generator, loss, s
     weight[:, 3], weight[:, :, 5] = 0, 0  # a view and a sample without data
     given = given.replace(weight=weight, radiance=weight * given.radiance)
     start = solved(given)
-    names = "radiance", "weight", "anchor", "regularization", "prior"
+    names = "radiance", "weight", "prior_mean", "regularization", "prior"
     outputs, slopes = [], []
     for how in ("numba", "torch"):
         leaves = {name: getattr(given, name).clone().requires_grad_() for name in names}

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from pimper_torch.method.photometry.factor_priors import (
     FieldLights,
-    Guesses,
+    MapPriors,
     SurfaceNormals,
     views_worth,
 )
@@ -66,7 +66,7 @@ def test_guessed_normals_bring_bumps_nearer_and_only_through_their_entry(scene):
 
 def test_guessed_albedo_is_in_any_unit_and_comes_out(scene):
     true = scene(bumps=0.2)
-    priors = [FieldLights(), SurfaceNormals(0.0), Guesses()]
+    priors = [FieldLights(), SurfaceNormals(0.0), MapPriors()]
     found = []
     for unit in (1.0, 7.0):
         albedo = [unit * each.mean(dim=-1) for each in true.albedo]
@@ -107,7 +107,7 @@ def test_guessed_lights_count_by_their_variance_and_in_any_unit(scene):
     for variance, pulled in ((1e-6, True), (1e6, False)):
         variances = [torch.full_like(each[..., 0], variance) for each in lights]
         seen = carried(true.seen, lights_patch=wrong, light_variance=variances)
-        found = solved(Factorize(priors=[FieldLights(1.0), Guesses()]), seen)
+        found = solved(Factorize(priors=[FieldLights(1.0), MapPriors()]), seen)
         for one, given in zip(found.buckets, wrong, strict=True):
             cosine = torch.cosine_similarity(one.lights_patch, given, dim=2)
             assert bool((cosine > 0.9999).all()) == pulled

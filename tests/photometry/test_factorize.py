@@ -186,7 +186,7 @@ def test_in_the_lamps_shadow_the_rooms_light_tells_normals_where_it_is_strong(
         origin=torch.zeros(3).double(),
         soft=pad(true.lights, (0, 5)),
         point_light=lamp,  # shadowed all over
-        closeness=torch.zeros(12).double(),
+        inverse_distance=torch.zeros(12).double(),
     )
     monkeypatch.setattr(FitLight, "_field", lambda *_: field)
     monkeypatch.setattr(

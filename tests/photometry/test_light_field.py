@@ -27,7 +27,7 @@ def room(generator):
         origin=points.mean(dim=0),
         soft=torch.tensor([[0.1] + 8 * [0.0]], dtype=torch.float64).repeat(6, 1),
         point_light=torch.linspace(0.5, 1.5, 6).double()[:, None] * directions,
-        closeness=1 / torch.linspace(3, 6, 6).double(),
+        inverse_distance=1 / torch.linspace(3, 6, 6).double(),
     )
     return points, normals, field
 
@@ -44,7 +44,7 @@ def test_a_point_light_falls_off_with_the_square_and_points_at_its_place():
         origin=torch.zeros(3).double(),
         soft=torch.zeros(1, 9).double(),
         point_light=2.0 * place[None] / 5,
-        closeness=torch.tensor([1 / 5]).double(),
+        inverse_distance=torch.tensor([1 / 5]).double(),
     )
     points = torch.tensor([[0.0, 0, 0], [1.0, 0, 4], [-2, 1, 0]], dtype=torch.float64)
     found = field.point_light_at(points)[:, 0]
@@ -63,7 +63,7 @@ def test_point_lights_are_found_where_they_are(room, generator):
     scale = field.point_light[0].norm() / found.point_light[0].norm()
     assert_close(found.point_light * scale, field.point_light, rtol=1e-3, atol=1e-3)
     assert_close(found.soft * scale, field.soft, rtol=1e-3, atol=1e-3)
-    assert_close(found.closeness, field.closeness, rtol=1e-3, atol=1e-3)
+    assert_close(found.inverse_distance, field.inverse_distance, rtol=1e-3, atol=1e-3)
 
 
 def test_point_lights_survive_cast_shadows_and_highlights(room, generator):
@@ -75,7 +75,7 @@ def test_point_lights_survive_cast_shadows_and_highlights(room, generator):
     found = fit_light_field(J, torch.ones_like(draw, dtype=torch.bool), normals, points)
     cosine = (normalize(found.point_light, dim=1) * normalize(field.point_light, dim=1)).sum(dim=1)
     assert torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max() < 2
-    assert (found.closeness / field.closeness - 1).abs().max() < 0.1
+    assert (found.inverse_distance / field.inverse_distance - 1).abs().max() < 0.1
 
 
 def test_light_from_all_sides_is_taken_for_no_point_light(room, generator):

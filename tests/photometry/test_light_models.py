@@ -60,7 +60,7 @@ def test_both_lights_shade_as_the_light_field_does(samples, generator):
         origin=torch.zeros(3).double(),
         soft=given[:, :9],
         point_light=given[:, 9:12],
-        closeness=given[:, 12],
+        inverse_distance=given[:, 12],
     )
     direct = (field.point_light_at(points) * normals[:, None]).sum(dim=-1).clamp_min(0)
     assert_close(model.shade(given), basis(normals) @ field.soft.mT + direct)

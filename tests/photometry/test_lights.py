@@ -117,7 +117,7 @@ def test_gradients_of_a_light_field_are_those_of_differences(generator, model):
     def told(values):
         leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
         field = fit_light_field(seen=seen, model=model, **leaves)
-        parts = field.soft, field.point_light, field.closeness
+        parts = field.soft, field.point_light, field.inverse_distance
         total = sum((a * b).sum() for a, b in zip(weights, parts, strict=True))
         return total, leaves
 

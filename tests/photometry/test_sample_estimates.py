@@ -33,7 +33,7 @@ def test_information_is_the_inverse_variance_of_normals_under_noise(problem, gen
         radiance=given.radiance + deviation * noise,
         weight=repeated(given.weight),
         lights=repeated(lights),
-        anchor=repeated(lights),
+        prior_mean=repeated(lights),
         shading=repeated(shading),
         regularization=given.regularization.expand(draws, -1),
     )

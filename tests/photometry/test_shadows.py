@@ -29,7 +29,7 @@ def point_lights(places, distant=False):
         origin=torch.zeros(3).double(),
         soft=torch.zeros(len(places), 9).double(),
         point_light=2.0 * normalize(places, dim=1),
-        closeness=torch.zeros_like(distance) if distant else 1 / distance,
+        inverse_distance=torch.zeros_like(distance) if distant else 1 / distance,
     )
 
 

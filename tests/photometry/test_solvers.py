@@ -49,7 +49,7 @@ def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
     _, normals = given.manifold.split(given.shading.mT)
     given = given.replace(
         regularization=torch.full_like(given.regularization, 3.0),
-        anchor=given.anchor + 0.1,
+        prior_mean=given.prior_mean + 0.1,
         prior=0.1 * given.manifold.normal_prior(normals.mT),
     )
     noise = torch.randn(given.radiance.shape, generator=generator, dtype=torch.float64)
@@ -75,8 +75,8 @@ def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
 def test_lights_that_are_held_stay(problem, solve):
     given, _, _ = problem()
     held = given.replace(regularization=torch.full_like(given.regularization, 1e9))
-    assert_close(solve(held, 40, 1e-6).lights, given.anchor, rtol=0, atol=1e-5)
-    assert (solve(given, 40, 1e-6).lights - given.anchor).abs().max() > 1e-2
+    assert_close(solve(held, 40, 1e-6).lights, given.prior_mean, rtol=0, atol=1e-5)
+    assert (solve(given, 40, 1e-6).lights - given.prior_mean).abs().max() > 1e-2
 
 
 @SOLVERS
@@ -86,7 +86,7 @@ def test_robust_weights_keep_outliers_out(problem, solve, generator):
     given = given.replace(
         radiance=torch.where(gross, given.radiance + 1.5, given.radiance),
         lights=lights,
-        anchor=lights,
+        prior_mean=lights,
         regularization=torch.full_like(given.regularization, 1e9),
     )
     plain = (solve(given, 100, 1e-6).shading - shading).norm(dim=1).median()
@@ -114,7 +114,7 @@ def test_a_patch_is_solved_as_if_it_were_alone(problem, solve):
 def test_the_last_step_reaches_the_minimum_of_every_sample_and_differentiates_it(problem):
     given, lights, _ = problem(patches=1, samples=12, off=0.02)
     given = given.replace(
-        lights=lights, anchor=lights, regularization=torch.full_like(given.regularization, 1e9)
+        lights=lights, prior_mean=lights, regularization=torch.full_like(given.regularization, 1e9)
     )
     noisy = given.radiance + 0.01 * torch.sin(torch.arange(240.0)).double().reshape(1, 20, 12)
     given = given.replace(radiance=noisy)

@@ -5,7 +5,7 @@ from PIL import Image
 
 from pimper_torch.cli.options import parse
 from pimper_torch.doors.io.decode import write_deep_png
-from pimper_torch.doors.size.given import Mark, Pointer
+from pimper_torch.doors.scale.given import Mark, Pointer
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import ConfigError, InputError

@@ -20,7 +20,7 @@ class Catching(nn.Module):
 
 @pytest.mark.parametrize("chain", ["default", "paper"])
 def test_chains_hand_on_normals_in_our_axes_and_undistorted(chain, rendered):
-    """DSINE's, of photographs that a lens bent: stages behind the silhouettes see them settled."""
+    """DSINE's normals of distorted photographs; later stages get resolved conventions."""
     scene = rendered.scene
     fx, fy, cx, cy = scene.lenses[0].params
     lens = scene.lenses[0].replace(model="OPENCV", params=(fx, fy, cx, cy, 0.05, 0, 0, 0))

@@ -106,7 +106,7 @@ def test_guesses_about_a_scene_are_of_its_undistorted_photographs(reconstruction
     found = pt.priors_of(lambda picture: picture[:, :1], scene, "silhouettes")
     assert found.undistorted
     given = scene.replace(views=scene.views.replace(priors=(found,)))
-    assert pt.settled(given) == given
+    assert pt.resolve_prior_conventions(given) == given
 
 
 def test_gradients_of_the_parameters_are_those_of_finite_differences(views):

@@ -33,7 +33,7 @@ def lights_beside(cameras):
     return ViewLights(
         direction_world=normalize(eyes + 0.7 * aside, dim=1).float(),
         ambient=(0.1 * torch.tensor([0.6, 0.8, 1.0])).expand(len(eyes), 3).contiguous(),
-        closeness=torch.zeros(len(eyes)),
+        inverse_distance=torch.zeros(len(eyes)),
         directed=(strength[:, None] * tint).float(),
     )
 

@@ -5,7 +5,7 @@ import torch
 
 from pimper_torch.doors.io.reports import relighting_report
 from pimper_torch.ground.geometry.poisson import reduced
-from pimper_torch.method.chains.coarse_to_fine import held_apart
+from pimper_torch.method.chains.coarse_to_fine import split_held_out
 from pimper_torch.records import Silhouettes
 from pimper_torch.result.asset.bake import textured
 from pimper_torch.result.relighting.held_out import Relight, judge_textures
@@ -21,27 +21,27 @@ def scene():
 
 
 def test_every_nth_photograph_by_name_is_held_out_but_for_what_is_needed(scene):
-    used, held = held_apart(scene, 3)
+    used, held = split_held_out(scene, 3)
     assert held.views.names == ("002", "005")
     assert used.views.names == ("000", "001", "003", "004")
     assert used.unregistered == held.unregistered == ()
     assert torch.equal(held.cameras.cam_from_world, scene.cameras.cam_from_world[[2, 5]])
     assert torch.equal(used.points_world, scene.points_world)
     turned = scene.replace(views=scene.views.replace(names=("5", "4", "3", "2", "1", "0")))
-    assert held_apart(turned, 3)[1].views.names == ("5", "2")
-    assert held_apart(scene, 3, ["005"])[1].views.names == ("002",)
-    assert held_apart(scene, 6, ["005"])[0] is scene
-    assert held_apart(scene, 0) == (scene, None)
+    assert split_held_out(turned, 3)[1].views.names == ("5", "2")
+    assert split_held_out(scene, 3, ["005"])[1].views.names == ("002",)
+    assert split_held_out(scene, 6, ["005"])[0] is scene
+    assert split_held_out(scene, 0) == (scene, None)
 
 
 def test_too_few_photographs_are_refused(scene):
     four = photographed(GLOSSY, views=4)[0]
     with pytest.raises(ConfigError, match="hold_out is 2; needed: a number that leaves 3 views"):
-        held_apart(four, 2)
+        split_held_out(four, 2)
 
 
 def test_held_out_photographs_are_predicted_better_with_their_highlights(scene):
-    used, held = held_apart(scene, 3)
+    used, held = split_held_out(scene, 3)
     found = Relight()(ball_mesh(), used, Silhouettes.everything(used.views), held)
     report = relighting_report(found)
     assert report["photographs"] == "held out"
@@ -77,9 +77,9 @@ def test_textures_come_nearer_to_photographs_than_vertices_of_few_faces(scene):
     few = reduced(full, 1200)
     found = Relight()(few, scene, None)
     asset = textured(full, few, found.materials.at_vertices())
-    judged = judge_textures(found, asset, scene, None)
-    coarse, fine = found.judged.psnr_db.mean(), judged.textured.psnr_db.mean()
+    errors = judge_textures(found, asset, scene, None)
+    coarse, fine = found.errors.psnr_db.mean(), errors.textured.psnr_db.mean()
     assert fine > coarse + 1
     assert fine > 45  # eight bits a texel
-    assert relighting_report(judged)["psnr_textured_db"] == pytest.approx(float(fine), abs=1e-3)
+    assert relighting_report(errors)["psnr_textured_db"] == pytest.approx(float(fine), abs=1e-3)
     assert relighting_report(found)["psnr_textured_db"] is None

@@ -79,7 +79,7 @@ def light():
     return ViewLights(
         direction_world=normalize(torch.tensor([[0.5, 0.2, 0.9]]), dim=1),
         ambient=torch.full((1, 3), 0.1),
-        closeness=torch.zeros(1),
+        inverse_distance=torch.zeros(1),
         directed=torch.full((1, 3), 0.8),
     )
 

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.records import Judged, Materials, Relighting, Silhouettes
+from pimper_torch.records import Materials, Relighting, Silhouettes, ViewErrors
 from pimper_torch.result.asset.bake import textured
 from pimper_torch.result.asset.placement import Placement, standing
 from pimper_torch.result.asset.write import write_asset
@@ -30,7 +30,7 @@ SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swifts
 LEFT_OUT = {"what": "points", "total": 90000, "reason": "without albedo", "names": []}
 VIEW = {"name": "a.png", "psnr_db": 31.0, "psnr_matte_db": None}
 SUMMARY = {
-    "doubt": None,
+    "diagnosis": None,
     "warnings": ["Lower `factorize.min_views`, or `--masks` and <b>bold</b>."],
     "seconds": 150.4,
     "peak_memory_mb": 900.0,
@@ -80,11 +80,11 @@ def shown(tmp_path_factory):
         expected_error=0.01 + 0.005 * mesh.vertices_world[:, 2], confidence=torch.ones(count)
     )
     materials = Materials.of(torch.zeros(count, dtype=torch.long), torch.tensor([GLOSSY]))
-    worth = Judged(
+    worth = ViewErrors(
         psnr_db=torch.full((scene.views.num_views,), 31.0), lights=lights, names=scene.views.names
     )
     relighting = Relighting(
-        lights=lights, materials=materials, judged=worth, matte=worth, held_out=False
+        lights=lights, materials=materials, errors=worth, matte=worth, held_out=False
     )
     folder = tmp_path_factory.mktemp("page")
     asset = textured(mesh, mesh, materials.at_vertices())

@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.records import Judged, Materials, Mesh, Relighting, ViewLights
+from pimper_torch.records import Materials, Mesh, Relighting, ViewErrors, ViewLights
 from pimper_torch.result.report.openness import openness
 from pimper_torch.result.report.page import left_out_by_pass, write_page
 from pimper_torch.result.report.predictions import (
@@ -34,7 +34,7 @@ from pimper_torch.result.report.vertex_layers import (
 MATTE = (0.0, 1.0, 0.0)  # metallic, roughness, specular
 SUMMARY = {
     "photographs": "/home/somebody/cup",
-    "doubt": None,
+    "diagnosis": None,
     "warnings": ["two photographs are blurred; take them again"],
     "seconds": 12.0,
     "stages": [],
@@ -121,7 +121,7 @@ def test_pinholes_are_those_of_the_run(reconstruction):
 def test_a_prediction_comes_with_its_light(reconstruction):
     light = ViewLights(
         direction_world=torch.tensor([[0.0, 0.6, 0.8]]),
-        closeness=torch.tensor([0.25]),
+        inverse_distance=torch.tensor([0.25]),
         ambient=torch.tensor([[0.1]]),
         directed=torch.tensor([[0.5]]),
     )
@@ -137,7 +137,7 @@ def test_a_prediction_comes_with_its_light(reconstruction):
     assert "psnr_db" not in third
     assert second["environment"] == pytest.approx([0.2, 0.1, 0.0, 0.3])
     assert second["psnr_db"] == 30.0
-    assert second["light"]["closeness"] == 0.25
+    assert second["light"]["inverse_distance"] == 0.25
     assert second["light"]["directed"] == pytest.approx([0.5] * 3)
     assert second["light"]["direction"] == pytest.approx([0.0, 0.6, 0.8])
     picture = decoded(second["prediction"])
@@ -148,16 +148,16 @@ def test_predictions_are_of_every_photograph(reconstruction):
     scene, mesh = reconstruction.scene, reconstruction.mesh
     lights = ViewLights(
         direction_world=torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3),
-        closeness=torch.zeros(3),
+        inverse_distance=torch.zeros(3),
         ambient=torch.tensor([[0.1], [0.2], [0.4]]),
         directed=torch.zeros(3, 1),
     )
     materials = Materials.of(torch.zeros(len(mesh.vertices_world)).long(), torch.tensor([MATTE]))
-    worth = Judged(
+    worth = ViewErrors(
         psnr_db=torch.tensor([30.04, torch.nan]), lights=lights, names=scene.views.names[:2]
     )
     relighting = Relighting(
-        lights=lights, materials=materials, judged=worth, matte=worth, held_out=False
+        lights=lights, materials=materials, errors=worth, matte=worth, held_out=False
     )
     found = predictions(mesh, scene, relighting)
     assert found[0].psnr_db == pytest.approx(30.04)

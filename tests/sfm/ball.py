@@ -8,7 +8,7 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.records import Cameras, Lens, Views
+from pimper_torch.records import CameraModel, Cameras, Views
 
 WIDTH, HEIGHT, FOCAL = 480, 360, 840.0
 
@@ -90,5 +90,5 @@ def model_of(
     seen = torch.rand(len(points), cameras.num_views, generator=generator) < fraction
     seen[:, :2] = True
     params = (FOCAL, WIDTH / 2, HEIGHT / 2, 0.0)
-    lens = Lens(camera=1, model="SIMPLE_RADIAL", params=params, width=WIDTH, height=HEIGHT)
+    lens = CameraModel(camera=1, model="SIMPLE_RADIAL", params=params, width=WIDTH, height=HEIGHT)
     return observed(cameras, points, seen, lens=lens, noise_px=noise_px, generator=generator)

@@ -101,6 +101,6 @@ def turntable(
     """
     cameras = orbit(count, span_deg, elevation_deg)
     ball = seen_of_ball(generator, turning, cameras)
-    room = torch.rand(resting, 2, generator=generator, dtype=torch.float64)
-    room = room * room.new_tensor([WIDTH, HEIGHT])
-    return Captured(generator, torch.cat([ball, room.expand(count, -1, -1)], dim=1))
+    detected = torch.rand(resting, 2, generator=generator, dtype=torch.float64)
+    detected = detected * detected.new_tensor([WIDTH, HEIGHT])
+    return Captured(generator, torch.cat([ball, detected.expand(count, -1, -1)], dim=1))

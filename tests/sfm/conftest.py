@@ -6,7 +6,7 @@ from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.sparse_scene import assemble_scene
-from pimper_torch.records import Lens, SparseScene, Views
+from pimper_torch.records import CameraModel, SparseScene, Views
 
 
 @pytest.fixture
@@ -15,16 +15,16 @@ def generator() -> torch.Generator:
 
 
 @pytest.fixture
-def lens() -> Lens:
-    return Lens(
+def lens() -> CameraModel:
+    return CameraModel(
         camera=3, model="SIMPLE_RADIAL", params=(90.0, 41.0, 29.0, 0.08), width=80, height=60
     )
 
 
 @pytest.fixture
-def model(generator: torch.Generator, lens: Lens) -> SparseModel:
+def model(generator: torch.Generator, lens: CameraModel) -> SparseModel:
     """Five cameras of two kinds before a box of points, every point seen by most views."""
-    other = Lens(
+    other = CameraModel(
         camera=7,
         model="OPENCV",
         params=(85.0, 88.0, 40.5, 30.5, -0.05, 0.01, 1e-3, -2e-3),

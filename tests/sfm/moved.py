@@ -27,12 +27,12 @@ def bodies(generator, num_object=60, num_table=90):
     return own, table
 
 
-def photographed(series, generator, **counts):
+def photographed(sessions, generator, **counts):
     """Give pixels of all points in every view: the object's first, turned over in series 1."""
     own, table = bodies(generator, **counts)
     over = transform(upside_down(own), own)
-    cameras = poses(len(series) // 2).repeat(2, 1, 1) if 1 in series else poses(len(series))
-    placed = [torch.cat([over if one else own, table]) for one in series]
+    cameras = poses(len(sessions) // 2).repeat(2, 1, 1) if 1 in sessions else poses(len(sessions))
+    placed = [torch.cat([over if one else own, table]) for one in sessions]
     return [
         project(points, camera, K)[0] for points, camera in zip(placed, cameras, strict=True)
     ], len(own)

@@ -5,7 +5,7 @@ import torch
 
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.rigid import rigid, transform
-from pimper_torch.method.sfm.doubt import agreement, judged
+from pimper_torch.method.sfm.diagnose import agreement, verify_model
 from pimper_torch.method.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.method.sfm.model import select_views
 from tests.sfm import ball
@@ -48,7 +48,7 @@ def rotated(model, view, angle=0.6):
 def test_a_view_put_elsewhere_is_told_from_its_neighbours(generator):
     model, points = scene(generator)
     pairs = pairs_of(model, points)
-    found = judged(rotated(model, 3), model.names, pairs, 4.0).misplaced
+    found = verify_model(rotated(model, 3), model.names, pairs, 4.0).misplaced
     judges = [agreement(rotated(model, 3), pair, 4.0) for pair in pairs if 3 in pair.views]
     assert found.keys() == {"3.png"}
     assert min(judges) <= found["3.png"] <= max(judges) < 0.5
@@ -58,18 +58,18 @@ def test_matches_are_explained_by_fraction_those_of_missing_photographs_not_at_a
     model, points = scene(generator)
     pairs = pairs_of(model, points)
     counts = torch.tensor([pair.num_matches for pair in pairs]).double()
-    right = judged(model, model.names, pairs, 0.01)  # through a lens that bends
-    assert right.explained == 1
+    right = verify_model(model, model.names, pairs, 0.01)  # through a lens that bends
+    assert right.inlier_ratio == 1
     assert right.misplaced == {}
     wrong = rotated(model, 3)
     fractions = torch.tensor([agreement(wrong, pair, 4.0) for pair in pairs]).double()
-    explained = judged(wrong, model.names, pairs, 4.0).explained
-    assert explained == pytest.approx(float((counts * fractions).sum() / counts.sum()))
+    inlier_ratio = verify_model(wrong, model.names, pairs, 4.0).inlier_ratio
+    assert inlier_ratio == pytest.approx(float((counts * fractions).sum() / counts.sum()))
     views = [0, 1, 2, *range(4, model.num_views)]
     there = torch.tensor([3 not in pair.views for pair in pairs])
-    explained = judged(select_views(model, views), model.names, pairs, 0.01).explained
-    assert explained == pytest.approx(float(counts[there].sum() / counts.sum()))
-    assert judged(model, model.names, [], 4.0).explained == 0
+    inlier_ratio = verify_model(select_views(model, views), model.names, pairs, 0.01).inlier_ratio
+    assert inlier_ratio == pytest.approx(float(counts[there].sum() / counts.sum()))
+    assert verify_model(model, model.names, [], 4.0).inlier_ratio == 0
 
 
 def test_pairs_with_few_matches_do_not_judge(generator):
@@ -79,7 +79,7 @@ def test_pairs_with_few_matches_do_not_judge(generator):
         for pair in pairs_of(model, points, {(0, 4): 20, (0, 5): 20})
     ]
     assert agreement(model, pairs[4], 4.0) < 0.5
-    assert judged(model, model.names, pairs, 4.0).misplaced == {}
+    assert verify_model(model, model.names, pairs, 4.0).misplaced == {}
 
 
 def test_photographs_that_the_model_lacks_do_not_judge(generator):
@@ -90,5 +90,7 @@ def test_photographs_that_the_model_lacks_do_not_judge(generator):
         for pair in pairs_of(model, points)
     ]
     stray = pairs[0].replace(views=(0, 1), first=pairs[0].first.flip(0))
-    assert judged(model, files, [stray, *pairs], 4.0).misplaced == {}
-    assert judged(rotated(model, 5), files, [stray, *pairs], 4.0).misplaced.keys() == {"5.png"}
+    assert verify_model(model, files, [stray, *pairs], 4.0).misplaced == {}
+    assert verify_model(rotated(model, 5), files, [stray, *pairs], 4.0).misplaced.keys() == {
+        "5.png"
+    }

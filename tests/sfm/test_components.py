@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.method.sfm.doubt import choose_component, count_spread_views
+from pimper_torch.method.sfm.diagnose import choose_component, count_spread_views
 from pimper_torch.runtime.errors import ReconstructionError
 
 NAMES = tuple(f"{index:02d}.jpg" for index in range(20))

@@ -3,7 +3,7 @@ import torch
 
 from pimper_torch.ground.geometry.colmap_library import loaded
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.method.sfm.static_background import leave_out_room
+from pimper_torch.method.sfm.static_background import remove_static_features
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
 
 SETTINGS = ReconstructConfig(threads=1)
@@ -64,8 +64,8 @@ def test_pairs_that_were_verified_on_the_room_are_verified_on_what_turns(tmp_pat
         on_room += int((scene.thing[pair[0]][verified[:, 0]] >= 250).double().mean() > 0.9)
     assert on_room == len(scene.pairs)
     former = [scene.thing, scene.keypoints]
-    rest = leave_out_room(path, SETTINGS)
-    assert rest.room
+    rest = remove_static_features(path, SETTINGS)
+    assert rest.detected
     assert all(torch.equal(one, torch.eye(3).double()) for one in rest.maps)
     scene.thing, scene.keypoints = (
         [values[~resting] for values, resting in zip(all_of, rest.features, strict=True)]
@@ -79,8 +79,8 @@ def test_pairs_that_were_verified_on_the_room_are_verified_on_what_turns(tmp_pat
             assert np.array_equal(signs, (thing // 4).numpy())
     for pair, (matches, verified) in zip(scene.pairs, read(path, scene), strict=True):
         for rows in (matches, verified):
-            room = scene.thing[pair[0]][rows[:, 0]] >= 250
-            assert not (room & scene.right(pair, rows)).any()
+            detected = scene.thing[pair[0]][rows[:, 0]] >= 250
+            assert not (detected & scene.right(pair, rows)).any()
         assert len(verified) >= 15
         assert scene.right(pair, verified).double().mean() > 0.95
 
@@ -89,8 +89,8 @@ def test_a_rigid_scene_keeps_all_its_matches(tmp_path, generator):
     scene = Captured(generator, seen_of_ball(generator, 300, orbit(5, 100.0)))
     path = stored(scene, tmp_path / "database.db")
     before = read(path, scene)
-    rest = leave_out_room(path, SETTINGS)
-    assert not rest.room
+    rest = remove_static_features(path, SETTINGS)
+    assert not rest.detected
     assert not rest.maps
     assert not any(resting.any() for resting in rest.features)
     for one, other in zip(before, read(path, scene), strict=True):

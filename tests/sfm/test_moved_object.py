@@ -6,7 +6,7 @@ from pimper_torch.method.sfm.moved_object import (
     clusters,
     find_moved_object,
     object_votes,
-    series_of,
+    sessions_of,
 )
 from tests.sfm.moved import photographed
 
@@ -14,23 +14,23 @@ SIZE = torch.tensor([320.0, 240.0])
 SERIES = (0,) * 6 + (1,) * 6
 
 
-def matched(series, num_object, num_points, same_side=2):
+def matched(sessions, num_object, num_points, same_side=2):
     """Match every feature between neighbours; between series the table is the larger body."""
     every = torch.arange(num_points)[:, None].repeat(1, 2)
     own, table = every[:num_object], every[num_object:]
     verified, outside = {}, {}
-    half = len(series) // 2
-    for first, second in combinations(range(len(series)), 2):
+    half = len(sessions) // 2
+    for first, second in combinations(range(len(sessions)), 2):
         apart = abs(first % half - second % half)
         if min(apart, half - apart) < same_side:
-            one = series[first] == series[second]
+            one = sessions[first] == sessions[second]
             verified[first, second] = every if one else table
             outside[first, second] = every[:0] if one else own
     return verified, outside
 
 
-def found(series, keypoints, num_object):
-    return found_in(keypoints, *matched(series, num_object, len(keypoints[0])))
+def found(sessions, keypoints, num_object):
+    return found_in(keypoints, *matched(sessions, num_object, len(keypoints[0])))
 
 
 def found_in(keypoints, verified, outside):
@@ -47,8 +47,8 @@ def found_in(keypoints, verified, outside):
 def test_series_are_told_apart_and_tied_by_the_object_alone(generator):
     keypoints, num_object = photographed(SERIES, generator)
     moved = found(SERIES, keypoints, num_object)
-    assert moved.series.any()
-    assert tuple(moved.series.tolist()) == SERIES
+    assert moved.sessions.any()
+    assert tuple(moved.sessions.tolist()) == SERIES
     pairs, _ = matched(SERIES, num_object, len(keypoints[0]))
     between = {pair for pair in pairs if SERIES[pair[0]] != SERIES[pair[1]]}
     assert set(moved.tying) == between
@@ -62,21 +62,21 @@ def test_the_object_is_the_body_in_the_middle_though_it_shows_more_features(gene
         if SERIES[pair[0]] != SERIES[pair[1]]:  # the first geometry is that of most matches
             verified[pair], outside[pair] = outside[pair], verified[pair]
     moved = found_in(keypoints, verified, outside)
-    assert tuple(moved.series.tolist()) == SERIES
+    assert tuple(moved.sessions.tolist()) == SERIES
     assert all(int(rows.max()) < num_object for rows in moved.tying.values())
 
 
 def test_a_rigid_scene_is_one_series_though_a_second_geometry_fits_what_the_first_leaves(generator):
     keypoints, num_object = photographed((0,) * 12, generator)
     moved = found(SERIES, keypoints, num_object)  # matched as if there were two
-    assert not moved.series.any()
+    assert not moved.sessions.any()
     assert not moved.tying
     assert not moved.dropped
 
 
 def test_few_pairs_of_two_bodies_are_no_evidence(generator):
     keypoints, _ = photographed(SERIES, generator)
-    assert not found(SERIES, keypoints, 29).series.any()  # fewer than a second body needs
+    assert not found(SERIES, keypoints, 29).sessions.any()  # fewer than a second body needs
 
 
 def test_a_pair_that_shows_the_table_alone_does_not_tie_series(generator):
@@ -98,7 +98,7 @@ def test_features_learn_from_their_matches_which_body_they_are_of(generator):
     assert all(bool((one[:num_object] > 0).all()) for one in votes)
     assert all(bool((one[num_object:] < 0).all()) for one in votes)
     # Views 3 to 5 and 9 to 11 show no pair of two bodies, and are joined by their neighbours.
-    assert tuple(series_of(12, verified, seconds, votes).tolist()) == SERIES
+    assert tuple(sessions_of(12, verified, seconds, votes).tolist()) == SERIES
 
 
 def test_clusters_leave_a_view_that_more_repels_than_attracts():

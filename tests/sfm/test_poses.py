@@ -10,11 +10,11 @@ from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.poses import (
     equal_poses,
     of_photographs,
-    one_view_a_pose,
+    one_view_per_pose,
     pictures_of_poses,
     with_poses,
 )
-from pimper_torch.records import Lens, SilhouettePrior
+from pimper_torch.records import CameraModel, SilhouettePrior
 from pimper_torch.runtime.errors import InputError
 
 POSES = (0, 1, 0, 2, 1, 0)
@@ -51,7 +51,7 @@ def test_photographs_of_unlike_sizes_are_not_one_pose(views):
 
 
 def test_cameras_and_observations_of_a_picture_are_those_of_all_photographs_of_its_pose(views):
-    lens = Lens(camera=1, model="PINHOLE", params=(90.0, 90.0, 6.0, 4.0), width=12, height=8)
+    lens = CameraModel(camera=1, model="PINHOLE", params=(90.0, 90.0, 6.0, 4.0), width=12, height=8)
     model = SparseModel(
         names=("d", "a"),  # pose 1 is not registered
         lenses=(lens, lens.replace(camera=2)),
@@ -60,13 +60,13 @@ def test_cameras_and_observations_of_a_picture_are_those_of_all_photographs_of_i
         observation_point=torch.tensor([0, 0, 1]),
         observation_view=torch.tensor([0, 1, 1]),
         observation_pixels=torch.tensor([[1.0, 1], [2, 2], [3, 3]]).double(),
-        series=torch.tensor([7, 8]),
+        sessions=torch.tensor([7, 8]),
     )
     every = of_photographs(model, views)
     assert every.names == ("a", "c", "d", "f")
     assert every.cam_from_world[:, 0, 0].tolist() == [1, 1, 3, 1]
     assert [one.camera for one in every.lenses] == [2, 2, 1, 2]
-    assert every.series.tolist() == [8, 8, 7, 8]
+    assert every.sessions.tolist() == [8, 8, 7, 8]
     assert every.observation_point.tolist() == [0, 0, 0, 0, 1, 1, 1]
     assert every.observation_view.tolist() == [0, 1, 2, 3, 0, 1, 3]
     assert every.observation_pixels[:, 0].tolist() == [2, 2, 1, 2, 3, 3, 3]
@@ -99,18 +99,18 @@ def test_one_photograph_stands_for_its_pose_with_what_all_of_it_observe(reconstr
     assert with_poses(scene) is scene
     posed = with_poses(four)
     assert posed.views.poses.tolist() == [0, 1, 2, 1]
-    few = one_view_a_pose(posed)
+    few = one_view_per_pose(posed)
     assert few.chosen.tolist() == [0, 2, 3]  # the darker one has less texture
     assert few.of.tolist() == [0, 2, 1, 2]
     assert few.scene.views.names == ("a.png", "c.png", "d.png")
     assert few.scene.unregistered == scene.unregistered
     assert torch.equal(few.scene.observed, scene.observed[:, [0, 2, 1]])
-    named = one_view_a_pose(posed, ("b",))
+    named = one_view_per_pose(posed, ("b",))
     assert named.scene.views.names == ("a.png", "b.png", "c.png")
     assert torch.equal(named.scene.observed, scene.observed)
     order = torch.argsort(3 * scene.observation_point + scene.observation_view)
     assert_close(named.scene.observation_pixels, scene.observation_pixels[order])
-    assert one_view_a_pose(scene).scene is scene
+    assert one_view_per_pose(scene).scene is scene
 
 
 def test_silhouettes_of_any_photograph_of_a_pose_are_those_of_the_one_that_is_kept(reconstruction):
@@ -130,7 +130,7 @@ def test_silhouettes_of_any_photograph_of_a_pose_are_those_of_the_one_that_is_ke
     )
 
     def kept(*needed):
-        (found,) = one_view_a_pose(five, needed).scene.views.priors
+        (found,) = one_view_per_pose(five, needed).scene.views.priors
         return dict(zip(found.names, (4 * found.inside[:, 0, 0]).int().tolist(), strict=True))
 
     assert kept("d") == {"d.png": 0, "c.png": 1}  # that of the first photograph with one

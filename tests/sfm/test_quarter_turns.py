@@ -6,7 +6,7 @@ from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.method.sfm.lenses import turned_lens, turned_pixels, turned_pose
 from pimper_torch.method.sfm.model_files import camera_models
-from pimper_torch.records import Lens
+from pimper_torch.records import CameraModel
 
 COUNTS = dict(camera_models().values())
 
@@ -20,7 +20,7 @@ def test_a_turned_camera_images_as_the_picture_is_turned(model, quarters, genera
     rest = 0.01 * (1 + torch.rand(count - len(start), generator=generator, dtype=torch.float64))
     if model == "EUCM":
         rest = torch.tensor([0.6, 1.1])
-    lens = Lens(camera=3, model=model, params=(*start, *rest.tolist()), width=80, height=60)
+    lens = CameraModel(camera=3, model=model, params=(*start, *rest.tolist()), width=80, height=60)
     points = torch.rand(50, 3, generator=generator, dtype=torch.float64) - 0.5
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.1, -0.2, 2.0])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pimper_torch.method.sfm import registration
-from pimper_torch.method.sfm.doubt import Judgement, count_views_with_depth
+from pimper_torch.method.sfm.diagnose import MatchConsistency, count_views_with_depth
 from pimper_torch.method.sfm.features import Workspace
 from pimper_torch.method.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.method.sfm.model import select_views
@@ -17,7 +17,7 @@ from pimper_torch.runtime.errors import PimperWarning
 
 SETTINGS = ReconstructConfig(guided_pairs=1, starts=2, seed=5, threads=1)
 
-RIGID = StaticBackground(features=(), still_fraction=0.0, moving_pairs=0, violating_fraction=0.0)
+RIGID = StaticBackground(features=(), static_fraction=0.0, moving_pairs=0, violating_fraction=0.0)
 ROOM = RIGID.replace(features=5 * (torch.tensor([True, False]),), violating_fraction=0.5)
 
 NOTHING = torch.zeros(3, 2).double()
@@ -27,9 +27,9 @@ MOVED = (VerifiedPair(views=(0, 1), first=NOTHING, second=NOTHING),)
 class Told:
     """What matcher and mapper are told; what the mapper and the judge answer, run by run."""
 
-    def __init__(self, models, misplaced=(), explained=()):
+    def __init__(self, models, misplaced=(), inlier_ratio=()):
         self.models, self.misplaced = list(models), list(misplaced)
-        self.explained, self.asked = list(explained), []
+        self.inlier_ratio, self.asked = list(inlier_ratio), []
         self.matched, self.mapped, self.databases = [], [], []
 
     def match(self, space, pairs, settings):
@@ -44,8 +44,8 @@ class Told:
         return [self.models.pop(0)]
 
     def judge(self, model, files, pairs, max_error_px):
-        return Judgement(
-            explained=self.explained.pop(0) if self.explained else 1.0,
+        return MatchConsistency(
+            inlier_ratio=self.inlier_ratio.pop(0) if self.inlier_ratio else 1.0,
             misplaced=self.misplaced.pop(0) if self.misplaced else {},
         )
 
@@ -54,8 +54,8 @@ class Told:
 def told(model, monkeypatch):
     """Five photographs whose neighbours share most matches."""
 
-    def tell(numbers, misplaced=(), explained=(), rest=RIGID, around=()):
-        answers = Told([select_views(model, some) for some in numbers], misplaced, explained)
+    def note(numbers, misplaced=(), inlier_ratio=(), rest=RIGID, around=()):
+        answers = Told([select_views(model, some) for some in numbers], misplaced, inlier_ratio)
 
         def leave_out(database, settings):
             answers.asked.append(database.name)
@@ -73,12 +73,12 @@ def told(model, monkeypatch):
         monkeypatch.setattr(registration, "match_guided", answers.guide)
         monkeypatch.setattr(registration, "map_views", answers.map)
         monkeypatch.setattr(registration, "MIN_POINTS", 6)
-        monkeypatch.setattr(registration, "judged", answers.judge)
-        monkeypatch.setattr(registration, "doubt", lambda model, count: "")
+        monkeypatch.setattr(registration, "verify_model", answers.judge)
+        monkeypatch.setattr(registration, "diagnose", lambda model, count: "")
         monkeypatch.setattr(registration, "verified_pairs", lambda space: pairs)
-        monkeypatch.setattr(registration, "leave_out_room", leave_out)
+        monkeypatch.setattr(registration, "remove_static_features", leave_out)
         monkeypatch.setattr(registration, "pairs_to_match", lambda space: all_pairs(5))
-        monkeypatch.setattr(registration, "tie_series", lambda *_: around)
+        monkeypatch.setattr(registration, "link_sessions", lambda *_: around)
         monkeypatch.setattr(
             registration,
             "count_views_with_depth",
@@ -86,7 +86,7 @@ def told(model, monkeypatch):
         )
         return answers
 
-    return tell
+    return note
 
 
 @pytest.fixture
@@ -146,7 +146,7 @@ def test_a_model_whose_views_all_see_too_few_points_is_none(told, space, monkeyp
 
 
 def test_a_plain_model_that_explains_the_matches_is_taken_before_a_room_is_looked_for(told, space):
-    answers = told([EVERY], explained=[0.95], rest=ROOM, around=MOVED)
+    answers = told([EVERY], inlier_ratio=[0.95], rest=ROOM, around=MOVED)
     found = register(space, SETTINGS)
     assert answers.asked == []
     assert not found.background
@@ -154,17 +154,17 @@ def test_a_plain_model_that_explains_the_matches_is_taken_before_a_room_is_looke
 
 
 def test_another_explanation_is_taken_where_it_explains_clearly_more(told, space):
-    answers = told([EVERY, EVERY], explained=[0.7, 0.98], around=MOVED)
+    answers = told([EVERY, EVERY], inlier_ratio=[0.7, 0.98], around=MOVED)
     assert register(space, SETTINGS).around == MOVED
     assert answers.databases == ["database.db", "other.db"]
     assert (space.folder / "other.db").read_bytes() == b"features and matches"
-    told([EVERY, EVERY], explained=[0.85, 0.94], around=MOVED)
+    told([EVERY, EVERY], inlier_ratio=[0.85, 0.94], around=MOVED)
     assert register(space, SETTINGS).around == ()
 
 
 def test_an_explanation_that_loses_photographs_does_not_beat_the_plain_one(told, space):
     some = [EVERY, *4 * [[0, 1, 2]]]
-    told(some, explained=[0.7, *4 * [0.5]], around=MOVED)
+    told(some, inlier_ratio=[0.7, *4 * [0.5]], around=MOVED)
     found = register(space, SETTINGS)
     assert not found.missing
     assert found.around == ()
@@ -173,11 +173,11 @@ def test_an_explanation_that_loses_photographs_does_not_beat_the_plain_one(told,
 def test_a_room_is_left_out_where_the_plain_model_is_doubtful(told, space, monkeypatch):
     told([EVERY, EVERY], rest=ROOM)
     doubts = ["follows a camera in its place", ""]
-    monkeypatch.setattr(registration, "doubt", lambda model, count: doubts.pop(0))
+    monkeypatch.setattr(registration, "diagnose", lambda model, count: doubts.pop(0))
     with pytest.warns(PimperWarning, match="5 of 10 features lie still"):
         found = register(space, SETTINGS)
     assert len(found.background) == 5
-    assert found.explained == 1
+    assert found.inlier_ratio == 1
 
 
 def test_of_many_photographs_likely_pairs_are_matched_first(told, space, monkeypatch):

@@ -15,7 +15,7 @@ from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable
 def test_a_room_is_at_rest_and_what_turns_is_not(elevation_deg, fraction, generator):
     scene = turntable(generator, elevation_deg=elevation_deg)
     rest = scene.rest()
-    assert rest.room
+    assert rest.detected
     assert not rest.nothing_moves
     assert rest.moving_pairs >= 12
     assert rest.violating_fraction > fraction
@@ -49,7 +49,7 @@ def test_far_points_that_do_not_move_before_a_camera_that_shifts_belong_to_the_s
     rest = scene.rest()
     assert rest.moving_pairs == 24  # all that are verified first; they end the search
     assert rest.violating_fraction < 0.01
-    assert not rest.room
+    assert not rest.detected
     assert not any(resting.any() for resting in rest.features)
 
 
@@ -62,31 +62,31 @@ def test_a_flat_object_that_hardly_moves_keeps_its_features(generator):
     scene = Captured(generator, pixels)
     rest = scene.rest()
     assert rest.moving_pairs > 10  # of the 24 that are verified first
-    assert rest.still_fraction > 0.05
+    assert rest.static_fraction > 0.05
     assert rest.violating_fraction < 0.01
-    assert not rest.room
+    assert not rest.detected
 
 
 def test_photographs_that_are_there_twice_leave_nothing_out(generator):
     cameras = orbit(6, 90.0)
     once = seen_of_ball(generator, 400, cameras)
     scene = Captured(generator, once.repeat_interleave(3, dim=0))
-    assert scene.rest().still_fraction > 0.1
+    assert scene.rest().static_fraction > 0.1
     rest = scene.rest()
-    assert not rest.room
+    assert not rest.detected
     assert not rest.nothing_moves
     assert not any(resting.any() for resting in rest.features)
 
 
 @pytest.mark.parametrize("shaken", [0, 100])
 def test_where_all_is_at_rest_nothing_moves_though_features_are_found_inexactly(generator, shaken):
-    room = torch.rand(300, 2, generator=generator, dtype=torch.float64) * 400
-    room = room.repeat(5, 1, 1)
+    detected = torch.rand(300, 2, generator=generator, dtype=torch.float64) * 400
+    detected = detected.repeat(5, 1, 1)
     noise = torch.randn(5, shaken, 2, generator=generator, dtype=torch.float64)
-    room[:, :shaken] += 1.2 * noise
-    rest = Captured(generator, room).rest()
+    detected[:, :shaken] += 1.2 * noise
+    rest = Captured(generator, detected).rest()
     assert rest.nothing_moves
-    assert not rest.room
+    assert not rest.detected
     assert rest.moving_pairs == 0
 
 

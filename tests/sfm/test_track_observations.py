@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.track_observations import log_pictures, sight, tangents
+from pimper_torch.method.sfm.track_observations import log_pictures, observe_points, tangents
 from tests.sfm import ball
 
 
@@ -29,7 +29,7 @@ def errors(found, pixels):
 @pytest.mark.parametrize("lit", [False, True], ids=["one light", "another light each"])
 def test_points_are_found_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
     cameras, planes, pixels = scene
-    found = sight(pictures(ball.photographs(cameras, lit=lit, wall=True)), cameras, planes)
+    found = observe_points(pictures(ball.photographs(cameras, lit=lit, wall=True)), cameras, planes)
     assert len(found.point) > 0.85 * 6 * 150
     assert errors(found, pixels).median() < (0.05 if lit else 0.02)
 
@@ -37,8 +37,8 @@ def test_points_are_found_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
 def test_a_part_of_the_points_at_a_time_gives_the_same_bits(scene):
     cameras, planes, _ = scene
     shown = pictures(ball.photographs(cameras, wall=True))
-    at_once = sight(shown, cameras, planes)
-    in_parts = sight(shown, cameras, planes, at_once=64)
+    at_once = observe_points(shown, cameras, planes)
+    in_parts = observe_points(shown, cameras, planes, at_once=64)
     for name in ("point", "view", "pixels"):
         assert torch.equal(getattr(at_once, name), getattr(in_parts, name))
 
@@ -49,13 +49,13 @@ def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
     rotated[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels
     wrong = cameras.replace(cam_from_world=rotated)
     shown = pictures(ball.photographs(cameras, lit=False, wall=True))
-    found = sight(shown, wrong, planes)
+    found = observe_points(shown, wrong, planes)
     mine = (found.view == 3) & (planes.reference[found.point] != 3)
     # The reference's pixel is where the wrong camera has it, so its own points are left out.
     right, _ = project(planes.points_world, cameras.cam_from_world[3], cameras.intrinsics[3])
     assert mine.sum() > 60
     assert (found.pixels[mine] - right[found.point[mine]]).norm(dim=1).median() < 0.05
-    near = sight(shown, wrong, planes, max_shift_px=1.0)
+    near = observe_points(shown, wrong, planes, max_shift_px=1.0)
     assert not ((near.view == 3) & (planes.reference[near.point] != 3)).any()
 
 
@@ -64,7 +64,7 @@ def test_what_stands_before_the_point_is_not_taken_for_it(scene):
     views = ball.photographs(cameras, wall=True)
     images = views.images.clone()
     images[2] = 0.2 * torch.rand(1, ball.HEIGHT, ball.WIDTH).double()
-    found = sight(pictures(views.replace(images=images)), cameras, planes)
+    found = observe_points(pictures(views.replace(images=images)), cameras, planes)
     other = planes.reference[found.point] != 2
     assert not (found.view[other] == 2).any()
 
@@ -80,7 +80,7 @@ def test_patches_that_a_view_does_not_have_are_not_found(scene, how):
     else:
         value = 1.0 if how == "saturated" else torch.nan
         views = views.replace(images=torch.where(left[:, None], value, views.images))
-    found = sight(pictures(views), cameras, planes)
+    found = observe_points(pictures(views), cameras, planes)
     here = found.view == 1
     assert here.any()
     assert (found.pixels[here, 0] > ball.WIDTH / 2 - 8).all()
@@ -91,17 +91,17 @@ def test_without_texture_or_along_a_stripe_nothing_is_found(scene):
     cameras, planes, _ = scene
     views = ball.photographs(cameras, wall=True)
     plain = torch.full_like(views.images, 0.3)
-    assert len(sight(pictures(views.replace(images=plain)), cameras, planes).point) == 0
+    assert len(observe_points(pictures(views.replace(images=plain)), cameras, planes).point) == 0
     stripes = torch.sin(torch.arange(ball.WIDTH) / 2.5).double().expand(ball.HEIGHT, -1)
     noise = torch.rand(plain.shape, generator=torch.Generator().manual_seed(1)).double()
     images = plain + 0.2 * stripes + 0.02 * noise
-    found = sight(pictures(views.replace(images=images)), cameras, planes)
+    found = observe_points(pictures(views.replace(images=images)), cameras, planes)
     assert len(found.point) < 0.05 * 6 * 150
 
 
 def test_sightings_are_sorted_and_the_reference_sees_what_others_found(scene):
     cameras, planes, pixels = scene
-    found = sight(pictures(ball.photographs(cameras, wall=True)), cameras, planes)
+    found = observe_points(pictures(ball.photographs(cameras, wall=True)), cameras, planes)
     key = found.point * 6 + found.view
     assert (key.diff() > 0).all()
     own = found.view == planes.reference[found.point]

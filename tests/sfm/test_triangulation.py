@@ -13,13 +13,13 @@ from pimper_torch.ground.geometry.local_frame import from_local
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.sfm.colmap import observation_errors
-from pimper_torch.method.sfm.epipolar import explained, pinholes_of
+from pimper_torch.method.sfm.epipolar import inliers, pinholes_of
 from pimper_torch.method.sfm.existing import existing_model
 from pimper_torch.method.sfm.matching import VerifiedPair
 from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.method.sfm.triangulation import lacks_points, triangulate
-from pimper_torch.records import Lens, Views
+from pimper_torch.records import CameraModel, Views
 from pimper_torch.runtime.errors import InputError, PimperWarning, ReconstructionError
 from tests.sfm.ball import cameras_on_an_arc, model_of, photographs, points_on_the_ball
 
@@ -41,7 +41,7 @@ def bare(generator) -> SparseModel:
 def small(views, bare) -> tuple[Views, SparseModel]:
     """Four of the photographs, of half the size: features take an eighth of the time."""
     images, (f, x, y, k) = avg_pool2d(views.images, 2), bare.lenses[0].params
-    lens = Lens(
+    lens = CameraModel(
         camera=1, model="SIMPLE_RADIAL", params=(f / 2, x / 2, y / 2, k), width=240, height=180
     )
     half = views.replace(images=images, sizes_px=views.sizes_px // 2)
@@ -74,7 +74,7 @@ def test_the_number_of_threads_changes_no_bit(small):
     assert torch.equal(found[0].observation_pixels, found[1].observation_pixels)
 
 
-def bent(views: Views, lens: Lens) -> Views:
+def bent(views: Views, lens: CameraModel) -> Views:
     """Show what the lens would have taken of what a pinhole of its focal length took."""
     K = pinhole_of(lens)
     pixels = pixel_centers(lens.width, lens.height, like=K)
@@ -153,13 +153,13 @@ def test_a_match_is_explained_on_the_line_and_before_both_cameras(generator):
     cameras = pinholes_of(model)
     pixels = [model.observation_pixels[model.observation_view == view] for view in (0, 1)]
     pair = VerifiedPair(views=(0, 1), first=pixels[0], second=pixels[1])
-    assert bool(explained(cameras, pair, 1e-6).all())
+    assert bool(inliers(cameras, pair, 1e-6).all())
     lifted = pair.replace(second=pair.second + pair.second.new_tensor([0.0, 5.0]))
-    assert not bool(explained(cameras, lifted, 2.0).any())
+    assert not bool(inliers(cameras, lifted, 2.0).any())
     behind = cameras.replace(cam_from_world=axes(-1, -1, -1) @ cameras.cam_from_world)
-    assert not bool(explained(behind, pair, 1e-6).any())
+    assert not bool(inliers(behind, pair, 1e-6).any())
     swapped = pair.replace(views=(1, 0), first=pair.second, second=pair.first)
-    assert bool(explained(cameras, swapped, 1e-6).all())
+    assert bool(inliers(cameras, swapped, 1e-6).all())
 
 
 def test_no_warning_is_left_out_where_settings_leave_tracks_as_features_found_them(small):

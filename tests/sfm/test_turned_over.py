@@ -19,7 +19,7 @@ def test_series_between_which_an_object_was_turned_over_are_registered_on_it_wit
     with pytest.warns(PimperWarning, match="between 2 series of photographs: 12 .*; 12 "):
         found = Reconstruct(ReconstructConfig(threads=1))(views)
     assert found.views.names == scene.names
-    assert found.series.tolist() == [0] * 12 + [1] * 12
+    assert found.sessions.tolist() == [0] * 12 + [1] * 12
     assert center_errors(found, scene).median() < 0.005
     up = torch.tensor([0.0, 1.0, 0.0])
     down = -found.cameras.cam_from_world[:, 1, :3]

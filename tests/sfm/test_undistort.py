@@ -8,12 +8,12 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.method.sfm.model_files import camera_models
 from pimper_torch.method.sfm.undistort import photograph_pixels, pinhole_for, undistort
-from pimper_torch.records import Lens, Views
+from pimper_torch.records import CameraModel, Views
 
 
-def bent(width: int, height: int, strength: float) -> Lens:
+def bent(width: int, height: int, strength: float) -> CameraModel:
     params = (60.0, width / 2 + 1.5, height / 2 - 2.0, strength)
-    return Lens(camera=1, model="SIMPLE_RADIAL", params=params, width=width, height=height)
+    return CameraModel(camera=1, model="SIMPLE_RADIAL", params=params, width=width, height=height)
 
 
 def ramp_views(sizes: list[tuple[int, int]]) -> Views:
@@ -117,7 +117,7 @@ def test_a_lens_and_its_inverse_undo_each_other(model):
         "OPENCV": (60.0, 62.0, 25.0, 20.0, 0.05, -0.01, 1e-3, 2e-3),
         "OPENCV_FISHEYE": (60.0, 62.0, 25.0, 20.0, 0.05, -0.01, 1e-3, 2e-3),
     }[model]
-    lens = Lens(camera=1, model=model, params=params, width=50, height=40)
+    lens = CameraModel(camera=1, model=model, params=params, width=50, height=40)
     pixels = pixel_centers(50, 40, like=torch.zeros(1, dtype=torch.float64)).reshape(-1, 2)
     plane = undistort_pixels(lens, pixels)
     rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
@@ -147,11 +147,13 @@ FISHEYES = ["FISHEYE", *(name for name in COUNTS if name.endswith("_FISHEYE"))]
 STRAIGHT = sorted({*COUNTS} - {*FISHEYES, "EUCM", "EQUIRECTANGULAR"})
 
 
-def without_coefficients(model: str, focal_px: float) -> Lens:
+def without_coefficients(model: str, focal_px: float) -> CameraModel:
     """Give a lens whose coefficients are all zero."""
     focal = (focal_px,) * (1 if model.startswith(("SIMPLE_", "RADIAL")) else 2)
     zeros = (0.0,) * (COUNTS[model] - len(focal) - 2)
-    return Lens(camera=1, model=model, params=(*focal, 25.0, 20.0, *zeros), width=50, height=40)
+    return CameraModel(
+        camera=1, model=model, params=(*focal, 25.0, 20.0, *zeros), width=50, height=40
+    )
 
 
 @pytest.mark.parametrize("model", FISHEYES)

@@ -7,16 +7,18 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.method.sfm.undistort import photograph_pixels, with_undistorted_priors
 from pimper_torch.records import (
     AlbedoPrior,
+    CameraModel,
     DepthPrior,
     InlierPrior,
-    Lens,
     LightPrior,
     NormalPrior,
     SilhouettePrior,
 )
 
 SIZE = 60, 40
-BARREL = Lens(camera=1, model="SIMPLE_RADIAL", params=(90.0, 31.0, 19.0, -0.2), width=60, height=40)
+BARREL = CameraModel(
+    camera=1, model="SIMPLE_RADIAL", params=(90.0, 31.0, 19.0, -0.2), width=60, height=40
+)
 PINCUSHION = BARREL.replace(params=(40.0, 31.0, 19.0, 2.0))  # looks past the edge
 
 

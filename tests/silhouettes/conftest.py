@@ -10,7 +10,7 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.method.silhouettes import cuts
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
-from pimper_torch.records import Cameras, Lens, SparseScene, Views
+from pimper_torch.records import CameraModel, Cameras, SparseScene, Views
 from tests.silhouettes.shapes import all_round
 
 # The ball stands on the plane z = 0.
@@ -96,7 +96,7 @@ def _cloud(views: Views, cameras, generator: torch.Generator) -> SparseScene:
     faces = (normal * rays).sum(-1) < -0.2 * rays.norm(dim=-1) * normal.norm(dim=-1)
     hidden[:, len(table) :] = False
     framed = (pixels > 2).all(-1) & (pixels < torch.tensor([238.0, 178.0])).all(-1)
-    lens = Lens(
+    lens = CameraModel(
         camera=1, model="PINHOLE", params=(300.0, 300.0, 120.0, 90.0), width=240, height=180
     )
     return observed(views, cameras, points, pixels, faces & ~hidden & framed, lens)

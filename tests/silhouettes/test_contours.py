@@ -4,7 +4,7 @@ from functools import partial
 import pytest
 import torch
 
-from pimper_torch.ground.geometry.visual_hull import box_round
+from pimper_torch.ground.geometry.visual_hull import bounding_box
 from pimper_torch.method.silhouettes import trace
 from pimper_torch.method.silhouettes.trace import TraceContours
 from pimper_torch.runtime.errors import PimperWarning
@@ -20,7 +20,7 @@ def coarse_voxels(monkeypatch):
 
 @pytest.mark.parametrize("shape", [ball, two_balls])
 def test_a_box_holds_what_the_silhouettes_show_and_not_much_more(cameras, shape):
-    low, high = box_round(silhouettes_of(shape, cameras), cameras)
+    low, high = bounding_box(silhouettes_of(shape, cameras), cameras)
     assert (low < -1.1).all()
     assert (high > 1.1).all()
     assert (high - low).max() < 2 * 2.4

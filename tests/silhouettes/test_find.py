@@ -11,9 +11,9 @@ from pimper_torch.method.silhouettes.cues import Cues, cues_of
 from pimper_torch.method.silhouettes.cuts import cuts_of
 from pimper_torch.method.silhouettes.find import FindSilhouettes, masked
 from pimper_torch.method.silhouettes.parallax import (
+    background_agreement,
     plane_agreement,
-    room_agreement,
-    room_at_rest,
+    static_background_maps,
     working_pictures,
 )
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
@@ -258,9 +258,9 @@ def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
     images = torch.where(hidden[:, None], other, views.images)
     pictures = working_pictures(views.replace(images=images), cameras, 240)
     plane = Plane(normal_world=torch.tensor([0.0, 0, 1]), offset=torch.tensor(0.0))
-    looked_at = fixation(pictures.cameras.cam_from_world)
-    before = plane_agreement(pictures, plane, looked_at)
-    after = plane_agreement(pictures, plane, looked_at, hidden)
+    seed_at_fixation = fixation(pictures.cameras.cam_from_world)
+    before = plane_agreement(pictures, plane, seed_at_fixation)
+    after = plane_agreement(pictures, plane, seed_at_fixation, hidden)
     centre = (away < 8) & after.isfinite()  # not where the table is flat
     seen, covered = centre & (torch.arange(12) >= 8)[:, None, None], centre & hidden
     assert seen.sum() > 400
@@ -307,7 +307,7 @@ def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator
     pictures = working_pictures(views, cameras, 240)  # half as large
     half = covered[:, ::2, ::2]
     maps[4] = torch.nan
-    found = room_agreement(pictures, maps)
+    found = background_agreement(pictures, maps)
     room = ~torch.nn.functional.max_pool2d(half[:, None].float(), 13, 1, 6)[:, 0].bool()
     known = room & found.isfinite()
     assert found[4].isnan().all()
@@ -315,7 +315,7 @@ def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator
     assert (found[known] > 0.75).float().mean() > 0.95
     inside = half & found.isfinite()
     assert (found[inside] > 0.75).float().mean() < 0.03
-    wrong = room_agreement(pictures, torch.eye(3).repeat(9, 1, 1))
+    wrong = background_agreement(pictures, torch.eye(3).repeat(9, 1, 1))
     assert (wrong[wrong.isfinite()] > 0.75).float().mean() < 0.2
 
 
@@ -324,11 +324,11 @@ def test_a_room_that_shifts_is_found_without_maps_and_none_where_the_camera_move
 ):
     views, maps, covered = before_a_room(generator)
     pictures = working_pictures(views, staged.scene.cameras.take(list(range(9))), 240)
-    found = room_at_rest(pictures, covered[:, ::2, ::2])
+    found = static_background_maps(pictures, covered[:, ::2, ::2])
     shifts = (found[:, :2, 2] - maps[:, :2, 2]).float()
     assert (shifts - shifts[0]).abs().max() <= 2.5  # a pixel of the reduced photographs and a half
     pictures = working_pictures(staged.scene.views, staged.scene.cameras, 240)
-    assert len(room_at_rest(pictures, staged.truth)) == 0
+    assert len(static_background_maps(pictures, staged.truth)) == 0
 
 
 def test_the_region_keeps_what_is_outside_from_being_the_object(staged):

@@ -14,7 +14,7 @@ from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.silhouettes.given import AS_THEY_ARE, Reading, right_reading
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
-from pimper_torch.records import Lens, SilhouettePrior, Views
+from pimper_torch.records import CameraModel, SilhouettePrior, Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from pimper_torch.runtime.stage import Stage
 from tests.silhouettes.shapes import FOCAL, HEIGHT, WIDTH, all_round, silhouettes_of
@@ -56,7 +56,7 @@ def scene(truth):
     # A ball may hide another one's points, which are inside all the same.
     seen = framed & torch.where(on_ball, faces & inside, ~inside)
     middle = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
-    lens = Lens(camera=1, model="PINHOLE", params=middle, width=WIDTH, height=HEIGHT)
+    lens = CameraModel(camera=1, model="PINHOLE", params=middle, width=WIDTH, height=HEIGHT)
     views = Views(
         images=torch.full((VIEWS, 3, HEIGHT, WIDTH), 0.2),
         sizes_px=torch.tensor([[WIDTH, HEIGHT]] * VIEWS),

@@ -14,11 +14,11 @@ from pimper_torch.method.silhouettes.cuts import (
     exposed_fraction,
     filled,
     held_fraction,
-    in_front,
     labels_from_hull,
     labels_from_points,
     not_seen_through,
-    off_plane,
+    occluder_mask,
+    off_plane_mask,
 )
 
 WIDTH, HEIGHT = 320, 240
@@ -89,22 +89,22 @@ def test_deep_inside_the_hull_parallax_is_enough_and_far_beyond_it_nothing_is(th
 
 def test_what_does_not_show_the_plane_is_off_it_and_grains_are_not(thing):
     grain = square(20, 20, 22, 22)
-    found = off_plane(agreeing(thing | grain))
+    found = off_plane_mask(agreeing(thing | grain))
     assert found[130, 150]
     assert not found[20:22, 20:22].any()
-    assert not off_plane(torch.full((HEIGHT, WIDTH), torch.nan)).any()
+    assert not off_plane_mask(torch.full((HEIGHT, WIDTH), torch.nan)).any()
 
 
 def test_what_is_wide_and_off_the_plane_but_not_the_object_stands_before_it(thing):
     person, halo = square(200, 40, 240, 240), square(95, 75, 205, 185)
     agreement = agreeing(thing | person | halo)
     agreement[100:140, 210:214] = 0.9  # a grain
-    found = in_front(thing, agreement)
+    found = occluder_mask(thing, agreement)
     assert found[60:230, 205:235].all()
     assert not (found & thing).any()
     assert not found[:, :195].any()
-    assert not in_front(thing, agreeing(thing | halo)).any()
-    assert not in_front(thing, torch.full((HEIGHT, WIDTH), torch.nan)).any()
+    assert not occluder_mask(thing, agreeing(thing | halo)).any()
+    assert not occluder_mask(thing, torch.full((HEIGHT, WIDTH), torch.nan)).any()
 
 
 @pytest.mark.parametrize("seen_through", [False, True])

@@ -4,7 +4,7 @@ from scenes import observing
 from torch.nn.functional import interpolate
 
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
-from pimper_torch.method.silhouettes.cues import pointed_at, soft_masks_of
+from pimper_torch.method.silhouettes.cues import keep_seeded_components, soft_masks_of
 from pimper_torch.method.silhouettes.find import FindSilhouettes
 from pimper_torch.records import SilhouettePrior
 from pimper_torch.runtime.errors import InputError, PimperWarning
@@ -129,9 +129,9 @@ def test_the_component_that_a_click_meets_first_is_kept():
     view = int((silhouettes_of(ball(0), cameras).masks & alone).sum(dim=(1, 2)).argmin())
     seeds = [torch.zeros(0, 2)] * cameras.num_views
     seeds[view] = torch.tensor([[0.5, 0.5]])
-    assert pointed_at(hull, cameras, seeds) is hull  # it meets nothing
+    assert keep_seeded_components(hull, cameras, seeds) is hull  # it meets nothing
     seeds[view] = alone[view].nonzero().float().mean(dim=0).flip(0)[None] + 0.5
-    kept = pointed_at(hull, cameras, seeds)
+    kept = keep_seeded_components(hull, cameras, seeds)
     assert kept.holds(places).tolist() == [False, True]
     inside = kept.occupied
     assert torch.equal(kept.distance[inside], hull.distance[inside])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pimper_torch.records import Cameras, Record, StageReport
 from pimper_torch.runtime.errors import OutputError
-from pimper_torch.runtime.store import Store, digest, opened, settled
+from pimper_torch.runtime.store import Store, digest, opened, realigned
 from pimper_torch.runtime.user_cache import user_cache
 
 
@@ -114,16 +114,16 @@ def test_what_asks_for_gradients_is_not_kept(record, tmp_path):
     assert files(tmp_path) == []
 
 
-def test_settled_tensors_have_one_layout(record):
+def test_realigned_tensors_have_one_layout(record):
     shared = torch.rand(4, 4, 2).permute(2, 0, 1)
     whole = torch.rand(33)[1:].reshape(2, 4, 4)
-    found = settled(record.replace(cam_from_world=shared))
+    found = realigned(record.replace(cam_from_world=shared))
     assert torch.equal(found.cam_from_world, shared)
     assert found.cam_from_world.is_contiguous()
     assert found.intrinsics is record.intrinsics
-    assert settled(record.replace(cam_from_world=whole)).cam_from_world.data_ptr() % 64 == 0
+    assert realigned(record.replace(cam_from_world=whole)).cam_from_world.data_ptr() % 64 == 0
     pair = Pair(one=shared, other=shared)
-    both = settled(pair)
+    both = realigned(pair)
     assert both.one is both.other
 
 

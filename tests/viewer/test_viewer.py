@@ -12,7 +12,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.doors.exchange.result import Result
+from pimper_torch.doors.export.result import Result
 from pimper_torch.ground.geometry.rigid import invert_rigid, transform
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh

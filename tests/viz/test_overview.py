@@ -129,7 +129,7 @@ def test_gradients_do_not_hinder_drawing(reconstruction, tmp_path):
 
 def test_the_headline_counts(reconstruction):
     assert headline(reconstruction) == "3 of 4 photographs, 2 facets, 225 vertices, 2 s"
-    doubted = reconstruction.replace(scene=reconstruction.scene.replace(doubt="All is flat."))
+    doubted = reconstruction.replace(scene=reconstruction.scene.replace(diagnosis="All is flat."))
     assert headline(doubted).startswith("3 of 4 photographs (cameras doubtful), 2 facets")
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 
 from pimper_bench.baselines.missing import MissingProgramError
-from pimper_torch.doors.exchange.colmap_workspace import write_pinholes
-from pimper_torch.doors.exchange.picture_files import write_picture
+from pimper_torch.doors.export.colmap_workspace import write_pinholes
+from pimper_torch.doors.export.picture_files import write_picture
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene

@@ -24,7 +24,7 @@ from pimper_torch.method.chains.chain_config import Config, load_config
 from pimper_torch.method.chains.presets import make_chain
 from pimper_torch.method.sfm.reconstruct import Reconstruct, find_model, placed_scene
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.paper.triangulate import Triangulate
+from pimper_torch.published.triangulate import Triangulate
 from pimper_torch.records import CoarseMesh, Estimate, Record, SparseScene
 from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.errors import ConfigError

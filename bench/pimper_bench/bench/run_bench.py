@@ -41,7 +41,7 @@ from pimper_bench.metrics.in_view import Meeting, ViewFigures, figures_of, meet_
 from pimper_bench.metrics.similarity import transfer
 from pimper_bench.truth import Capture
 from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.doors.outputs.folders import written_whole
+from pimper_torch.doors.result_folder.folders import written_whole
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import PimperError, PimperWarning
 from pimper_torch.runtime.reporting import stage

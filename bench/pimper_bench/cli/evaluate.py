@@ -30,7 +30,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.doors.io.estimates import read_estimate
 from pimper_torch.doors.io.meshes import read_mesh
 from pimper_torch.doors.io.version import installed_version
-from pimper_torch.doors.outputs.files import file_written_whole, prepare_file
+from pimper_torch.doors.result_folder.files import file_written_whole, prepare_file
 from pimper_torch.records import Estimate, Views
 from pimper_torch.result.report.page import HEAD
 from pimper_torch.runtime.config import to_mapping

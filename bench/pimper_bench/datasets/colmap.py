@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.doors.exchange.picture_files import refuse_skew, write_pictures
+from pimper_torch.doors.export.picture_files import refuse_skew, write_pictures
 from pimper_torch.ground.geometry.lens_models import pinhole_lenses
 from pimper_torch.ground.shapes import Points
 from pimper_torch.method.sfm.colmap import write_binary

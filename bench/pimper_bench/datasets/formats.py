@@ -29,7 +29,7 @@ from pimper_torch.doors.io.decode import read_header
 from pimper_torch.doors.io.extras import SUFFIXES
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.method.sfm.model_files import read_model
-from pimper_torch.records import Lens
+from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.numpy_files import read_npy
 
@@ -152,7 +152,7 @@ def _llff_camera(name: str, row: Float[Tensor, "3 5"], root: DataSetPath) -> Pos
         f"{height}, {width}, {focal_px}",
     )
     params = (focal_px, width / 2, height / 2)
-    lens = Lens(
+    lens = CameraModel(
         camera=1, model="SIMPLE_PINHOLE", params=params, width=int(width), height=int(height)
     )
     down, right, back, center = row[:, :4].unbind(dim=1)

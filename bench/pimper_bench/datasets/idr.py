@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.doors.exchange.picture_files import write_mask, write_picture
+from pimper_torch.doors.export.picture_files import write_mask, write_picture
 from pimper_torch.ground.geometry.pixels import indices_from_pixels
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.records import Cameras, Views

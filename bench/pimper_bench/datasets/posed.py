@@ -19,7 +19,7 @@ from pimper_torch.ground.geometry.lens_models import is_pinhole, rescale_lens
 from pimper_torch.ground.radiometry import FROM_FILES, Encoding
 from pimper_torch.method.sfm.existing import resize_fits
 from pimper_torch.method.sfm.undistort import pinhole_for, undistort
-from pimper_torch.records import Cameras, Lens, Views
+from pimper_torch.records import CameraModel, Cameras, Views
 from pimper_torch.runtime.errors import InputError, some
 
 
@@ -119,7 +119,7 @@ def assemble(
     )
 
 
-def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple[Lens, ...]:
+def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple[CameraModel, ...]:
     """Let each lens follow its photograph to the size it was read at."""
     lenses = []
     for one, (width, height) in zip(photographs, views.sizes_px.tolist(), strict=True):
@@ -195,7 +195,7 @@ def _select(
     return chosen
 
 
-def _intrinsics(one: PosedPhotograph, lens: Lens) -> Float[Tensor, "3 3"]:
+def _intrinsics(one: PosedPhotograph, lens: CameraModel) -> Float[Tensor, "3 3"]:
     assert one.skew_px == 0 or is_pinhole(lens), "skew and distortion together are undefined here"
     K = pinhole_for(lens).clone()
     K[0, 1] = one.skew_px * lens.width / one.lens.width

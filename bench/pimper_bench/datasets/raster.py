@@ -10,7 +10,7 @@ from torch import Tensor
 from pimper_torch.doors.io.decode import read_header
 from pimper_torch.doors.io.photographs import read_mask, shrunk_focals, shrunk_size
 from pimper_torch.doors.io.radiance import read_pictures, resized_mask
-from pimper_torch.doors.io.responses import tell_cautions
+from pimper_torch.doors.io.responses import warn_of_responses
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
 from pimper_torch.ground.radiometry import Encoding
 from pimper_torch.records import Views
@@ -38,7 +38,7 @@ def read_photographs(
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
     headers = [read_header(there(path)) for path in paths]
     sizes = [shrunk_size(header, max_size_px) for header in headers]
-    tell_cautions(paths[0].parent, paths, headers, encoding)
+    warn_of_responses(paths[0].parent, paths, headers, encoding)
     images, transparent = read_pictures(paths, headers, sizes, encoding)
     files = [None] * len(paths) if masks is None else masks
     drawn = {path: _read_mask(path) for path in dict.fromkeys(files) if path is not None}

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from pimper_bench.metrics.in_view import angles_deg
 from pimper_bench.metrics.similarity import transfer
-from pimper_torch.doors.exchange.result import read_result
+from pimper_torch.doors.export.result import read_result
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.surfaces import unit_face_normals
 from pimper_torch.records import Mesh

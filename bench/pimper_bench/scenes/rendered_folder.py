@@ -36,7 +36,7 @@ from pimper_bench.scenes.whole_scene import Scene, build_scene
 from pimper_torch.doors.io.decode import write_deep_png
 from pimper_torch.doors.io.meshes import write_ply
 from pimper_torch.doors.io.version import installed_version
-from pimper_torch.doors.outputs.folders import require_apart, written_whole
+from pimper_torch.doors.result_folder.folders import require_apart, written_whole
 from pimper_torch.ground.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.method.sfm.colmap import write_binary
 from pimper_torch.runtime.config import require, to_mapping

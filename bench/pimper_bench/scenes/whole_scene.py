@@ -252,7 +252,7 @@ def _turned_over(
     counts = config.num_views - second, second
     over = upside_down(points)
     rooms = torch.stack([torch.eye(4).to(over), over])
-    series = [
+    sessions = [
         _taken(
             transform(room, points), replace(config, num_views=count, turned_over=False), generator
         )
@@ -260,8 +260,8 @@ def _turned_over(
     ]
     room_from_world = rooms.repeat_interleave(torch.tensor(counts), dim=0)
     world_from_room = invert_rigid(room_from_world)
-    cameras = Cameras.cat([taken[0] for taken in series])
-    lights = [taken[1] for taken in series]
+    cameras = Cameras.cat([taken[0] for taken in sessions])
+    lights = [taken[1] for taken in sessions]
     positions = torch.cat([one.positions_world for one in lights])
     turned = Lights(
         positions_world=transform(world_from_room, positions[:, None])[:, 0],

@@ -17,7 +17,7 @@ from pimper_torch.doors.camera_files.posed_camera import (
     number_lenses,
 )
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
-from pimper_torch.records import Lens
+from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.numpy_files import read_npz
 
@@ -69,7 +69,9 @@ def read_camera_arrays(
     for name, size, K, pose in zip(names, sizes_of(names), intrinsics.tolist(), poses, strict=True):
         if size is not None:
             params = (K[0][0], K[1][1], K[0][2], K[1][2])
-            lens = Lens(camera=1, model="PINHOLE", params=params, width=size[0], height=size[1])
+            lens = CameraModel(
+                camera=1, model="PINHOLE", params=params, width=size[0], height=size[1]
+            )
             cameras.append(PosedCamera(name=name, lens=lens, skew_px=K[0][1], cam_from_world=pose))
     return number_lenses(cameras)
 

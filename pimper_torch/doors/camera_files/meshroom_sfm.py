@@ -11,7 +11,7 @@ from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import Distortion, PosedCamera, polynomial_lens
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
 from pimper_torch.ground.shapes import Pose
-from pimper_torch.records import Lens
+from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import some
 
 KIND = "a Meshroom cameras.sfm"
@@ -82,7 +82,7 @@ def _cam_from_world(entry: Mapping[str, object], name: str, file: DataSetPath) -
 
 def _lens(
     entry: Mapping[str, object], version: tuple[int, ...], camera: int, file: DataSetPath
-) -> Lens:
+) -> CameraModel:
     def value(key: str, count: int = 1, default: object = None) -> Float[Tensor, " value"]:
         return file.numbers(entry.get(key, default), count, f"{key} of an intrinsic")
 
@@ -102,7 +102,9 @@ def _lens(
     center = pixels_from_indices(center if version < (1, 2, 1) else center + size / 2)
     pinhole = (float(focal[0]), float(focal[1]), float(center[0]), float(center[1]))
     model, params = _distortion(entry, file)
-    return Lens(camera=camera, model=model, params=(*pinhole, *params), width=width, height=height)
+    return CameraModel(
+        camera=camera, model=model, params=(*pinhole, *params), width=width, height=height
+    )
 
 
 def _distortion(entry: Mapping[str, object], file: DataSetPath) -> Distortion:

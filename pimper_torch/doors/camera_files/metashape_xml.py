@@ -11,7 +11,7 @@ from torch import Tensor
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import PosedCamera, polynomial_lens
 from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
-from pimper_torch.records import Lens
+from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import InputError, caution, some
 
 KIND = "a Metashape camera XML"
@@ -140,7 +140,7 @@ def _cam_from_world(
     return invert_rigid(world_from_chunk @ rigid(pose[:3, :3], scale * pose[:3, 3]))
 
 
-def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[Lens, float]:
+def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[CameraModel, float]:
     """Translate a sensor's calibration; return the skew, too."""
     label = sensor.get("label") or sensor.get("id")
     given = sensor.findall("calibration")
@@ -178,5 +178,7 @@ def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[
         f"a {kind} camera with {', '.join(told)}; export undistorted photographs with their "
         "cameras, or align anew without the others",
     )
-    lens = Lens(camera=number, model=model, params=(*pinhole, *params), width=width, height=height)
+    lens = CameraModel(
+        camera=number, model=model, params=(*pinhole, *params), width=width, height=height
+    )
     return lens, b2

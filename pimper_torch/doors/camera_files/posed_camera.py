@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.ground.shapes import Pose, Poses
-from pimper_torch.records import Lens, Record
+from pimper_torch.records import CameraModel, Record
 
 Rig = tuple[Float[Tensor, "view 3 3"], Poses]
 """Intrinsics and ``cam_from_world``."""
@@ -33,7 +33,7 @@ class PosedCamera(Record):
 
     name: str
     cam_from_world: Pose
-    lens: Lens
+    lens: CameraModel
     skew_px: float = 0.0
 
 

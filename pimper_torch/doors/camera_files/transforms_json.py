@@ -18,7 +18,7 @@ from pimper_torch.doors.camera_files.posed_camera import (
 )
 from pimper_torch.ground.geometry.rigid import invert_rigid
 from pimper_torch.ground.shapes import Points
-from pimper_torch.records import Lens
+from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import InputError, caution
 
 KIND = "a transforms.json set"
@@ -127,7 +127,7 @@ def _camera(
 
 def _lens(
     frame: Mapping[str, object], name: str, size_px: tuple[int, int], file: DataSetPath
-) -> Lens:
+) -> CameraModel:
     def value(key: str, default: float = 0.0) -> float:
         given = frame.get(key)
         if given is None:
@@ -158,4 +158,4 @@ def _lens(
     file.expect(fisheye or k4 == 0, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
     bent = ("OPENCV_FISHEYE", (k1, k2, k3, k4)) if fisheye else polynomial_lens(k1, k2, p1, p2, k3)
     kind, params = bent
-    return Lens(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)
+    return CameraModel(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)

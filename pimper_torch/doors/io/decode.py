@@ -54,7 +54,7 @@ class Decoded(Record):
     alpha: Map | None
     lossy: bool
     full: int
-    full_told: bool = False
+    full_scale_given: bool = False
     colour: Colour = SILENT
 
     @property
@@ -200,7 +200,7 @@ def decode(path: Path | str) -> Decoded:
         alpha=planes[-1] if has_alpha else None,
         lossy=format_of(path) in ("JPEG", "HEIC"),
         full=int(full),
-        full_told=header.full_told,
+        full_scale_given=header.full_scale_given,
         colour=header.colour,
     )
 

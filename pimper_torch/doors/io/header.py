@@ -81,7 +81,7 @@ class Header(Record):
     channels: int
     deep: bool
     full: int = 255
-    full_told: bool = False
+    full_scale_given: bool = False
     colour: Colour = SILENT
     cautions: tuple[str, ...] = ()
     layout: Layout | None = None

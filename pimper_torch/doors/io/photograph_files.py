@@ -120,7 +120,7 @@ def _refuse_video(entries: Sequence[Path]) -> None:
             )
 
 
-def tell_passed_over(folder: Path | str, read: Sequence[Path | str]) -> None:
+def warn_of_skipped_files(folder: Path | str, read: Sequence[Path | str]) -> None:
     """Warn of what looks like photographs and is not read, kind by kind with its count."""
     folder, paths = Path(folder), [Path(path) for path in read]
     names = {path.relative_to(folder).parts[0] for path in paths}

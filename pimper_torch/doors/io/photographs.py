@@ -16,10 +16,10 @@ from pimper_torch.doors.io.photograph_files import (
     MIN_PHOTOGRAPHS,
     image_name,
     list_images,
-    tell_passed_over,
+    warn_of_skipped_files,
 )
 from pimper_torch.doors.io.radiance import OPAQUE, read_pictures, resized_mask
-from pimper_torch.doors.io.responses import tell_cautions
+from pimper_torch.doors.io.responses import warn_of_responses
 from pimper_torch.ground.radiometry import FROM_FILES, SATURATED, Encoding
 from pimper_torch.ground.shapes import Images, Map, Mask, Masks, PerView
 from pimper_torch.method.silhouettes.given import around_and_inside
@@ -90,9 +90,9 @@ def load_views(
             f"least {MIN_PHOTOGRAPHS} photographs, better 10 or more, each from another viewpoint "
             "under another light."
         )
-    tell_passed_over(Path(folder), paths)
+    warn_of_skipped_files(Path(folder), paths)
     headers = [read_header(path) for path in paths]
-    tell_cautions(Path(folder), paths, headers, encoding)
+    warn_of_responses(Path(folder), paths, headers, encoding)
     names = tuple(image_name(path, folder) for path in paths)
     matched = _match_masks(names, Path(masks)) if masks is not None else None
     sizes = [shrunk_size(header, max_size_px) for header in headers]

@@ -35,7 +35,7 @@ class _Kind(NamedTuple):
     """Files of one kind: their level of full scale, whether it is stated, and their response."""
 
     full: int
-    full_told: bool
+    full_scale_given: bool
     response: Response
 
 
@@ -141,7 +141,7 @@ def _fill(
         of_colours = isinstance(response, Curve) and len(response.radiance) > len(decoded.samples)
         if response is None or (given is None and of_colours):
             response = Srgb()
-        kind = _Kind(decoded.full, decoded.full_told, response)
+        kind = _Kind(decoded.full, decoded.full_scale_given, response)
         black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
         linear = _fitted(response, decoded, paths[index]).linear_from_encoded
         # Black becomes 0; the level of saturation, or more, 1.
@@ -198,7 +198,7 @@ def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
 
 def _low_levels(tallies: Mapping[_Kind, _Tally], whites: _Whites) -> str:
     """Return advice where files of 16 bits may hold 10, 12 or 14, as cameras' sensors do."""
-    deep = [kind for kind in tallies if kind.full == 2**16 - 1 and not kind.full_told]
+    deep = [kind for kind in tallies if kind.full == 2**16 - 1 and not kind.full_scale_given]
     if not deep or any(kind in whites for kind in deep):
         return ""
     highest = max(int(tallies[kind][0].sum(dim=0).nonzero().max()) for kind in deep)

@@ -68,7 +68,7 @@ def read_raw_header(path: Path | str) -> Header:
             channels=1 if gray else 3,
             deep=True,
             full=np.iinfo(np.uint16).max,
-            full_told=True,
+            full_scale_given=True,
             colour=Colour(source=_SOURCE, response=Linear(), srgb_from_file=matrix),
             cautions=(_UNKNOWN_CAMERA,) if unknown else (),
         )

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pimper_torch.doors.io.version import installed_version
 from pimper_torch.ground.geometry.rigid import rotate
-from pimper_torch.paper.seams import by_facet
+from pimper_torch.published.seams import by_facet
 from pimper_torch.records import Failure, Reconstruction, Relighting
 
 # What JSON can hold.
@@ -143,7 +143,8 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "views": scene.views.num_views + len(scene.unregistered),
         "registered": scene.views.num_views,
         "unregistered": list(scene.unregistered),
-        "doubt": scene.doubt or None,
+        "diagnosis": scene.diagnosis or None,
+        "doubt": scene.diagnosis or None,  # its name until 0.9
         "offset_world": list(scene.offset_world),
         "failures": _failures(result.failures),
         "left_out": [asdict(entry) for entry in result.left_out],
@@ -201,11 +202,11 @@ def relighting_report(found: Relighting) -> dict[str, object]:
     vertices = torch.bincount(found.materials.cluster, minlength=len(found.materials.metallic))
     shares = (vertices / vertices.sum()).tolist()
     rows = zip(shares, found.materials.values.tolist(), strict=True)
-    decibels = [one.psnr_db.tolist() for one in (found.judged, found.matte)]
-    judged = zip(found.judged.names, *decibels, strict=True)
+    decibels = [one.psnr_db.tolist() for one in (found.errors, found.matte)]
+    errors = zip(found.errors.names, *decibels, strict=True)
     return {
         "photographs": "held out" if found.held_out else "used",
-        "psnr_db": _mean(found.judged.psnr_db),
+        "psnr_db": _mean(found.errors.psnr_db),
         "psnr_matte_db": _mean(found.matte.psnr_db),
         "psnr_textured_db": None if found.textured is None else _mean(found.textured.psnr_db),
         "views": [
@@ -214,7 +215,7 @@ def relighting_report(found: Relighting) -> dict[str, object]:
                 "psnr_db": _finite(round(with_one, 3)),
                 "psnr_matte_db": _finite(round(without, 3)),
             }
-            for name, with_one, without in judged
+            for name, with_one, without in errors
         ],
         "materials": [
             {"vertices": share, "metallic": metal, "roughness": rough, "specular": specular}

@@ -10,7 +10,7 @@ import torch
 
 from pimper_torch.doors.io.header import Header
 from pimper_torch.ground.radiometry import Curve, Encoding, Gamma, Linear, Response, Srgb
-from pimper_torch.ground.radiometry.colour import disagree, told
+from pimper_torch.ground.radiometry.colour import describe, disagree
 from pimper_torch.ground.radiometry.response import curve_from_table
 from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.numpy_files import read_npy
@@ -113,7 +113,7 @@ def _is_number(cell: str) -> bool:
 CONTRADICTED = "what is given is taken"
 
 
-def tell_cautions(
+def warn_of_responses(
     folder: Path | str, paths: Sequence[Path | str], headers: Sequence[Header], encoding: Encoding
 ) -> None:
     """Warn of what photographs say and is not followed.
@@ -143,8 +143,8 @@ def tell_cautions(
             given = response_of(encoding)
             if encoding.response != "auto" and disagree(given, said.response):
                 sentences.append(
-                    f"the response {told(given)} is given, but {said.source} says "
-                    f"{told(said.response)}; what is given is taken. Leave out "
+                    f"the response {describe(given)} is given, but {said.source} says "
+                    f"{describe(said.response)}; what is given is taken. Leave out "
                     "`photographs.response` to follow the files"
                 )
         for sentence in sentences:

@@ -13,8 +13,8 @@ from pimper_torch.doors.io import reports
 from pimper_torch.doors.io.estimates import mask_path, read_lights
 from pimper_torch.doors.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.doors.io.thumbnails import thumbnails
-from pimper_torch.doors.outputs.folders import written_whole
-from pimper_torch.doors.size.given import MILLIMETRES
+from pimper_torch.doors.result_folder.folders import written_whole
+from pimper_torch.doors.scale.given import MILLIMETRES
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
@@ -86,7 +86,8 @@ def write_result(
     The pictures show what is written, but for the caps of a mesh that shall be watertight: those
     are not measured. Faces of the PLY and the OBJ, and vertices of the GLB, say which they are.
 
-    It is there whole or not at all; see :func:`pimper_torch.doors.outputs.folders.written_whole`.
+    The folder is replaced as a whole, or not at all; see
+    :func:`pimper_torch.doors.result_folder.folders.written_whole`.
 
     Args:
         config: The dataclass of settings that it ran with.

@@ -23,12 +23,12 @@ def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
 
     if fresh and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
-    _tell_order()
+    _warn_of_import_order()
     return pycolmap
 
 
 @cache
-def _tell_order() -> None:
+def _warn_of_import_order() -> None:
     """Warn, once, where a script has loaded pycolmap before Pillow."""
     names = list(sys.modules)  # in the order of loading
     if names.index("pycolmap") < names.index("PIL._imaging"):

@@ -19,7 +19,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.ground.geometry.pixels import pixels_from_indices
 from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.ground.geometry.visual_hull import Everywhere, Hull
+from pimper_torch.ground.geometry.visual_hull import Hull, UnboundedHull
 from pimper_torch.ground.shapes import Map, Points
 from pimper_torch.records import Cameras, ContourPoints, ContourRays, Record, Silhouettes
 from pimper_torch.runtime.parallel import num_workers, side_by_side
@@ -305,7 +305,7 @@ class Contours(Record):
     def none(cls, silhouettes: Silhouettes, cameras: Cameras) -> "Contours":
         """Return contours without rays; the hull holds everything, or what is above planes."""
         like, planes = cameras.cam_from_world, silhouettes.planes_world
-        hull = Everywhere(
+        hull = UnboundedHull(
             origin_world=like.new_zeros(3),
             spacing=like.new_ones(()),
             distance=like.new_full((1, 1, 1), torch.inf),
@@ -317,7 +317,7 @@ class Contours(Record):
     @property
     def confine(self) -> bool:
         """Whether silhouettes give a hull that the object is inside of."""
-        return not isinstance(self.hull, Everywhere)
+        return not isinstance(self.hull, UnboundedHull)
 
     def touching(self, points_world: Points, normals_world: Points) -> ContourPoints:
         """Find where the rays touch a surface; see :func:`.contour_points`."""

@@ -43,13 +43,13 @@ def compare_with_scene(
     # The box around an object is off by less than a tenth of its diagonal.
     if fit.score < 0.1 and not fit.distance < 0.1:
         raise InputError(
-            f"The given mesh is not where the photographs show the object: {fit.told()}. It has to "
-            f"be {frame}: give the model that it belongs to by `--sparse`, or align it first."
+            f"The given mesh is not where the photographs show the object: {fit.message()}. It has "
+            f"to be {frame}: give the model that it belongs to by `--sparse`, or align it first."
         )
     unknown = math.isnan(fit.score) and fit.rays >= 30
     if unknown or fit.distance > 0.02 or fit.score < 0.8 or fit.overlap < 0.8:
         caution(
-            f"The given mesh is off what the photographs show: {fit.told()}. Look whether it is "
+            f"The given mesh is off what the photographs show: {fit.message()}. Look whether it is "
             f"{frame}, and of this object."
         )
     figures = {
@@ -114,7 +114,7 @@ class _Fit(NamedTuple):
         known = [value for value in (self.on_mesh, self.overlap) if not math.isnan(value)]
         return sum(known) / len(known) if known else math.nan
 
-    def told(self) -> str:
+    def message(self) -> str:
         """State how far off the mesh is, in a part of a sentence."""
         parts = [f"rays to {self.hits} of {self.rays} observed points meet it"]
         if not math.isnan(self.on_mesh):

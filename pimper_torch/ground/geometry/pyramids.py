@@ -334,7 +334,7 @@ def _prior_maps(
             if prior.inverse or prior.along != "axis" or prior.gauge != "scene":
                 raise InputError(
                     "a DepthPrior is not in scene units along the camera's axis; needed: "
-                    "`pimper_torch.priors.settled`, which fits it to the cloud."
+                    "`pimper_torch.priors.conventions`, which fits it to the cloud."
                 )
             kind, layers = "depth", prior.depth[:, None]
         layers = torch.where(known[:, None], layers, 0)

@@ -125,8 +125,8 @@ def transferred(
     asked = points.detach().cpu().double().numpy()
     count = min(_BLENDED, len(source.points))
     apart, near = tree.query(asked, k=list(range(1, count + 1)), workers=-1)
-    closeness = 1 / torch.from_numpy(apart).clamp_min(_TOGETHER)
-    fraction = (closeness / closeness.sum(dim=1, keepdim=True)).to(values)
+    inverse_distance = 1 / torch.from_numpy(apart).clamp_min(_TOGETHER)
+    fraction = (inverse_distance / inverse_distance.sum(dim=1, keepdim=True)).to(values)
     return (fraction * values[torch.from_numpy(near).to(values.device)]).sum(dim=1)
 
 

@@ -97,7 +97,7 @@ class Hull(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Everywhere(Hull):
+class UnboundedHull(Hull):
     """The hull of silhouettes that exclude nothing: everything above planes, if there are any.
 
     Points of the planes are as deep inside as all others, and shape the surface with them; surface
@@ -121,7 +121,7 @@ class Everywhere(Hull):
         return (heights > self.offsets.to(points_world)).all(dim=-1)
 
 
-def box_round(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
+def bounding_box(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
     """Return the corners of a box that holds what the silhouettes show.
 
     Its centre is nearest to the rays through the centres of the silhouettes' bounding boxes; from

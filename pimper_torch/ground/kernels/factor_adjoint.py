@@ -50,7 +50,7 @@ class FactorData(NamedTuple):
 
     radiance: Doubles3
     weight: Doubles3
-    anchor: Doubles3
+    prior_mean: Doubles3
     regularization: Doubles2
     prior: Doubles3
 
@@ -60,7 +60,7 @@ class Data(NamedTuple):
 
     radiance: Doubles
     given: Doubles
-    anchor: Doubles
+    prior_mean: Doubles
     regularization: Doubles
     prior: Doubles
     num_scale: int
@@ -125,7 +125,7 @@ def _data(
 ) -> Data:
     shape = len(views), len(samples)
     radiance, given = np.empty(shape), np.empty(shape)
-    anchor, regularization = np.empty((len(views), 4)), np.empty(len(views))
+    prior_mean, regularization = np.empty((len(views), 4)), np.empty(len(views))
     prior = np.empty((10, len(samples)))
     size, count = 0.0, 0.0
     for f in range(len(views)):
@@ -135,13 +135,13 @@ def _data(
             size += abs(radiance[f, k])
             count += given[f, k]
         for i in range(4):
-            anchor[f, i] = problem.anchor[p, views[f], i]
+            prior_mean[f, i] = problem.prior_mean[p, views[f], i]
         regularization[f] = problem.regularization[p, views[f]]
     for i in range(10):
         for k in range(len(samples)):
             prior[i, k] = problem.prior[p, i, samples[k]]
     level = MIN_DEVIATION * size / max(count, 1.0)
-    return Data(radiance, given, anchor, regularization, prior, num_scale, level, loss, scale)
+    return Data(radiance, given, prior_mean, regularization, prior, num_scale, level, loss, scale)
 
 
 @compiled()
@@ -310,7 +310,7 @@ def _descent(
     _coordinates(at, image, drawn)
     on_samples -= drawn
     for f in range(len(lights)):
-        on_lights[f] -= data.regularization[f] * (lights[f] - data.anchor[f])
+        on_lights[f] -= data.regularization[f] * (lights[f] - data.prior_mean[f])
     return np.sum(on_lights**2) + np.sum(on_samples**2)
 
 
@@ -642,8 +642,10 @@ def _pull_back(
                 r * moved + given.weight[p, views[f], samples[k]]
             ) + 0.5 * per_rms * (r * r - rms * rms)
         for i in range(4):
-            found.anchor[p, views[f], i] = data.regularization[f] * on_lights[0, f, i]
-        found.regularization[p, views[f]] = np.sum(on_lights[0, f] * (data.anchor[f] - light[f]))
+            found.prior_mean[p, views[f], i] = data.regularization[f] * on_lights[0, f, i]
+        found.regularization[p, views[f]] = np.sum(
+            on_lights[0, f] * (data.prior_mean[f] - light[f])
+        )
     entry = 0
     for i in range(4):
         for j in range(i, 4):
@@ -678,7 +680,7 @@ def refine(
         for f in range(lights.shape[1]):
             if _is_anchored(problem, p, f):
                 for i in range(4):
-                    lights[p, f, i] = problem.anchor[p, f, i]
+                    lights[p, f, i] = problem.prior_mean[p, f, i]
         views = _views_with_data(problem.weight[p])
         samples, num_scale = samples_that_count(problem.weight[p], stride)
         if len(views) == 0:
@@ -718,7 +720,7 @@ def pull_back(
         for f in range(lights.shape[1]):
             if _is_anchored(problem, p, f):
                 for i in range(4):
-                    found.anchor[p, f, i] = given.lights[p, f, i]
+                    found.prior_mean[p, f, i] = given.lights[p, f, i]
         views = _views_with_data(problem.weight[p])
         samples, num_scale = samples_that_count(problem.weight[p], stride)
         if len(views) == 0:

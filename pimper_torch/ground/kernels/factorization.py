@@ -48,7 +48,7 @@ class ConeProblem(NamedTuple):
 
     radiance: Floats3
     given: Floats3
-    anchor: Floats3
+    prior_mean: Floats3
     regularization: Floats2
     prior: Floats3
 
@@ -106,7 +106,7 @@ class Patch(NamedTuple):
     residual: Floats
     prior: Floats
     equations: Floats
-    anchor: Floats
+    prior_mean: Floats
     regularization: Floats
     slack: float
     num_views: int
@@ -118,7 +118,7 @@ class Patch(NamedTuple):
 
 @compiled()
 def _views_that_count(
-    given: Floats, anchor: Floats, regularization: Floats, lights: Floats
+    given: Floats, prior_mean: Floats, regularization: Floats, lights: Floats
 ) -> Integers:
     """List the views with data, and those whose light is not at its anchor."""
     found = np.empty(len(given), np.int64)
@@ -126,7 +126,7 @@ def _views_that_count(
     for f in range(len(given)):
         fixed = regularization[f] > 0
         for i in range(4):
-            fixed = fixed and lights[f, i] == anchor[f, i]
+            fixed = fixed and lights[f, i] == prior_mean[f, i]
         if not fixed or np.any(given[f] > 0):
             found[count] = f
             count += 1
@@ -165,13 +165,13 @@ def _packed(
     scale: float,
 ) -> Patch:
     samples, num_scale = found
-    radiance, given, anchor = problem.radiance[p], problem.given[p], problem.anchor[p]
+    radiance, given, prior_mean = problem.radiance[p], problem.given[p], problem.prior_mean[p]
     regularization, prior = problem.regularization[p], problem.prior[p]
     num_views, num_samples = len(views), len(samples)
     padded = TILE * (-(-num_samples // TILE))
     shape = (num_views, padded)
     radiance_rows, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    own_anchor, own_regularization = (
+    own_prior_mean, own_regularization = (
         np.empty((num_views, 4), np.float32),
         np.empty(num_views, np.float32),
     )
@@ -185,7 +185,7 @@ def _packed(
             size += abs(radiance_rows[f, k])
             count += weight[f, k]
         for i in range(4):
-            own_anchor[f, i] = anchor[views[f], i]
+            own_prior_mean[f, i] = prior_mean[views[f], i]
         own_regularization[f] = regularization[views[f]]
         slack -= 4 * own_regularization[f]
     prior_rows = np.zeros((10, padded), np.float32)
@@ -202,7 +202,7 @@ def _packed(
         residual=np.empty(shape, np.float32),
         prior=prior_rows,
         equations=np.empty((14, padded), np.float32),
-        anchor=own_anchor,
+        prior_mean=own_prior_mean,
         regularization=own_regularization,
         slack=max(slack, 0.0),
         num_views=len(regularization),
@@ -383,7 +383,7 @@ def _evaluate(patch: Patch, lights: Floats, shading: Floats, slope: Doubles) -> 
         total += float(cost)
         slope[f, 0], slope[f, 1], slope[f, 2], slope[f, 3] = on_s, on_x, on_y, on_z
         for i in range(4):
-            difference = float(light[i]) - float(patch.anchor[f, i])
+            difference = float(light[i]) - float(patch.prior_mean[f, i])
             total += patch.regularization[f] * difference * difference
             slope[f, i] -= patch.regularization[f] * difference
     return total + _quadratic_penalty(patch.prior, s, x, y, z)
@@ -521,10 +521,10 @@ def solve_on_cone(
         stride: The deviation is estimated from every ``stride``-th sample.
         solution: Its lights and shading are the start.
     """
-    _, given, anchor, regularization, _ = problem
+    _, given, prior_mean, regularization, _ = problem
     lights, shading, weight, iterations, residual, cause = solution
     for p in range(len(given)):
-        views = _views_that_count(given[p], anchor[p], regularization[p], lights[p])
+        views = _views_that_count(given[p], prior_mean[p], regularization[p], lights[p])
         samples, num_scale = samples_that_count(given[p], stride)
         patch = _packed(problem, p, views, (samples, num_scale), loss, scale)
         light = np.empty((len(views), 4), np.float32)

@@ -15,8 +15,8 @@ from pimper_torch.ground.kernels.sweep_costs import (
     Shading,
     Trial,
     choose,
+    empty_choice,
     look_up,
-    room,
     trace,
 )
 
@@ -164,7 +164,7 @@ def pull_back(
     """
     patches, views, height, width = trial.valid.shape
     heights, limit = len(trial.ladder), min(trial.num_views, views)
-    choice = room(views, limit)
+    choice = empty_choice(views, limit)
     lit = np.empty(limit, np.float32)
     per_lit = np.empty(limit, np.float32)
     ratios = np.empty(limit, np.float32)

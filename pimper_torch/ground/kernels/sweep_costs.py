@@ -157,7 +157,7 @@ class Choice(NamedTuple):
 
 
 @compiled()
-def room(views: int, limit: int) -> Choice:
+def empty_choice(views: int, limit: int) -> Choice:
     """Return a choice of ``limit`` out of some views, to be made."""
     return Choice(
         np.empty(limit, np.int64),
@@ -323,7 +323,7 @@ def costs(
     """
     patches, views, height, width = trial.valid.shape
     heights, limit = len(trial.ladder), min(trial.num_views, views)
-    choice = room(views, limit)
+    choice = empty_choice(views, limit)
     lit = np.empty(limit, np.float32)
     per_lit = np.empty(limit, np.float32)
     fractions = shrinkage(levels)

@@ -49,7 +49,7 @@ def disagree(one: Response, other: Response) -> bool:
     return float((_through(one) - _through(other)).abs().max()) > 0.02
 
 
-def told(response: Response) -> str:
+def describe(response: Response) -> str:
     """Name a response as the option does."""
     if isinstance(response, Linear):
         return "linear"

@@ -14,7 +14,7 @@ from pimper_torch.method.photometry.photometry_config import FactorizeConfig, Fi
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.method.sweep.sweep_config import SweepConfig
-from pimper_torch.paper.paper_config import AlignConfig, RefineConfig, TriangulateConfig
+from pimper_torch.published.published_config import AlignConfig, RefineConfig, TriangulateConfig
 from pimper_torch.runtime.config import (
     Range,
     build,

@@ -25,13 +25,13 @@ from pimper_torch.method.photometry.factorize import Factorize
 from pimper_torch.method.photometry.fit_light import FitLight, Illumination
 from pimper_torch.method.photometry.gauge import FixGauge
 from pimper_torch.method.photometry.lights import thinned
-from pimper_torch.method.sfm.poses import one_view_a_pose
+from pimper_torch.method.sfm.poses import one_view_per_pose
 from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.method.silhouettes.explain import explain
 from pimper_torch.method.silhouettes.find import FindSilhouettes, masked, of_all_photographs
 from pimper_torch.method.silhouettes.trace import TraceContours
 from pimper_torch.method.sweep.sweep import Sweep
-from pimper_torch.priors.settled import settled
+from pimper_torch.priors.conventions import resolve_prior_conventions
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -55,7 +55,7 @@ from pimper_torch.runtime.store import Store, opened
 _MIN_VIEWS = 3
 
 
-def held_apart(
+def split_held_out(
     scene: SparseScene, every: int, needed: Iterable[str] = ()
 ) -> tuple[SparseScene, SparseScene | None]:
     """Divide a scene into views that are used, and every n-th by name that is held out.
@@ -123,12 +123,12 @@ class CoarseToFine(Chain):
         """Run the stages behind the coarse mesh once a scale."""
         every = self.placed(run, views, sparse_model, mesh)
         needed = (*self.references(), *self.needed)
-        placed, held_out = held_apart(every, self.config.hold_out, needed)
-        few = one_view_a_pose(placed, needed)
+        placed, held_out = split_held_out(every, self.config.hold_out, needed)
+        few = one_view_per_pose(placed, needed)
         outlines = run(self.silhouettes, few.scene)
         mesh = self.given_mesh(mesh, views, few.scene, outlines)
         scene, silhouettes = of_all_photographs(placed, few, outlines)
-        scene = settled(scene, silhouettes)
+        scene = resolve_prior_conventions(scene, silhouettes)
         shown = scene if few.scene is placed else masked(few.scene, outlines)
         contours = run(self.contours, outlines, shown.cameras)
         coarse = run(self.coarse_surface, shown, contours, mesh)

@@ -17,7 +17,7 @@ from pimper_torch.records import (
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
-from pimper_torch.runtime.reporting import figures, part, tell
+from pimper_torch.runtime.reporting import add_counts, figures, part
 from pimper_torch.runtime.stage import Stage
 
 Factorizing = Callable[[PatchViews, Illumination], PhotometricPatches]
@@ -80,7 +80,7 @@ class Photometric(Stage):
             some = patches.replace(buckets=(templates,))
             with part("warp"):
                 seen = self.warp(views, cameras, some, sources)  # samples J
-            tell(figures(seen))
+            add_counts(figures(seen))
             with part("factorize"):
                 photometric = self.factorize(seen, light)  # J = L N: lights, albedo and normals
             with part("sweep"):

@@ -17,14 +17,14 @@ from pimper_torch.method.patches.warp import Warp
 from pimper_torch.method.photometry.factorize import Factorize
 from pimper_torch.method.photometry.fit_light import FitLight, Illumination
 from pimper_torch.method.photometry.gauge import FixGauge
-from pimper_torch.method.sfm.poses import one_view_a_pose
+from pimper_torch.method.sfm.poses import one_view_per_pose
 from pimper_torch.method.sfm.reconstruct import Reconstruct
 from pimper_torch.method.silhouettes.find import FindSilhouettes, masked, of_all_photographs
-from pimper_torch.paper.align import Align
-from pimper_torch.paper.integrate import Integrate
-from pimper_torch.paper.refine import Refine
-from pimper_torch.paper.triangulate import Triangulate
-from pimper_torch.priors.settled import settled
+from pimper_torch.priors.conventions import resolve_prior_conventions
+from pimper_torch.published.align import Align
+from pimper_torch.published.integrate import Integrate
+from pimper_torch.published.refine import Refine
+from pimper_torch.published.triangulate import Triangulate
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
@@ -82,11 +82,11 @@ class Published(Chain):
     ) -> Iterator[Step]:
         """Run once through the stages."""
         placed = self.placed(run, views, sparse_model, mesh)
-        few = one_view_a_pose(placed, tuple(self.references()))
+        few = one_view_per_pose(placed, tuple(self.references()))
         outlines = run(self.silhouettes, few.scene)
         mesh = self.given_mesh(mesh, views, few.scene, outlines)
         scene, silhouettes = of_all_photographs(placed, few, outlines)
-        scene = settled(scene, silhouettes)
+        scene = resolve_prior_conventions(scene, silhouettes)
         shown = scene if few.scene is placed else masked(few.scene, outlines)
         if mesh is None:
             coarse = run(self.triangulate, shown)

@@ -53,23 +53,23 @@ def depth_points(scene: SparseScene) -> SparseScene:
     room = _room(scene)
     everywhere = torch.arange(len(room.points_world), device=room.points_world.device)
     if len(everywhere) == 0:
-        _tell(scene, 0)
+        _warn(scene, 0)
         return scene
     maps = depth_maps(room, everywhere, _LEVELS)[-1]
     once, twice = (int((maps.agreed >= count).sum()) for count in (1, 2))
     confirmed = twice >= _MIN_CONFIRMED * max(once, 1)
-    leave_out("depth_points.doubt", not confirmed)
+    leave_out("depth_points.disagreement", not confirmed)
     if not confirmed:
-        _tell(scene, 0)
+        _warn(scene, 0)
         return scene
     parts = [_points_of(scene, maps, view) for view in range(scene.cameras.num_views)]
     pixels, seen = (torch.cat(part) for part in zip(*parts, strict=True))
     found = _with(scene, pixels, seen)
-    _tell(found, len(found.points_world) - len(scene.points_world))
+    _warn(found, len(found.points_world) - len(scene.points_world))
     return found
 
 
-def _tell(scene: SparseScene, count: int) -> None:
+def _warn(scene: SparseScene, count: int) -> None:
     if not count:
         caution(
             "No points: features do not match, and depth maps agree by chance alone. The surface "

@@ -22,7 +22,7 @@ MIN_FACING = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Common(Record):
+class SharedError(Record):
     """An error that neighbours have in common, as their light and albedo were found together.
 
     It does not average out. Neighbours that have it agree with each other, and would outvote
@@ -68,7 +68,7 @@ def slopes(
     directions: Vertices,
     normals: Vertices,
     variance: PerVertex,
-    common: Common | None = None,
+    common: SharedError | None = None,
 ) -> Equations:
     r"""State that edges are at right angles to the normals at their ends.
 
@@ -160,7 +160,7 @@ def swept_heights(
     information: PerVertex,
     facing: PerVertex,
     correlated: PerVertex,
-    common: Common | None = None,
+    common: SharedError | None = None,
 ) -> Equations:
     """State where the sweep has the surface.
 

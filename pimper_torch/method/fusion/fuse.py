@@ -29,7 +29,7 @@ from pimper_torch.method.fusion.estimate import Fused, fuse_like, fuse_terms
 from pimper_torch.method.fusion.expected_error import expected_error
 from pimper_torch.method.fusion.fuse_config import FuseConfig
 from pimper_torch.method.fusion.normal_bias import CoarsePart, NormalBias, normal_bias
-from pimper_torch.method.fusion.problem import FINEST, Problem, laid, pose
+from pimper_torch.method.fusion.problem import FINEST, Problem, build_problem, subdivide_facets
 from pimper_torch.method.fusion.terms import (
     ROTATION,
     SLOPES,
@@ -123,14 +123,14 @@ class Fuse(Stage):
         """
         config = self.config
         spacing = spacing_of(swept, config.samples_per_vertex, config.max_lost)
-        problem = pose(swept, laid(swept, _COARSER * spacing), self._lit)
+        problem = build_problem(swept, subdivide_facets(swept, _COARSER * spacing), self._lit)
         terms = tuple(term.bound(problem, contours) for term in self._terms)
         problem = _sloped(problem, terms)
         several = _COARSER**2 * len(problem.points) > most
         shared = self._shared(problem, terms, expected, several)
         del problem
         release_memory()
-        subdivision = laid(swept, spacing).subdivision
+        subdivision = subdivide_facets(swept, spacing).subdivision
         blend, heights, albedo = self._blended(swept, subdivision, shared, most)
         directions = ray_directions(subdivision, swept.patches.coarse)
         points = subdivision.points + blend.heights[:, None] * directions
@@ -203,7 +203,7 @@ class Fuse(Stage):
     ) -> Problem:
         """Pose the problem of some facets, without the tilt that the normals of each share."""
         block = blocks.block_of(whole, swept.patches.coarse.mesh.faces, mine, shared.coarse)
-        problem = pose(swept, block, self._lit)
+        problem = build_problem(swept, block, self._lit)
         problem = _sloped(problem.replace(typical=typical), shared.terms)
         release_memory()
         if shared.tilt is None:
@@ -216,7 +216,7 @@ class Fuse(Stage):
     ) -> dict[blocks.Key, tuple[int, Scalar]]:
         """Return the noise factors of a block, each with the number of equations that show it."""
         problem = self._posed(swept, whole, mine, shared, shared.coarse.typical)
-        made = _Made.of(shared.terms, problem)
+        made = _AssembledTerms.of(shared.terms, problem)
         fused = self._fused(problem, made)
         numbers = [len(kind.targets) for kind in fused.kinds]
         return dict(zip(made.keys, zip(numbers, fused.factors, strict=True), strict=True))
@@ -240,11 +240,15 @@ class Fuse(Stage):
             several: Whether the heights are needed, for several blocks.
         """
         subdivision, facets, known = problem.subdivision, problem.facets, problem.known
-        made = _Made.of(terms, problem)
-        firm = made.equations(lambda term: term.position and not term.loose)
-        loose = made.equations(lambda term: term.loose)
+        made = _AssembledTerms.of(terms, problem)
+        trusted = made.equations(lambda term: term.position and not term.biased)
+        biased = made.equations(lambda term: term.biased)
         normals, shape = problem.photometric, problem.normals
-        if self.config.bias_iterations == 0 or not bool(problem.lit.any()) or not (firm or loose):
+        if (
+            self.config.bias_iterations == 0
+            or not bool(problem.lit.any())
+            or not (trusted or biased)
+        ):
             return _Shared(
                 tilt=None,
                 tilt_variance=normals.new_zeros(()),
@@ -253,20 +257,20 @@ class Fuse(Stage):
             )
 
         def doubted(term: Term) -> bool:
-            return term.loose if firm else term.guessed
+            return term.biased if trusted else term.guessed
 
         # These are evaluated by the others first, which they would draw along.
         taken = made.without(doubted)
         vertex = torch.cat(
-            [kind.unknowns[:, 0] for kind in firm or loose] or [problem.edges.new_zeros(0)]
+            [kind.unknowns[:, 0] for kind in trusted or biased] or [problem.edges.new_zeros(0)]
         )
         for _ in range(self.config.bias_iterations):
             tilt = normal_bias(subdivision, facets, normals, shape, known)
             tilted = problem.replace(tilt_variance=tilt.variance())
-            fused = self._fused(problem, taken.again(tilted))
+            fused = self._fused(problem, taken.reassemble(tilted))
             moved = fused.heights.to(problem.points)[:, None] * problem.directions
             shape = vertex_normals(subdivision.points + moved, subdivision.faces)
-            made, problem = made.evaluated(problem, fused.heights, vertex, doubted)
+            made, problem = made.reestimate(problem, fused.heights, vertex, doubted)
             taken = made
         tilt = normal_bias(subdivision, facets, normals, shape, known)
         normals = normalize(normals + tilt.at(subdivision, facets), dim=-1)
@@ -282,7 +286,7 @@ class Fuse(Stage):
     def _coarse(
         self,
         problem: Problem,
-        made: "_Made",
+        made: "_AssembledTerms",
         expected: bool,
         several: bool,
         tilt_variance: Scalar | None = None,
@@ -292,10 +296,10 @@ class Fuse(Stage):
         coarse, expected = blocks.Coarse(subdivision=subdivision), expected and draws > 0
         if not (expected or several):
             return coarse
-        made = made.again(problem)
+        made = made.reassemble(problem)
         independent = correlated = self._fused(problem, made)
         if tilt_variance is not None:
-            common = made.again(problem.replace(tilt_variance=tilt_variance)).equations()
+            common = made.reassemble(problem.replace(tilt_variance=tilt_variance)).equations()
             correlated = fuse_like(independent, common, problem.start_of_shape)
         if several:
             start, known = problem.start, problem.known
@@ -328,13 +332,13 @@ class Fuse(Stage):
         Noise is estimated anew: what the coarser mesh finds noisier than claimed may be its own
         coarseness.
         """
-        made = _Made.of(shared.terms, problem)
+        made = _AssembledTerms.of(shared.terms, problem)
         release_memory()
         fused = self._fused(problem, made)
         detail = fused.heights
         if shared.tilt is None:
             return detail
-        common = made.again(problem.replace(tilt_variance=shared.tilt_variance)).equations()
+        common = made.reassemble(problem.replace(tilt_variance=shared.tilt_variance)).equations()
 
         def with_coarse_shape() -> PerVertex:
             shape = fuse_like(fused, common, problem.start_of_shape).heights
@@ -348,7 +352,7 @@ class Fuse(Stage):
             done="The surface has the coarse shape of independent errors",
         )
 
-    def _fused(self, problem: Problem, made: "_Made") -> Fused:
+    def _fused(self, problem: Problem, made: "_AssembledTerms") -> Fused:
         kinds, typical, iterations = made.equations(), problem.typical, self.config.noise_iterations
         one = problem.spacing.new_ones((), dtype=torch.float64)
         known = any(key in typical for key in made.keys)
@@ -357,14 +361,14 @@ class Fuse(Stage):
 
 
 @dataclass(frozen=True, slots=True)
-class _Made:
+class _AssembledTerms:
     """Terms, with the equations that each of them has made."""
 
     terms: tuple[Term, ...]
     kinds: tuple[list[Equations], ...]
 
     @classmethod
-    def of(cls, terms: tuple[Term, ...], problem: Problem) -> "_Made":
+    def of(cls, terms: tuple[Term, ...], problem: Problem) -> "_AssembledTerms":
         """Make the equations of all terms; those of points share one ray caster."""
         if any(isinstance(term, Passing) and term.contacts is not None for term in terms):
             caster = RayCaster(problem.points, problem.subdivision.faces)
@@ -381,30 +385,30 @@ class _Made:
         """The term's number, and that among its kinds, of every kind."""
         return [(term, kind) for term, kinds in enumerate(self.kinds) for kind in range(len(kinds))]
 
-    def without(self, unwanted: Callable[[Term], bool]) -> "_Made":
+    def without(self, unwanted: Callable[[Term], bool]) -> "_AssembledTerms":
         """Leave out some terms."""
         pairs = zip(self.terms, self.kinds, strict=True)
         terms, kinds = zip(*(pair for pair in pairs if not unwanted(pair[0])), strict=True)
-        return _Made(terms, kinds)
+        return _AssembledTerms(terms, kinds)
 
-    def again(self, problem: Problem) -> "_Made":
+    def reassemble(self, problem: Problem) -> "_AssembledTerms":
         """Make the equations of tilted terms anew, for other normals or another tilt."""
         pairs = zip(self.terms, self.kinds, strict=True)
         made = (term.equations(problem) if term.tilted else kinds for term, kinds in pairs)
-        return _Made(self.terms, tuple(made))
+        return _AssembledTerms(self.terms, tuple(made))
 
-    def evaluated(
+    def reestimate(
         self,
         problem: Problem,
         heights: PerVertex,
-        firm: Int[Tensor, " known"],
+        trusted: Int[Tensor, " known"],
         doubted: Callable[[Term], bool],
-    ) -> tuple["_Made", Problem]:
+    ) -> tuple["_AssembledTerms", Problem]:
         """Evaluate some terms, and make their equations anew, and what guesses leave open."""
         pairs = list(zip(self.terms, self.kinds, strict=True))
         anew = [doubted(term) and bool(kinds) for term, kinds in pairs]
         terms = tuple(
-            term.evaluated(problem, heights, firm) if new else term
+            term.reestimate(problem, heights, trusted) if new else term
             for term, new in zip(self.terms, anew, strict=True)
         )
         if guessed := any(term.guessed and kinds for term, kinds in pairs):
@@ -413,7 +417,7 @@ class _Made:
             term.equations(problem) if new or (guessed and term.residual) else old
             for term, new, old in zip(terms, anew, self.kinds, strict=True)
         )
-        return _Made(terms, kinds), problem
+        return _AssembledTerms(terms, kinds), problem
 
 
 def _sloped(problem: Problem, terms: tuple[Term, ...]) -> Problem:

@@ -21,7 +21,7 @@ from pimper_torch.ground.geometry.subdivision import Subdivision
 from pimper_torch.ground.linalg.sums import sum_at
 from pimper_torch.ground.linalg.systems import prepare
 from pimper_torch.ground.shapes import PerVertex, Scalar, VertexMask, Vertices
-from pimper_torch.method.fusion.equations import Common, Equations
+from pimper_torch.method.fusion.equations import Equations, SharedError
 from pimper_torch.records import Record
 
 # Median of the squared length of a vector of two components of unit Gaussian noise.
@@ -107,10 +107,10 @@ def common_variance(
     return square.median() / 0.4549 if len(square) > 0 else off.new_zeros(())
 
 
-def common(variance: Scalar, facet: Int[Tensor, " vertex"], known: VertexMask) -> Common:
+def shared_error(variance: Scalar, facet: Int[Tensor, " vertex"], known: VertexMask) -> SharedError:
     """Return the error that the known vertices of each facet have in common."""
     count = torch.bincount(facet[known], minlength=int(facet.max()) + 1)
-    return Common(variance=variance, count=count[facet].to(variance))
+    return SharedError(variance=variance, count=count[facet].to(variance))
 
 
 class CoarsePart:

@@ -111,13 +111,13 @@ class Problem(Record):
         return self.blend.heights + self.block.shape.to(self.blend.heights)
 
 
-def laid(swept: SweptPatches, spacing: Float[Tensor, " facet"]) -> Block:
+def subdivide_facets(swept: SweptPatches, spacing: Float[Tensor, " facet"]) -> Block:
     """Lay a subdivided mesh over all facets, of that distance between vertices in each."""
     mesh = swept.patches.coarse.mesh
     return Block.whole(subdivide(mesh.vertices_world, mesh.faces, spacing), mesh.faces)
 
 
-def pose(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
+def build_problem(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
     """Blend the patches on a subdivided mesh.
 
     Args:

@@ -22,13 +22,13 @@ from pimper_torch.method.fusion import equations
 from pimper_torch.method.fusion.equations import Contacts, Equations
 from pimper_torch.method.fusion.normal_bias import (
     MEDIAN_OF_TILT,
-    common,
     common_variance,
     normal_bias,
+    shared_error,
 )
 from pimper_torch.method.fusion.problem import Problem
 
-Known = Int[Tensor, " known"]
+KnownVertices = Int[Tensor, " known"]
 
 
 # Least squared angle from vertex to vertex, radians, and least variance of the slopes that a
@@ -62,7 +62,7 @@ class Term(nn.Module):
         position: Whether it determines where the surface is, so that the tilt that the normals of a
             facet have in common follows from it.
         loose: Whether what it states of a facet has an error in common, whose variance the other
-            terms determine (:meth:`evaluated`).
+            terms determine (:meth:`reestimate`).
         guessed: Whether it is a guess: all terms that are not guesses evaluate it.
         residual: Whether it states what other terms leave open: its equations depend on
             ``problem.sloped``.
@@ -71,7 +71,7 @@ class Term(nn.Module):
     """
 
     position: ClassVar[bool] = False
-    loose: ClassVar[bool] = False
+    biased: ClassVar[bool] = False
     guessed: ClassVar[bool] = False
     residual: ClassVar[bool] = False
     tilted: ClassVar[bool] = False
@@ -89,13 +89,13 @@ class Term(nn.Module):
         """List equations of one kind each, with the variances that their source claims."""
         raise NotImplementedError
 
-    def evaluated(self, problem: Problem, heights: PerVertex, firm: Known) -> "Term":
+    def reestimate(self, problem: Problem, heights: PerVertex, trusted: KnownVertices) -> "Term":
         """Return the term with the variance of its common errors, as other terms' heights show it.
 
         Args:
             firm: Vertices whose positions other terms determine.
         """
-        del problem, heights, firm
+        del problem, heights, trusted
         return self
 
 
@@ -114,7 +114,7 @@ class Normals(Term):
     def equations(self, problem: Problem) -> list[Equations]:
         """State the slopes, with the tilt that is common if ``problem`` has its variance."""
         shared = problem.tilt_variance
-        together = None if shared is None else common(shared, problem.facet, problem.known)
+        together = None if shared is None else shared_error(shared, problem.facet, problem.known)
         return [
             equations.slopes(
                 problem.edges[problem.lit],
@@ -137,7 +137,7 @@ class SweptHeights(Term):
         variance: Of the error that the heights of a facet have in common, squared scene units.
     """
 
-    position, loose = True, True
+    position, biased = True, True
 
     def __init__(self, variance: Scalar | None = None) -> None:
         super().__init__()
@@ -162,14 +162,18 @@ class SweptHeights(Term):
         facing, together = problem.facing, None
         if self.variance is not None:
             known = equations.upright_heights(information, facing)
-            together = common(self.variance, problem.facet, known)
+            together = shared_error(self.variance, problem.facet, known)
         start = problem.blend.heights
         return equations.swept_heights(start, offsets, information, facing, correlated, together)
 
-    def evaluated(self, problem: Problem, heights: PerVertex, firm: Known) -> "SweptHeights":
+    def reestimate(
+        self, problem: Problem, heights: PerVertex, trusted: KnownVertices
+    ) -> "SweptHeights":
         """Return the term with the variance of the error that a facet's heights share."""
         plain, facet = type(self)().equations(problem), problem.facet
-        return type(self)(common_variance(plain[0], heights, facet, facet[firm]) if plain else None)
+        return type(self)(
+            common_variance(plain[0], heights, facet, facet[trusted]) if plain else None
+        )
 
 
 class PriorNormals(Term):
@@ -182,7 +186,7 @@ class PriorNormals(Term):
         variance: Of that tilt, squared radians; ``None`` where nothing shows it.
     """
 
-    loose, guessed = True, True
+    biased, guessed = True, True
 
     def __init__(self, variance: Scalar | None = None) -> None:
         super().__init__()
@@ -212,17 +216,19 @@ class PriorNormals(Term):
             return []
         together = None
         if self.variance is not None:
-            together = common(self.variance, problem.facet, information > 0)
+            together = shared_error(self.variance, problem.facet, information > 0)
         flat = problem.subdivision.points
         variance = slope_variance(information) / problem.density
         return [equations.slopes(edges, flat, problem.directions, normals, variance, together)]
 
-    def evaluated(self, problem: Problem, heights: PerVertex, firm: Known) -> "PriorNormals":
+    def reestimate(
+        self, problem: Problem, heights: PerVertex, trusted: KnownVertices
+    ) -> "PriorNormals":
         """Return the term with the variance of its tilt against the photometric normals.
 
         What these are off the surface by themselves does not count.
         """
-        del firm
+        del trusted
         both = problem.known & (problem.blend.prior_normal_information > 0)
         if not bool(both.any()):
             return self

@@ -29,6 +29,7 @@ from pimper_torch.ground.linalg.robust import Loss, Squares, robust_deviation
 from pimper_torch.method.photometry import quadratics
 from pimper_torch.method.photometry.cone import Cone, Manifold
 from pimper_torch.records import Convergence, Record, StopCause
+from pimper_torch.runtime.renamed import renamed_fields
 
 Lights = Float[Tensor, "patch view rank"]
 Shading = Float[Tensor, "patch rank sample"]
@@ -42,6 +43,7 @@ Packed = Float[Tensor, "patch packed sample"]
 REWEIGHT_EVERY = 3
 
 
+@renamed_fields(anchor="prior_mean")
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Bilinear(Record):
     """A batch of factorization problems, the samples of each patch flattened and padded.
@@ -63,7 +65,7 @@ class Bilinear(Record):
     radiance: Entries
     weight: Entries
     lights: Lights
-    anchor: Lights
+    prior_mean: Lights
     shading: Shading
     regularization: Float[Tensor, "patch view"]
     prior: Packed | None = None
@@ -74,7 +76,7 @@ class Bilinear(Record):
     @property
     def requires_grad(self) -> bool:
         """Whether gradients of the solution are required."""
-        data = (self.radiance, self.weight, self.anchor, self.regularization, self.prior)
+        data = (self.radiance, self.weight, self.prior_mean, self.regularization, self.prior)
         return any(part is not None and part.requires_grad for part in data)
 
     @property
@@ -133,7 +135,7 @@ def equations_of_views(
     """Assemble the normal equations for every view's light, its prior included."""
     packed = (weight @ quadratics.outer(shading).mT).mT.clone()
     packed[:, quadratics.diagonal(shading.shape[1])] += problem.regularization[:, None, :]
-    pull = problem.regularization[..., None] * problem.anchor
+    pull = problem.regularization[..., None] * problem.prior_mean
     return packed, ((weight * problem.radiance) @ shading.mT + pull).mT
 
 
@@ -155,7 +157,7 @@ def evaluate(
     residual = problem.radiance - lights @ shading
     weighted = weight * residual
     cost = torch.linalg.vecdot(weighted.flatten(1), residual.flatten(1))
-    difference = lights - problem.anchor
+    difference = lights - problem.prior_mean
     cost = cost + (problem.regularization * difference.square().sum(dim=2)).sum(dim=1)
     if problem.prior is not None:
         penalty = shading * quadratics.apply_packed(problem.prior, shading)

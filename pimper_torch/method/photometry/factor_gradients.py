@@ -41,8 +41,8 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     holds at the optimum alone. A patch whose gradient it does not reduce keeps its solution.
 
     Args:
-        problem: Gradients reach its ``radiance``, ``weight``, ``anchor``, ``regularization`` and
-            ``prior``.
+        problem: Gradients reach its ``radiance``, ``weight``, ``prior_mean``, ``regularization``
+            and ``prior``.
         factors: Its solution, near enough to a minimum that the Hessian is positive definite.
 
     Returns:
@@ -54,7 +54,7 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
     (:mod:`~pimper_torch.ground.kernels.factor_adjoint`), which is differentiable once.
     """
     if problem.has_kernel and compiled_for(problem.radiance.detach()):
-        data = problem.radiance, problem.weight, problem.anchor, problem.regularization
+        data = problem.radiance, problem.weight, problem.prior_mean, problem.regularization
         lights, shading, weight, residual = _Compiled.apply(  # type: ignore[no-untyped-call]
             problem.detach(), factors, *data, problem.dense_prior
         )
@@ -309,7 +309,7 @@ def _gradient(
     deviation = bilinear.residual_deviation(problem, residual)[:, None, None]
     robust = problem.loss.weights(residual, deviation)
     weighted_residual = problem.weight.double() * robust * residual
-    difference = L - problem.anchor.double()
+    difference = L - problem.prior_mean.double()
     on_lights = weighted_residual @ N.mT - problem.regularization.double()[..., None] * difference
     ambient = L.mT @ weighted_residual
     if problem.prior is not None:

@@ -55,7 +55,7 @@ class PatchSamples(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Known(Record):
+class PriorTerms(Record):
     """Statement of a prior on a batch of patches; ``None`` where it makes none.
 
     Attributes:
@@ -80,7 +80,7 @@ class Known(Record):
 class FactorPrior(nn.Module):
     """A prior of the factorization; one of your own overrides :meth:`forward`."""
 
-    def forward(self, samples: PatchSamples) -> Known:
+    def forward(self, samples: PatchSamples) -> PriorTerms:
         """Return what is known of some patches."""
         raise NotImplementedError
 
@@ -96,10 +96,10 @@ class FieldLights(FactorPrior):
         super().__init__()
         self.weight = weight
 
-    def forward(self, samples: PatchSamples) -> Known:
+    def forward(self, samples: PatchSamples) -> PriorTerms:
         """Return the field's lights."""
         weight = torch.full_like(samples.lights[..., 0], self.weight)
-        return Known(lights=samples.lights, light_weight=weight)
+        return PriorTerms(lights=samples.lights, light_weight=weight)
 
 
 class SurfaceNormals(FactorPrior):
@@ -113,21 +113,21 @@ class SurfaceNormals(FactorPrior):
         super().__init__()
         self.weight = weight
 
-    def forward(self, samples: PatchSamples) -> Known:
+    def forward(self, samples: PatchSamples) -> PriorTerms:
         """Return the surface's normals."""
         weight = torch.full_like(samples.albedo, self.weight)
-        return Known(normals=samples.normals, normal_weight=weight)
+        return PriorTerms(normals=samples.normals, normal_weight=weight)
 
 
-class Guesses(FactorPrior):
+class MapPriors(FactorPrior):
     """Normals, albedo, lights and inliers are those that views carry, to their variance.
 
     Albedo and lights are taken up to a factor for each patch.
     """
 
-    def forward(self, samples: PatchSamples) -> Known:
+    def forward(self, samples: PatchSamples) -> PriorTerms:
         """Return the guesses in units of the light field and the albedo under it."""
-        known = Known(normals=samples.guessed_normals, inlier=samples.guessed_inlier)
+        known = PriorTerms(normals=samples.guessed_normals, inlier=samples.guessed_inlier)
         if (information := samples.guessed_information) is not None:
             known = known.replace(normal_weight=views_worth(information))
         albedo, variance = samples.guessed_albedo, samples.guessed_albedo_variance

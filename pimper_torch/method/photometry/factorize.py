@@ -22,22 +22,22 @@ from pimper_torch.method.photometry.factor_gradients import differentiable
 from pimper_torch.method.photometry.factor_priors import (
     FactorPrior,
     FieldLights,
-    Guesses,
-    Known,
+    MapPriors,
     PatchSamples,
+    PriorTerms,
     SurfaceNormals,
 )
 from pimper_torch.method.photometry.fit_light import Illumination, lights_in_patches
 from pimper_torch.method.photometry.light_field import LightField, faces_light, harmonics
 from pimper_torch.method.photometry.photometry_config import FactorizeConfig
 from pimper_torch.method.photometry.sample_estimates import (
-    Rows,
+    FlatSamples,
     fit_albedo,
-    in_row,
+    flatten_samples,
+    gather_samples,
     initial_shading,
-    on_raster,
     refine_on_manifold,
-    rows_of,
+    scatter_samples,
 )
 from pimper_torch.method.photometry.shadows import cast_shadows_on_rasters
 from pimper_torch.method.photometry.status import light_varies, patch_status
@@ -123,7 +123,7 @@ class Factorize(Stage):
         require(config.loss in LOSSES, "factorize.loss", config.loss, " or ".join(LOSSES))
         if priors is None:
             own = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
-            priors = [*own, Guesses()]
+            priors = [*own, MapPriors()]
         for prior in priors:
             needed = "modules derived from FactorPrior"
             require(isinstance(prior, FactorPrior), "Factorize: priors", prior, needed)
@@ -171,15 +171,15 @@ class Factorize(Stage):
 
     def _prepare(
         self, bucket: _Bucket, illuminated: PatchMasks, shadowed: PatchMasks, light: Illumination
-    ) -> tuple[Rows, Int[Tensor, " patch"], Bilinear]:
+    ) -> tuple[FlatSamples, Int[Tensor, " patch"], Bilinear]:
         """Return samples, status and problem; in light that never moves, shadows take part.
 
         There shadows are at rest on the surface; elsewhere they move over it as false texture.
         """
         config = self.config
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
-        rows = rows_of(bucket.templates, bucket.registered, bucket.normals)
-        lit, anchor = _lit(rows, light.field, patch_from_world, illuminated, shadowed)
+        rows = gather_samples(bucket.templates, bucket.registered, bucket.normals)
+        lit, prior_mean = _lit(rows, light.field, patch_from_world, illuminated, shadowed)
         dark = int((rows.seen & ~lit).sum())
         leave_out("photometry.shadows", dark, total=int(rows.seen.sum()))
         observed = bucket.registered.valid & bucket.templates.inside[:, None]
@@ -187,22 +187,24 @@ class Factorize(Stage):
             observed.flatten(1).any(dim=1),
             rows.seen.flatten(1).any(dim=1),
             lit,
-            anchor,
+            prior_mean,
             config.min_views,
             config.min_light_variation,
         )
         raster = bucket.normals.shape[1] * bucket.normals.shape[2]
         refused = status != int(PatchStatus.DETERMINED)
         shown = rows.seen.sum(dim=2)
-        at_rest = refused & ~light_varies(anchor, shown, config.min_light_variation)
+        at_rest = refused & ~light_varies(prior_mean, shown, config.min_light_variation)
         rows = rows.only(lit | at_rest[:, None, None])
-        anchor = torch.where(refused[:, None, None], recomputed(_exposed, rows, anchor), anchor)
+        prior_mean = torch.where(
+            refused[:, None, None], recomputed(_exposed, rows, prior_mean), prior_mean
+        )
         variance = light.guess_variance
-        problem = self._problem(rows, anchor, refused, raster, bucket.registered, variance)
+        problem = self._problem(rows, prior_mean, refused, raster, bucket.registered, variance)
         return rows, status, problem
 
     def _photometry(
-        self, bucket: _Bucket, rows: Rows, status: Int[Tensor, " patch"], problem: Bilinear
+        self, bucket: _Bucket, rows: FlatSamples, status: Int[Tensor, " patch"], problem: Bilinear
     ) -> Photometry:
         """Solve the problem, and put what light determines on the rasters."""
         factors = self._solve(problem)
@@ -211,7 +213,7 @@ class Factorize(Stage):
         gray, normals, information = recomputed(refine_on_manifold, problem, factors)
         views = rows.seen.shape[1]  # a view beyond them represents known albedo
         lights, weight = factors.lights[:, :views], factors.weight[:, :views]
-        anchor, given = problem.anchor[:, :views], problem.weight[:, :views]
+        prior_mean, given = problem.prior_mean[:, :views], problem.weight[:, :views]
         finite = lights.isfinite().flatten(1).all(dim=1)
         estimated = normals.isfinite().all(dim=2) & gray.isfinite()
         estimated &= (gray > 0) & (rows.seen.sum(dim=1) >= self.config.min_views)
@@ -224,7 +226,7 @@ class Factorize(Stage):
         determined = (status == int(PatchStatus.DETERMINED))[:, None]
         valid = estimated & determined & (normals[..., 2] < 0)
         fitted = finite & rows.seen.flatten(1).any(dim=1)
-        lights = torch.where(fitted[:, None, None], lights, anchor)
+        lights = torch.where(fitted[:, None, None], lights, prior_mean)
         lights = lights * rows.seen.any(dim=2)[..., None]
         normals = torch.where(valid[..., None], normals, rows.normals)
         weight = torch.where(determined[..., None], weight, given)
@@ -235,18 +237,18 @@ class Factorize(Stage):
         residual = factors.convergence.residual
         finite_residual = torch.where(residual.isfinite() | ~failed, residual, 0)
         return Photometry(
-            normals_patch=on_raster(normals, rows.index, bucket.normals),
-            albedo=on_raster(albedo.mT, rows.index, black),
+            normals_patch=scatter_samples(normals, rows.index, bucket.normals),
+            albedo=scatter_samples(albedo.mT, rows.index, black),
             lights_patch=lights,
-            valid=on_raster(valid, rows.index, blank > 0),
-            information=on_raster(information * valid, rows.index, blank),
+            valid=scatter_samples(valid, rows.index, blank > 0),
+            information=scatter_samples(information * valid, rows.index, blank),
             status=status,
             convergence=factors.convergence.replace(residual=finite_residual),
         )
 
     def _problem(
         self,
-        rows: Rows,
+        rows: FlatSamples,
         field: Float[Tensor, "patch view 4"],
         refused: Bool[Tensor, " patch"],
         raster: int,
@@ -259,11 +261,11 @@ class Factorize(Stage):
         basis = harmonics(rows.normals).mT
         shading = recomputed(initial_shading, gray, rows.seen, field, basis)
         samples = _samples(rows, gray, field, shading[:, 0], registered, variance)
-        known = [cast("Known", prior(samples)) for prior in self.priors]
+        known = [cast("PriorTerms", prior(samples)) for prior in self.priors]
         for each in known:
             if each.inlier is not None:
                 weight = weight * each.inlier
-        anchor, light_weight = _anchor(field, known)
+        prior_mean, light_weight = _prior_mean(field, known)
         square = shading[:, 0] ** 2
         count = (square > 0).sum(dim=1).clamp_min(1)
         seen_square = (weight @ square[..., None])[..., 0]
@@ -286,8 +288,8 @@ class Factorize(Stage):
         problem = Bilinear(
             radiance=gray,
             weight=weight,
-            lights=anchor,
-            anchor=anchor,
+            lights=prior_mean,
+            prior_mean=prior_mean,
             shading=shading,
             # At least a millionth of the data holds the light of views with few samples.
             regularization=light_weight.clamp_min(1e-6) * unit,
@@ -325,7 +327,7 @@ def _balanced(registered: Observations, field: LightField) -> Observations:
 
 
 def _lit(
-    rows: Rows,
+    rows: FlatSamples,
     field: LightField,
     patch_from_world: Float[Tensor, "patch 4 4"],
     illuminated: PatchMasks,
@@ -336,8 +338,12 @@ def _lit(
     What is mostly in shadow of the lamp has the room's light in that view.
     """
     lights, soft, point_light = lights_in_patches(field, patch_from_world)
-    lit = in_row(illuminated, rows.index) & rows.seen & faces_light(point_light, rows.normals)
-    shaded = in_row(shadowed, rows.index) | faces_light(-point_light, rows.normals)
+    lit = (
+        flatten_samples(illuminated, rows.index)
+        & rows.seen
+        & faces_light(point_light, rows.normals)
+    )
+    shaded = flatten_samples(shadowed, rows.index) | faces_light(-point_light, rows.normals)
     # Directed soft light that shades by much beside a point light.
     directed, strength = (soft[..., 1:] != 0).any(dim=-1), point_light.norm(dim=-1)
     strong = directed & (strength > 0) & (soft[..., 0] - soft[..., 3] > strength / 4)
@@ -347,7 +353,7 @@ def _lit(
 
 
 def _samples(
-    rows: Rows,
+    rows: FlatSamples,
     gray: Float[Tensor, "patch view sample"],
     field: Float[Tensor, "patch view 4"],
     albedo: Float[Tensor, "patch sample"],
@@ -377,14 +383,14 @@ def _samples(
         guessed_information=row(information / (1 + information * variance)),
         guessed_albedo=row(guessed.albedo),
         guessed_albedo_variance=row(guessed.albedo_variance),
-        guessed_inlier=None if inlier is None else in_row(inlier, rows.index),
+        guessed_inlier=None if inlier is None else flatten_samples(inlier, rows.index),
         guessed_lights=guessed.lights_patch,
         guessed_light_variance=guessed.light_variance,
     )
 
 
-def _anchor(
-    field: Float[Tensor, "patch view 4"], known: Sequence[Known]
+def _prior_mean(
+    field: Float[Tensor, "patch view 4"], known: Sequence[PriorTerms]
 ) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch view"]]:
     """Return the mean of the lights that priors know, by weight, and the sum of the weights."""
     told = [
@@ -416,7 +422,7 @@ def _with_albedo(
         radiance=torch.cat([problem.radiance, (strength * albedo)[:, None]], dim=1),
         weight=torch.cat([problem.weight, weight[:, None]], dim=1),
         lights=torch.cat([problem.lights, light], dim=1),
-        anchor=torch.cat([problem.anchor, light], dim=1),
+        prior_mean=torch.cat([problem.prior_mean, light], dim=1),
         regularization=torch.cat([problem.regularization, fixed], dim=1),
     )
 
@@ -447,7 +453,9 @@ def _illuminated(
     return lit & sure, ~lit & sure
 
 
-def _exposed(rows: Rows, lights: Float[Tensor, "patch view 4"]) -> Float[Tensor, "patch view 4"]:
+def _exposed(
+    rows: FlatSamples, lights: Float[Tensor, "patch view 4"]
+) -> Float[Tensor, "patch view 4"]:
     """Scale each view's light to its radiance, coarse normals given and albedo the same in all."""
     gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
     predicted = lights @ initial_shading(gray, rows.seen, lights, basis) * rows.seen

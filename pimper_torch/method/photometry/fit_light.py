@@ -20,7 +20,7 @@ from pimper_torch.method.photometry.light_field import (
 )
 from pimper_torch.method.photometry.lights import light_of_mesh
 from pimper_torch.method.photometry.photometry_config import FitLightConfig
-from pimper_torch.method.photometry.sample_estimates import initial_shading, rows_of
+from pimper_torch.method.photometry.sample_estimates import gather_samples, initial_shading
 from pimper_torch.records import PatchPriors, PatchViews, Record
 from pimper_torch.runtime.stage import Stage
 
@@ -106,7 +106,7 @@ def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ 
     """Return the median residual of normals under a light field, over what it predicts."""
     found = []
     for templates, registered, own in zip(seen.patches.buckets, seen.buckets, normals, strict=True):
-        rows = rows_of(templates, registered, own)
+        rows = gather_samples(templates, registered, own)
         lights, _, _ = lights_in_patches(templates.own(field), templates.patch_from_world.to(own))
         gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
         predicted = lights @ initial_shading(gray, rows.seen, lights, basis)

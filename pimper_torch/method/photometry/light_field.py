@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pimper_torch.ground.shapes import Points, Vectors
 from pimper_torch.records import Record
+from pimper_torch.runtime.renamed import renamed_fields
 
 
 def harmonics(normals: Vectors) -> Float[Tensor, "*batch 4"]:
@@ -64,6 +65,7 @@ def rotate_lights(
 _MIN_COSINE = 0.05
 
 
+@renamed_fields(closeness="inverse_distance")
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class LightField(Record):
     r"""The light at every point of the scene, in every view.
@@ -89,7 +91,7 @@ class LightField(Record):
 
     soft: Float[Tensor, "view 9"]
     point_light: Float[Tensor, "view 3"]
-    closeness: Float[Tensor, " view"]
+    inverse_distance: Float[Tensor, " view"]
     origin: Float[Tensor, " 3"]
     gain: Float[Tensor, "view channel"] | None = None
     exposure: Float[Tensor, " view"] | None = None
@@ -98,7 +100,7 @@ class LightField(Record):
         """Return ``E``, the direction to the point light times its irradiance."""
         strength = self.point_light.norm(dim=1)
         direction = self.point_light / torch.where(strength > 0, strength, 1)[:, None]
-        away = direction - self.closeness[:, None] * (points - self.origin)[:, None]
+        away = direction - self.inverse_distance[:, None] * (points - self.origin)[:, None]
         distance = away.norm(dim=-1, keepdim=True)
         return strength[:, None] * away / torch.where(strength[:, None] > 0, distance, 1) ** 3
 

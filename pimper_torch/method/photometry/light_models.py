@@ -278,8 +278,8 @@ class LightModel:
         ambient = lights[:, :1].clamp_min(0)
         if self.points is None:
             return torch.cat([ambient, lights[:, 1:]], dim=1)
-        closeness = lights[:, -1:].clamp(0, 1 / MIN_DISTANCE)
-        return torch.cat([ambient, lights[:, 1:-1], closeness], dim=1)
+        inverse_distance = lights[:, -1:].clamp(0, 1 / MIN_DISTANCE)
+        return torch.cat([ambient, lights[:, 1:-1], inverse_distance], dim=1)
 
     def _geometry(
         self, lights: Parameters

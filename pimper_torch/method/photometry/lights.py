@@ -146,7 +146,7 @@ def fit_light_field(
             origin=radiance.new_zeros(3),
             soft=radiance.new_zeros(views, 9),
             point_light=radiance.new_zeros(views, 3),
-            closeness=radiance.new_zeros(views),
+            inverse_distance=radiance.new_zeros(views),
         )
     some = seen.any(dim=1)
     seen = seen[some]
@@ -172,15 +172,17 @@ def fit_light_field(
         torch.cat([scale * each[part] for scale, each in zip(scales, fits, strict=True)])[order]
         for part in (0, 1)
     )
-    closeness = torch.cat([each[3] for each in fits])[order]
-    closeness = torch.zeros_like(closeness) if points is None else closeness / size
+    inverse_distance = torch.cat([each[3] for each in fits])[order]
+    inverse_distance = (
+        torch.zeros_like(inverse_distance) if points is None else inverse_distance / size
+    )
     square = lights.square().sum(dim=1) + point_lights.square().sum(dim=1)
     factor = square[square > 0].sqrt().median().nan_to_num(nan=1.0)
     return LightField(
         origin=origin.to(radiance),
         soft=(lights / factor).to(radiance),
         point_light=(point_lights / factor).to(radiance),
-        closeness=closeness.to(radiance),
+        inverse_distance=inverse_distance.to(radiance),
     )
 
 
@@ -194,10 +196,10 @@ def _lights(
     fitted, terms = with_gradients(found, samples), len(mixing)
     solution = fitted.lights
     lights = solution[:, :terms] @ mixing
-    point_lights, closeness = torch.zeros_like(lights[:, :3]), torch.zeros_like(lights[:, 0])
+    point_lights, inverse_distance = torch.zeros_like(lights[:, :3]), torch.zeros_like(lights[:, 0])
     if name != "soft":
-        point_lights, closeness = solution[:, terms:-1], solution[:, -1]
-    return lights, point_lights, fitted.albedo, closeness
+        point_lights, inverse_distance = solution[:, terms:-1], solution[:, -1]
+    return lights, point_lights, fitted.albedo, inverse_distance
 
 
 def _fit(

@@ -14,7 +14,7 @@ from pimper_torch.records import Observations, Record, Templates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Rows(Record):
+class FlatSamples(Record):
     """The samples inside each patch's template, flattened and padded to the longest.
 
     Attributes:
@@ -30,13 +30,15 @@ class Rows(Record):
     seen: Bool[Tensor, "patch view sample"]
     normals: Float[Tensor, "patch sample 3"]
 
-    def only(self, some: Bool[Tensor, "patch view sample"]) -> "Rows":
+    def only(self, some: Bool[Tensor, "patch view sample"]) -> "FlatSamples":
         """Take all others as missing."""
         seen = self.seen & some
         return self.replace(seen=seen, radiance=torch.where(seen[:, :, None], self.radiance, 0))
 
 
-def rows_of(templates: Templates, registered: Observations, normals: PatchVectors) -> Rows:
+def gather_samples(
+    templates: Templates, registered: Observations, normals: PatchVectors
+) -> FlatSamples:
     """Gather the samples inside each template."""
     inside = templates.inside.flatten(1)
     longest = max(int(inside.sum(dim=1).max()), 1) if len(inside) else 1
@@ -45,10 +47,10 @@ def rows_of(templates: Templates, registered: Observations, normals: PatchVector
     num_views, num_channels = registered.radiance.shape[1:3]
     by_channel = index[:, None, None].expand(-1, num_views, num_channels, -1)
     radiance = registered.radiance.flatten(3).gather(3, by_channel)
-    seen = in_row(registered.valid, index) & within[:, None]
+    seen = flatten_samples(registered.valid, index) & within[:, None]
     # A sum is finite where all its terms are, but for overflow.
     seen = seen & radiance.sum(dim=2).isfinite()
-    return Rows(
+    return FlatSamples(
         index=index,
         radiance=torch.where(seen[:, :, None], radiance, 0),
         seen=seen,
@@ -56,7 +58,7 @@ def rows_of(templates: Templates, registered: Observations, normals: PatchVector
     )
 
 
-def in_row(
+def flatten_samples(
     raster: Shaped[Tensor, "patch view height width"], index: Int[Tensor, "patch sample"]
 ) -> Shaped[Tensor, "patch view sample"]:
     """Take the samples of a row from their rasters."""
@@ -64,7 +66,7 @@ def in_row(
     return flat.gather(2, index[:, None].expand(-1, flat.shape[1], -1))
 
 
-def on_raster(
+def scatter_samples(
     row: Float[Tensor, "patch sample *channel"] | Bool[Tensor, "patch sample"],
     index: Int[Tensor, "patch sample"],
     background: Float[Tensor, "patch height width *channel"] | PatchMask,

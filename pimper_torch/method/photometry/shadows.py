@@ -136,10 +136,10 @@ def _direction_to_light(
 ) -> tuple[Vectors, Scalars]:
     """Return the unit direction to the point light, and its distance, infinite if distant."""
     direction = normalize(field.point_light, dim=1).to(points)[view]
-    closeness = field.closeness.to(points)[view]
-    away = direction - closeness[..., None] * (points - field.origin.to(points))
+    inverse_distance = field.inverse_distance.to(points)[view]
+    away = direction - inverse_distance[..., None] * (points - field.origin.to(points))
     length = away.norm(dim=-1)
-    far = torch.where(closeness > 0, length / closeness.clamp_min(1e-30), torch.inf)
+    far = torch.where(inverse_distance > 0, length / inverse_distance.clamp_min(1e-30), torch.inf)
     return away / length.clamp_min(1e-30)[..., None], far
 
 

@@ -247,7 +247,7 @@ def _solve_by_kernel(
     weight, residual = torch.zeros_like(J), J.new_zeros(len(J))
     taken = torch.zeros(len(J), dtype=torch.int64)
     cause = torch.zeros_like(taken)
-    data = J, problem.weight, problem.anchor, problem.regularization, problem.dense_prior
+    data = J, problem.weight, problem.prior_mean, problem.regularization, problem.dense_prior
     results = lights, shading, weight, taken, residual, cause
     factorization.solve_on_cone(
         factorization.ConeProblem(*map(as_array, data)),

@@ -47,15 +47,15 @@ def fundamental_matrix(first: Matched, second: Matched, weight: Float[Tensor, " 
     return from_second.mT @ (u * s) @ v @ from_first
 
 
-def shared_geometry(still: Ends, moving: Ends, max_error_px: float) -> Matrix3:
+def shared_geometry(static: Ends, moving: Ends, max_error_px: float) -> Matrix3:
     """Fit the fundamental matrix that explains still and moving matches best; float64.
 
     The eight-point algorithm, reweighted for Cauchy's loss of Sampson's distance. Both kinds weigh
     the same. Every translation explains the still ones, so that it is mostly the moving ones that
     violate the result where no geometry explains both.
     """
-    first, second = (torch.cat(ends).double() for ends in zip(still, moving, strict=True))
-    count = torch.tensor([len(still[0]), len(moving[0])])
+    first, second = (torch.cat(ends).double() for ends in zip(static, moving, strict=True))
+    count = torch.tensor([len(static[0]), len(moving[0])])
     weight = even = (1 / count.double()).repeat_interleave(count)
     for _ in range(6):
         geometry = fundamental_matrix(first, second, weight)
@@ -113,7 +113,7 @@ def match_errors(model: SparseModel, pairs: Sequence[VerifiedPair]) -> Float[Ten
     return torch.cat([*errors, torch.zeros(0, dtype=torch.float64)])
 
 
-def explained(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool[Tensor, " match"]:
+def inliers(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool[Tensor, " match"]:
     """Find the matches on each other's epipolar lines whose point is before both cameras.
 
     Args:

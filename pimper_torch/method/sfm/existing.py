@@ -13,7 +13,7 @@ from pimper_torch.ground.geometry.lens_models import rescale_lens
 from pimper_torch.method.sfm import colmap, lenses
 from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.method.sfm.model_files import largest_model
-from pimper_torch.records import Lens, Views
+from pimper_torch.records import CameraModel, Views
 from pimper_torch.runtime.errors import InputError, ReconstructionError, caution, some
 from pimper_torch.runtime.file_names import match_poses
 
@@ -37,7 +37,7 @@ def existing_model(views: Views, path: Path) -> SparseModel:
         InputError: They do not belong to the photographs, or cannot be read.
     """
     path = largest_model(path)
-    where = place(path)
+    where = source_label(path)
     read = _model_of_file(views, path) if path.is_file() else colmap.read_model(path)
     found = match_poses(views.names, read.names, folder=views.folder, where=where, what="image")
     own = {name: at for name, at in zip(views.names, found, strict=True) if at is not None}
@@ -54,12 +54,12 @@ def existing_model(views: Views, path: Path) -> SparseModel:
             f"photographs ({', '.join(model.names)}); at least 3 are needed. Use a model that "
             "holds more of them, or leave it out to run structure from motion."
         )
-    shown = taken(views, model)
+    shown = registered_views(views, model)
     placed = _in_photographs(model, shown, _quarter_turns(model, shown, where))
     return placed.replace(points_world=read_cloud(path)) if path.is_file() else placed
 
 
-def resize_fits(lens: Lens, width: int, height: int) -> bool:
+def resize_fits(lens: CameraModel, width: int, height: int) -> bool:
     """Return whether a resize alone leads from a lens's picture to one of a different size."""
     # Rounding a side to whole pixels changes the shape by less than this.
     ratio = width / lens.width / (height / lens.height)
@@ -108,12 +108,12 @@ def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
     return [0] * model.num_views
 
 
-def place(path: Path) -> str:
+def source_label(path: Path) -> str:
     """State what cameras come from, at the start of a sentence."""
     return f"The file of cameras {path}" if path.is_file() else f"The COLMAP model in {path}"
 
 
-def taken(views: Views, model: SparseModel) -> Views:
+def registered_views(views: Views, model: SparseModel) -> Views:
     """Take the photographs of a model, in its order."""
     return views.take([views.names.index(name) for name in model.names])
 
@@ -148,7 +148,7 @@ def _model_of_file(views: Views, path: Path) -> SparseModel:
 
 def _stored_sizes(views: Views, names: Sequence[str], path: Path) -> list[tuple[int, int] | None]:
     """Return the sizes of photographs in their files, which others' programs count pixels of."""
-    where = place(path)
+    where = source_label(path)
     found = match_poses(views.names, names, folder=views.folder, where=where, what="camera")
     sizes: list[tuple[int, int] | None] = [None] * len(names)
     for name, at, (width, height) in zip(views.names, found, views.sizes_px.tolist(), strict=True):

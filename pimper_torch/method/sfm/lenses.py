@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.records import Lens, Views
+from pimper_torch.records import CameraModel, Views
 from pimper_torch.runtime.errors import InputError, some
 
 QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
@@ -52,7 +52,7 @@ def turned_pose(
     return torch.stack([x, y, *rest], dim=-2)
 
 
-def turned_lens(lens: Lens, quarters: int) -> Lens:
+def turned_lens(lens: CameraModel, quarters: int) -> CameraModel:
     """Turn a lens with its picture, of whatever model of COLMAP's: it images turned directions so.
 
     Focal lengths are exchanged by a quarter, the principal point moves, and parameters that are
@@ -71,7 +71,7 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
     return lens.replace(params=tuple(values), width=width, height=height)
 
 
-def count_focals(lens: Lens) -> int:
+def count_focals(lens: CameraModel) -> int:
     """Count the focal lengths, behind which the principal point stands."""
     return 1 if lens.model.startswith(_ONE_FOCAL) else 2
 

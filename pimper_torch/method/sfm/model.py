@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.ground.shapes import Points
-from pimper_torch.records import Lens, Record, pairs_table
-from pimper_torch.records.scene import no_maps, no_series
+from pimper_torch.records import CameraModel, Record, pairs_table
+from pimper_torch.records.scene import no_maps, no_sessions
 from pimper_torch.runtime.ledger import leave_out
 
 
@@ -28,16 +28,16 @@ class SparseModel(Record):
     """
 
     names: tuple[str, ...]
-    lenses: tuple[Lens, ...]
+    lenses: tuple[CameraModel, ...]
     cam_from_world: Float[Tensor, "view 4 4"]
     points_world: Points = field(default_factory=lambda: torch.zeros(0, 3).double())
-    observation_point: Int[Tensor, " observation"] = field(default_factory=no_series)
-    observation_view: Int[Tensor, " observation"] = field(default_factory=no_series)
+    observation_point: Int[Tensor, " observation"] = field(default_factory=no_sessions)
+    observation_view: Int[Tensor, " observation"] = field(default_factory=no_sessions)
     observation_pixels: Float[Tensor, "observation 2"] = field(
         default_factory=lambda: torch.zeros(0, 2).double()
     )
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
-    series: Int[Tensor, " divided"] = field(default_factory=no_series)
+    sessions: Int[Tensor, " divided"] = field(default_factory=no_sessions)
 
     @property
     def num_views(self) -> int:
@@ -95,7 +95,7 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
     rows, view, point = (values[tied[point]] for values in (rows, view, point))
     point = (torch.cumsum(tied, dim=0) - 1)[point]
     order = torch.argsort(point * max(len(chosen), 1) + view, stable=True)
-    maps, series = model.background_from_view, model.series
+    maps, sessions = model.background_from_view, model.sessions
     return SparseModel(
         names=tuple(model.names[index] for index in chosen),
         lenses=tuple(model.lenses[index] for index in chosen),
@@ -105,7 +105,7 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
         observation_view=view[order],
         observation_pixels=model.observation_pixels[rows[order]],
         background_from_view=maps[views] if len(maps) else maps,
-        series=series[views] if len(series) else series,
+        sessions=sessions[views] if len(sessions) else sessions,
     )
 
 

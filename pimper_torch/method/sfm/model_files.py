@@ -19,7 +19,7 @@ from pimper_torch.ground.geometry.colmap_library import loaded
 from pimper_torch.ground.geometry.rigid import rigid
 from pimper_torch.method.sfm.lenses import count_focals
 from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.records import Lens
+from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import InputError, caution, some
 
 _PARTS = ("cameras", "images", "points3D")
@@ -135,13 +135,13 @@ def _ending(folder: Path) -> str | None:
     return None
 
 
-def _binary_cameras(data: bytes) -> Iterator[Lens]:
+def _binary_cameras(data: bytes) -> Iterator[CameraModel]:
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         camera, kind, width, height = struct.unpack_from("<IiQQ", data, at)
         model, size = camera_models()[kind]
         params = struct.unpack_from(f"<{size}d", data, at + 24)
-        yield Lens(camera=camera, model=model, params=params, width=width, height=height)
+        yield CameraModel(camera=camera, model=model, params=params, width=width, height=height)
         at += 24 + 8 * size
 
 
@@ -173,14 +173,14 @@ def _lines(data: bytes) -> Iterator[str]:
     return (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
 
 
-def _text_cameras(data: bytes) -> Iterator[Lens]:
+def _text_cameras(data: bytes) -> Iterator[CameraModel]:
     counts = dict(camera_models().values())
     for line in filter(None, _lines(data)):
         camera, model, width, height, *params = line.split()
         if len(params) != counts[model]:
             raise ValueError(f"{len(params)} parameters of {model}")
         values, size = tuple(map(float, params)), {"width": int(width), "height": int(height)}
-        yield Lens(camera=int(camera), model=model, params=values, **size)
+        yield CameraModel(camera=int(camera), model=model, params=values, **size)
 
 
 def _text_images(data: bytes) -> Iterator[_Image]:
@@ -200,7 +200,7 @@ def _text_points(data: bytes) -> Iterator[_Point]:
         yield _Point(int(point), (float(x), float(y), float(z)), elements)
 
 
-def _sound(image: _Image, lens: Lens | None) -> bool:
+def _sound(image: _Image, lens: CameraModel | None) -> bool:
     """Return whether an image has a rotation, a place, and a lens with a focal length."""
     if lens is None or lens.model == "EQUIRECTANGULAR":
         return False

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
 from pimper_torch.method.sfm import matching
-from pimper_torch.method.sfm.doubt import FEWEST_VIEWS, JOINING, agreement
+from pimper_torch.method.sfm.diagnose import FEWEST_VIEWS, JOINING, agreement
 from pimper_torch.method.sfm.epipolar import sampson_errors, shared_geometry
 from pimper_torch.method.sfm.matching import Keypoints, Matches, PhotographPair, Rows
 from pimper_torch.method.sfm.model import SparseModel, select_views
@@ -47,7 +47,7 @@ class MovedObject(Record):
         around: Matches of the surroundings, within series and between.
     """
 
-    series: Int[Tensor, " view"]
+    sessions: Int[Tensor, " view"]
     tying: Matches = field(default_factory=dict)
     dropped: tuple[PhotographPair, ...] = ()
     around: Matches = field(default_factory=dict)
@@ -69,7 +69,7 @@ def find_moved_object(
         verified: Matches of each pair that its geometry explains.
         outside: Matches of the same pairs that it does not.
     """
-    whole = MovedObject(series=torch.zeros(len(keypoints), dtype=torch.long))
+    whole = MovedObject(sessions=torch.zeros(len(keypoints), dtype=torch.long))
     many = {pair: rows for pair, rows in outside.items() if len(rows) >= _MIN_SECOND}
     seconds = {}
     for pair, second in verify(many).items():
@@ -82,12 +82,12 @@ def find_moved_object(
     if len(seconds) < 3:  # a thing that a person moved between two photographs shows in few
         return whole
     votes = object_votes(keypoints, sizes_px, verified, seconds)
-    series = series_of(len(keypoints), verified, seconds, votes)
-    if int(series.max()) == 0:
+    sessions = sessions_of(len(keypoints), verified, seconds, votes)
+    if int(sessions.max()) == 0:
         return whole
     own, around_it = {}, {}
     for pair, rows in verified.items():
-        if series[pair[0]] != series[pair[1]]:
+        if sessions[pair[0]] != sessions[pair[1]]:
             counts = _counts(votes, pair, rows)
             if counts[0] <= counts[1]:
                 cast = [votes[view][outside[pair][:, side]] for side, view in enumerate(pair)]
@@ -102,7 +102,7 @@ def find_moved_object(
         pair: torch.cat([rows, seconds.get(pair, rows[:0])]) for pair, rows in verified.items()
     }
     around = {pair: rows[_total(votes, pair, rows) < 0] for pair, rows in every.items()}
-    return MovedObject(series=series, tying=tying, dropped=tuple(dropped), around=around)
+    return MovedObject(sessions=sessions, tying=tying, dropped=tuple(dropped), around=around)
 
 
 def object_votes(
@@ -134,7 +134,7 @@ def object_votes(
     return votes
 
 
-def series_of(
+def sessions_of(
     num_views: int, verified: Matches, seconds: Matches, votes: Sequence[Float[Tensor, " _"]]
 ) -> Int[Tensor, " view"]:
     """Number the series of every photograph.
@@ -183,7 +183,7 @@ def _counts(votes: Sequence[Tensor], pair: PhotographPair, rows: Rows) -> tuple[
     return int((total > 0).sum()), int((total < 0).sum())
 
 
-def tie_series(database: Path, settings: ReconstructConfig) -> tuple[matching.VerifiedPair, ...]:
+def link_sessions(database: Path, settings: ReconstructConfig) -> tuple[matching.VerifiedPair, ...]:
     """Find series between which the object was moved, and keep between them what is the object's.
 
     Args:
@@ -270,7 +270,7 @@ def with_series(
             stacklevel=4,
         )
         return model
-    leave_out("sfm.small_series", small, names=model.names)
+    leave_out("sfm.small_sessions", small, names=model.names)
     if bool(small.any()):
         model, numbers = select_views(model, (~small).nonzero()[:, 0].tolist()), numbers[~small]
     groups = [
@@ -285,7 +285,7 @@ def with_series(
             "cameras of all are around the object.",
             stacklevel=4,
         )
-        return model.replace(series=numbers)
+        return model.replace(sessions=numbers)
     if apart := [name for name in names if name not in model.names]:
         caution(
             f"The object was moved on what it stands on, and too little of it ties {len(apart)} of "

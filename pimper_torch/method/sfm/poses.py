@@ -14,7 +14,7 @@ from torch import Tensor
 from pimper_torch.ground.shapes import Scalar
 from pimper_torch.method.sfm.model import SparseModel, select_views
 from pimper_torch.records import Cameras, Prior, SilhouettePrior, SparseScene, Views, pairs_table
-from pimper_torch.records.scene import OneAPose, with_views
+from pimper_torch.records.scene import ViewPerPose, with_views
 from pimper_torch.runtime.errors import InputError, some
 from pimper_torch.runtime.mapped import by_view
 
@@ -85,7 +85,7 @@ def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
     return same.long().argmax(dim=1)  # the first of each pose
 
 
-def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPose:
+def one_view_per_pose(scene: SparseScene, needed: Collection[str] = ()) -> ViewPerPose:
     """Keep the most textured photograph of every pose; without poses, the scene as it is.
 
     Guessed silhouettes of other photographs of a pose become those of the one that is kept.
@@ -96,7 +96,7 @@ def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPos
     poses = scene.views.poses
     if poses is None:
         every = torch.arange(scene.cameras.num_views)
-        return OneAPose(scene, every, every)
+        return ViewPerPose(scene, every, every)
     rank = by_view(_texture, scene.views.images, scene.views.sizes_px)
     for view, name in enumerate(scene.views.names):
         if {name, name.rsplit(".", 1)[0]} & set(needed):
@@ -117,7 +117,7 @@ def one_view_a_pose(scene: SparseScene, needed: Collection[str] = ()) -> OneAPos
     carried = tuple(_with_leads(prior, scene.views.names, lead) for prior in few.views.priors)
     views = few.views.replace(poses=None, priors=carried)
     few = few.replace(views=views, unregistered=scene.unregistered)
-    return OneAPose(few, kept.nonzero()[:, 0], (kept.long().cumsum(dim=0) - 1)[lead])
+    return ViewPerPose(few, kept.nonzero()[:, 0], (kept.long().cumsum(dim=0) - 1)[lead])
 
 
 def _with_leads(prior: Prior, names: Sequence[str], lead: Int[Tensor, " view"]) -> Prior:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.method.sfm.doubt import choose_component, doubt
-from pimper_torch.method.sfm.existing import existing_model, place, taken
+from pimper_torch.method.sfm.diagnose import choose_component, diagnose
+from pimper_torch.method.sfm.existing import existing_model, registered_views, source_label
 from pimper_torch.method.sfm.features import SMALLEST_PX, find_features, too_small, workspace
 from pimper_torch.method.sfm.lenses import choose_lenses
 from pimper_torch.method.sfm.model import SparseModel, select_views
@@ -75,7 +75,7 @@ class Reconstruct(Stage):
         path = Path(sparse_model)
         model = existing_model(bare, path)
         if lacks_points(model):
-            model = self._triangulated(taken(bare, model), model, place(path))
+            model = self._triangulated(registered_views(bare, model), model, source_label(path))
         return placed_scene(views, model)
 
     def with_points(self, scene: SparseScene) -> SparseScene:
@@ -108,11 +108,11 @@ def placed_scene(views: Views, model: SparseModel) -> SparseScene:
             f"out: {', '.join(missing)}.",
             stacklevel=3,
         )
-    reason = "" if lacks_points(model) else doubt(model, views.num_views)
-    leave_out("sfm.doubt", bool(reason))
+    reason = "" if lacks_points(model) else diagnose(model, views.num_views)
+    leave_out("sfm.diagnosis", bool(reason))
     if reason:
         caution(reason, stacklevel=3)
-    return assemble_scene(views, model).replace(doubt=reason)
+    return assemble_scene(views, model).replace(diagnosis=reason)
 
 
 def find_model(
@@ -153,7 +153,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
             "in which there are features, of some hundred pixels at least."
         )
     model = _registered_model(views, config)
-    model = refine_tracks(taken(views, model), model, config.track_iterations)
+    model = refine_tracks(registered_views(views, model), model, config.track_iterations)
     release_memory()
     return upright(model)
 

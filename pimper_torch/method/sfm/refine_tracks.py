@@ -103,7 +103,7 @@ def _renewed(views: Views, model: SparseModel) -> tuple[SparseModel, Bool[Tensor
         sizes_px=views.sizes_px.cpu(),
     )
     planes = tracks.tangents(model.points_world, model.observed, cameras)
-    found = tracks.sight(pictures, cameras, planes)
+    found = tracks.observe_points(pictures, cameras, planes)
     del pictures  # as large as the photographs
     often = torch.bincount(found.point, minlength=len(model.points_world)) >= 3
     kept = often[found.point]

@@ -15,7 +15,13 @@ from itertools import count
 from pimper_torch.ground.geometry.colmap_library import loaded, quiet
 from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.method.sfm.colmap import model_of
-from pimper_torch.method.sfm.doubt import FEWEST_VIEWS, MOVE, count_views_with_depth, doubt, judged
+from pimper_torch.method.sfm.diagnose import (
+    FEWEST_VIEWS,
+    MOVE,
+    count_views_with_depth,
+    diagnose,
+    verify_model,
+)
 from pimper_torch.method.sfm.features import Workspace
 from pimper_torch.method.sfm.matching import (
     MOST_PAIRED,
@@ -27,10 +33,10 @@ from pimper_torch.method.sfm.matching import (
     verified_pairs,
 )
 from pimper_torch.method.sfm.model import SparseModel, drop_weak_views
-from pimper_torch.method.sfm.moved_object import tie_series
+from pimper_torch.method.sfm.moved_object import link_sessions
 from pimper_torch.method.sfm.reconstruct_config import MIN_POINTS, ReconstructConfig
 from pimper_torch.method.sfm.retrieval import pairs_to_match
-from pimper_torch.method.sfm.static_background import enter_room, leave_out_room
+from pimper_torch.method.sfm.static_background import log_static_features, remove_static_features
 from pimper_torch.runtime.errors import ReconstructionError, caution
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.progress import report
@@ -64,12 +70,12 @@ def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list
     options.triangulation.ignore_two_view_tracks = not pairs_count
     registered, total = count(3), len(space.files)  # the first call follows a model of two views
 
-    def tell() -> None:
+    def on_image() -> None:
         report(min(next(registered), total), total)  # models that begin anew add views again
 
     with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
         found = pycolmap.incremental_mapping(
-            space.database, space.images, output, options, next_image_callback=tell
+            space.database, space.images, output, options, next_image_callback=on_image
         )
     models = [model_of(reconstruction) for reconstruction in found.values()]
     return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))
@@ -106,7 +112,7 @@ class Registration:
     spread: tuple[int, ...]
     missing: tuple[str, ...]
     misplaced: Mapping[str, float]
-    explained: float
+    inlier_ratio: float
     background: tuple[Matrix3, ...] = ()
     around: tuple[VerifiedPair, ...] = ()
 
@@ -118,7 +124,7 @@ class Registration:
     @property
     def sound(self) -> bool:
         """True where nothing speaks against the model."""
-        return self.complete and self.explained >= _EXPLAINED
+        return self.complete and self.inlier_ratio >= _EXPLAINED
 
     @property
     def rank(self) -> tuple[bool, int, int]:
@@ -152,24 +158,24 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     plain = _registered(space, settings)
     if plain.sound:
         return plain
-    rest = leave_out_room(other.database, settings)
-    if rest.nothing_moves:
+    background = remove_static_features(other.database, settings)
+    if background.nothing_moves:
         raise ReconstructionError(
-            f"Nothing moves in {len(space.files)} photographs: {rest.still_fraction:.0%} of the "
-            "matches lie at the same pixel, and in no pair do enough others agree on a motion. "
+            f"Nothing moves in {len(space.files)} photographs: {background.static_fraction:.0%} of "
+            "the matches lie at the same pixel, and in no pair do enough others agree on a motion. "
             "Camera and background were at rest, and an object that turned has too little "
             f"texture. {MOVE}"
         )
-    around = () if rest.room else tie_series(other.database, settings)
-    if not rest.room and not around:
+    around = () if background.detected else link_sessions(other.database, settings)
+    if not background.detected and not around:
         return _thorough(space, plain, settings)
     rival = _registered(other, settings)
     if not rival.sound:
         rival, plain = (_thorough(*one, settings) for one in ((other, rival), (space, plain)))
-    if rival.explained <= plain.explained + _MARGIN:
+    if rival.inlier_ratio <= plain.inlier_ratio + _MARGIN:
         return plain
-    if rest.room:
-        left, total = enter_room(rest)
+    if background.detected:
+        left, total = log_static_features(background)
         caution(
             f"{left} of {total} features lie still in the photographs while others move: they are "
             "taken for those of a room before which the object turns, and are left out.",
@@ -179,7 +185,7 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
         surroundings = sum(pair.num_matches for pair in around)
         verified = sum(pair.num_matches for pair in verified_pairs(space))
         leave_out("sfm.moved_object", surroundings, total=verified)
-    return replace(rival, background=tuple(rest.maps), around=around)
+    return replace(rival, background=tuple(background.maps), around=around)
 
 
 def _registered(space: Workspace, settings: ReconstructConfig) -> Registration:
@@ -235,14 +241,16 @@ def _mapped(
     counted.sort(key=lambda one: (-one[0], -one[1].num_views, -len(one[1].points_world)))
     models = tuple(model for _, model in counted)
     if not models:
-        return Registration(models=(), spread=(), missing=space.files, misplaced={}, explained=0.0)
+        return Registration(
+            models=(), spread=(), missing=space.files, misplaced={}, inlier_ratio=0.0
+        )
     # At twice the distance that verifies a match it still agrees: the lens is the model's.
-    judgement = judged(models[0], space.files, verified, 2 * settings.max_error_px)
-    doubtful = bool(doubt(models[0], len(space.files)))
+    consistency = verify_model(models[0], space.files, verified, 2 * settings.max_error_px)
+    doubtful = bool(diagnose(models[0], len(space.files)))
     return Registration(
         models=models,
         spread=tuple(spread for spread, _ in counted),
         missing=tuple(file for file in space.files if file not in models[0].names),
-        misplaced=judgement.misplaced,
-        explained=0.0 if doubtful else judgement.explained,
+        misplaced=consistency.misplaced,
+        inlier_ratio=0.0 if doubtful else consistency.inlier_ratio,
     )

@@ -13,7 +13,7 @@ from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import SATURATED, to_bytes
 from pimper_torch.method.sfm.colmap import reprojection_errors, write_binary
-from pimper_torch.method.sfm.existing import taken
+from pimper_torch.method.sfm.existing import registered_views
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.undistort import undistort, with_undistorted_priors
 from pimper_torch.records import Cameras, Failure, SparseScene, Views
@@ -37,7 +37,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
             cam_from_world=to_local(model.cam_from_world, offset),
             points_world=model.points_world - model.points_world.new_tensor(offset),
         )
-    undistorted, intrinsics = undistort(taken(views, model), model.lenses)
+    undistorted, intrinsics = undistort(registered_views(views, model), model.lenses)
     like = views.images
     scene = SparseScene(
         views=undistorted.replace(folder=""),  # the scene is the same from another folder
@@ -55,7 +55,7 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         unregistered=tuple(name for name in views.names if name not in model.names),
         background_from_view=model.background_from_view.to(like),
         offset_world=offset,
-        series=model.series.to(like.device),
+        sessions=model.sessions.to(like.device),
     )
     return with_undistorted_priors(scene)
 

@@ -7,7 +7,7 @@ points near the axis of a turn. But there one epipolar geometry explains them to
 matches that move. No geometry explains a room at rest together with an object that turns.
 
 A room that shifts, because the tripod was touched, is not found. A model that was registered on it
-is doubted, see :mod:`pimper_torch.method.sfm.doubt`.
+is doubted, see :mod:`pimper_torch.method.sfm.diagnose`.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ from pimper_torch.runtime.progress import track
 _CONTRADICTION = 0.1
 # Longest still match. Of 24 rendered photographs of 640x480, 99 % of the matches of a room at rest
 # are shorter, and 0.4 % of those of a turning mug.
-_STILL_PX = 1.0
+_STATIC_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -51,12 +51,12 @@ class StaticBackground(Record):
     """
 
     features: tuple[Bool[Tensor, " _"], ...]
-    still_fraction: float
+    static_fraction: float
     moving_pairs: int
     violating_fraction: float
 
     @property
-    def room(self) -> bool:
+    def detected(self) -> bool:
         """True where something is at rest while something else moves."""
         return self.violating_fraction > _CONTRADICTION
 
@@ -68,15 +68,17 @@ class StaticBackground(Record):
         """
         identity = torch.eye(3).double()
         enough = [int(one.sum()) >= MIN_MATCHES for one in self.features]
-        return [identity if one else identity * torch.nan for one in enough] if self.room else []
+        return (
+            [identity if one else identity * torch.nan for one in enough] if self.detected else []
+        )
 
     @property
     def nothing_moves(self) -> bool:
         """True where most matches are still, and nowhere do enough others move."""
-        return self.still_fraction > 0.5 and self.moving_pairs == 0
+        return self.static_fraction > 0.5 and self.moving_pairs == 0
 
 
-def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackground:
+def remove_static_features(database: Path, settings: ReconstructConfig) -> StaticBackground:
     """Find what is at rest while something else moves, and keep features and matches of the latter.
 
     Pairs that were verified on what is at rest are verified anew.
@@ -89,19 +91,19 @@ def leave_out_room(database: Path, settings: ReconstructConfig) -> StaticBackgro
         matched = matching.read_matched(stored)
         verifier = matching.Verifier(matched=matched, settings=settings)
         limit = settings.max_error_px
-        rest = find_static_background(matched.keypoints, matched.pairs, verifier, limit)
-        if rest.room:
+        background = find_static_background(matched.keypoints, matched.pairs, verifier, limit)
+        if background.detected:
             geometries = matching.read_geometries(stored, matched.ids) | verifier.geometries
-            _keep_moving(stored, matched, rest, geometries)
-    return rest
+            _keep_moving(stored, matched, background, geometries)
+    return background
 
 
-def enter_room(rest: StaticBackground) -> tuple[int, int]:
+def log_static_features(background: StaticBackground) -> tuple[int, int]:
     """Enter in the ledger how many features rest with a room; return their and all numbers."""
-    resting = sum(int(one.sum()) for one in rest.features)
-    total = sum(map(len, rest.features))
-    leave_out("sfm.room", resting, total=total)
-    return resting, total
+    static = sum(int(one.sum()) for one in background.features)
+    total = sum(map(len, background.features))
+    leave_out("sfm.static_background", static, total=total)
+    return static, total
 
 
 def find_static_background(
@@ -120,41 +122,43 @@ def find_static_background(
     split = {pair: _split(keypoints, pair, rows) for pair, rows in pairs.items()}
     shown = {pair: min(map(len, both)) for pair, both in split.items()}
     order = sorted(split, key=shown.__getitem__, reverse=True)
-    telling = [pair for pair in order if shown[pair] >= MIN_MATCHES]
+    informative = [pair for pair in order if shown[pair] >= MIN_MATCHES]
     # The first pairs, which show most of both, must contradict one geometry: else no more are
     # verified.
-    for start in track(range(0, len(telling), 24)):
-        group = telling[start : start + 24]
+    for start in track(range(0, len(informative), 24)):
+        group = informative[start : start + 24]
         for pair, moving in verify({pair: split[pair][1] for pair in group}).items():
             if len(moving) < MIN_MATCHES:
                 continue
-            resting = split[pair][0]
-            still, ends = (matching.pixels_of(keypoints, pair, some) for some in (resting, moving))
-            geometry = shared_geometry(still, ends, max_error_px)
+            static_rows = split[pair][0]
+            static, ends = (
+                matching.pixels_of(keypoints, pair, some) for some in (static_rows, moving)
+            )
+            geometry = shared_geometry(static, ends, max_error_px)
             moving_pairs += 1
             num_moving += len(moving)
             num_violating += int((sampson_errors(geometry, *ends) > max_error_px).sum())
-            matching.add_votes(votes, pair, resting, torch.ones_like(resting))
+            matching.add_votes(votes, pair, static_rows, torch.ones_like(static_rows))
             matching.add_votes(votes, pair, moving, -torch.ones_like(moving))
         if num_moving and num_violating <= _CONTRADICTION * num_moving:
             break
-    num_still = sum(len(still) for still, _ in split.values())
+    num_static = sum(len(static) for static, _ in split.values())
     fraction = num_violating / max(num_moving, 1)
     return StaticBackground(
         features=tuple((one > 0) & (fraction > _CONTRADICTION) for one in votes),
-        still_fraction=num_still / max(sum(map(len, pairs.values())), 1),
+        static_fraction=num_static / max(sum(map(len, pairs.values())), 1),
         moving_pairs=moving_pairs,
         violating_fraction=fraction,
     )
 
 
 def moving_matches(
-    keypoints: Keypoints, pair: PhotographPair, rows: Rows, rest: StaticBackground
+    keypoints: Keypoints, pair: PhotographPair, rows: Rows, background: StaticBackground
 ) -> Bool[Tensor, " match"]:
     """Find matches that are neither still nor of a feature at rest."""
-    touched = rest.features[pair[0]][rows[:, 0]] | rest.features[pair[1]][rows[:, 1]]
+    touched = background.features[pair[0]][rows[:, 0]] | background.features[pair[1]][rows[:, 1]]
     first, second = matching.pixels_of(keypoints, pair, rows)
-    return ~touched & ((first - second).norm(dim=-1) >= _STILL_PX)
+    return ~touched & ((first - second).norm(dim=-1) >= _STATIC_PX)
 
 
 def _split(keypoints: Keypoints, pair: PhotographPair, rows: Rows) -> tuple[Rows, Rows]:
@@ -162,26 +166,26 @@ def _split(keypoints: Keypoints, pair: PhotographPair, rows: Rows) -> tuple[Rows
     first, second = matching.pixels_of(keypoints, pair, rows)
     length = (first - second).norm(dim=-1)
     # Features at rest that were found less exactly do not show motion.
-    return rows[length < _STILL_PX], rows[length >= 4 * _STILL_PX]
+    return rows[length < _STATIC_PX], rows[length >= 4 * _STATIC_PX]
 
 
 def _keep_moving(
     stored: Any,  # noqa: ANN401 - pycolmap is untyped
     matched: matching.Matched,
-    rest: StaticBackground,
+    background: StaticBackground,
     geometries: Mapping[PhotographPair, Any],
 ) -> None:
     described = [stored.read_descriptors(image) for image in matched.ids]
     stored.clear_descriptors()
-    for image, resting, one in zip(matched.ids, rest.features, described, strict=True):
-        moves = (~resting).numpy()
+    for image, static, one in zip(matched.ids, background.features, described, strict=True):
+        moves = (~static).numpy()
         stored.update_keypoints(image, np.array(stored.read_keypoints(image))[moves])
         kept = loaded().FeatureDescriptors(one.type, one.data[moves])
         stored.write_descriptors(image, kept)
-    number = [torch.cumsum(~resting, dim=0) - 1 for resting in rest.features]
+    number = [torch.cumsum(~static, dim=0) - 1 for static in background.features]
 
     def moving(pair: PhotographPair, rows: Rows) -> np.ndarray:
-        rows = rows[moving_matches(matched.keypoints, pair, rows, rest)]
+        rows = rows[moving_matches(matched.keypoints, pair, rows, background)]
         ends = [number[view][rows[:, side]] for side, view in enumerate(pair)]
         return torch.stack(ends, dim=1).numpy().astype(np.uint32)
 

@@ -223,7 +223,7 @@ class _Window:
         return heavy - heavy @ self.light @ self.light.mT
 
 
-def sight(
+def observe_points(
     pictures: LogPictures,
     cameras: Cameras,
     tangents: Tangents,
@@ -242,13 +242,13 @@ def sight(
     limits = torch.tensor([*_LIMITS, max_shift_px], dtype=torch.float64)
     found = []
     for first in range(0, max(len(tangents.points_world), 1), at_once):
-        part = _sight(pictures, cameras, tangents.take(slice(first, first + at_once)), limits)
+        part = _observed(pictures, cameras, tangents.take(slice(first, first + at_once)), limits)
         found.append(part.replace(point=part.point + first))
     return TrackObservations.cat(found)
 
 
 @torch.no_grad()
-def _sight(
+def _observed(
     pictures: LogPictures, cameras: Cameras, tangents: Tangents, limits: Float[Tensor, " limit"]
 ) -> TrackObservations:
     from pimper_torch.ground.kernels.patch_alignment import align

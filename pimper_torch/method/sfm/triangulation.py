@@ -17,7 +17,7 @@ from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.method.sfm.refine_tracks import refine_tracks
 from pimper_torch.method.sfm.retrieval import pairs_to_match
-from pimper_torch.method.sfm.static_background import enter_room, leave_out_room
+from pimper_torch.method.sfm.static_background import log_static_features, remove_static_features
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.runtime.errors import InputError, caution
 from pimper_torch.runtime.memory import release_memory
@@ -65,7 +65,7 @@ def triangulate(
         release_memory()
         if sum(count > 0 for count in counts) >= 2:
             matching.match_pairs(space, pairs_to_match(space), settings)
-            enter_room(leave_out_room(space.database, settings))
+            log_static_features(remove_static_features(space.database, settings))
         verified = matching.verified_pairs(space)
         require_agreement(given, verified, settings.max_error_px, where)
         offset = local_origin(given.cam_from_world, cloud)
@@ -116,7 +116,7 @@ def require_agreement(
     """
     total = sum(pair.num_matches for pair in verified)
     pairs, cameras = epipolar.undistorted_pairs(model, verified), epipolar.pinholes_of(model)
-    right = sum(int(epipolar.explained(cameras, pair, max_error_px).sum()) for pair in pairs)
+    right = sum(int(epipolar.inliers(cameras, pair, max_error_px).sum()) for pair in pairs)
     if total < 2 * MIN_MATCHES or right >= _DOUBTFUL * total:
         return
     found = (
@@ -153,7 +153,7 @@ def _match_along_lines(
         if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
     }
     for known in epipolar.undistorted_pairs(model, verified):
-        if count := int(epipolar.explained(cameras, known, limit).sum()):
+        if count := int(epipolar.inliers(cameras, known, limit).sum()):
             weights[known.views] = weights.get(known.views, 0.0) + count
     pairs = matching.strongest(weights, model.num_views, max(settings.guided_pairs, 1))
     with quiet(), loaded().Database.open(space.database) as stored:
@@ -173,7 +173,7 @@ def _match_along_lines(
             ends = matching.VerifiedPair(
                 views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
             )
-            return found[epipolar.explained(cameras, ends, limit)]
+            return found[epipolar.inliers(cameras, ends, limit)]
 
         stored.clear_two_view_geometries()
         for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):

@@ -14,9 +14,9 @@ from pimper_torch.ground.radiometry import SATURATED
 from pimper_torch.ground.shapes import Mask, Matrix3
 from pimper_torch.records import (
     AlbedoPrior,
+    CameraModel,
     DepthPrior,
     InlierPrior,
-    Lens,
     LightPrior,
     MapPrior,
     NormalPrior,
@@ -33,7 +33,9 @@ Picture = Float[Tensor, "channel height width"]
 Places = Float[Tensor, "1 height width 2"]
 
 
-def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tensor, "view 3 3"]]:
+def undistort(
+    views: Views, lenses: tuple[CameraModel, ...]
+) -> tuple[Views, Float[Tensor, "view 3 3"]]:
     """Resample photographs so that straight lines in space are straight in the image.
 
     The pinholes are those of :func:`pinhole_for`, of the photographs' sizes.
@@ -59,7 +61,7 @@ def undistort(views: Views, lenses: tuple[Lens, ...]) -> tuple[Views, Float[Tens
     return views.replace(images=images, masks=None if whole else valid), pinholes
 
 
-def undistorted(views: Views, lenses: tuple[Lens, ...]) -> Iterator[tuple[Picture, Mask]]:
+def undistorted(views: Views, lenses: tuple[CameraModel, ...]) -> Iterator[tuple[Picture, Mask]]:
     """Undistort photographs one by one, as :func:`undistort` does, without padding."""
     shared = source_grid(lenses[0], like=views.images) if len(set(lenses)) == 1 else None
 
@@ -84,14 +86,14 @@ def undistorted(views: Views, lenses: tuple[Lens, ...]) -> Iterator[tuple[Pictur
     release_memory()  # of the photographs, and of their grids
 
 
-def pinholes_for(lenses: tuple[Lens, ...]) -> Float[Tensor, "view 3 3"]:
+def pinholes_for(lenses: tuple[CameraModel, ...]) -> Float[Tensor, "view 3 3"]:
     """Return ``K`` of each lens's :func:`pinhole_for`, in float64."""
     found = {lens: pinhole_for(lens) for lens in dict.fromkeys(lenses)}
     return torch.stack([found[lens] for lens in lenses])
 
 
 def source_grid(
-    lens: Lens, like: Tensor, width: int = 0, height: int = 0
+    lens: CameraModel, like: Tensor, width: int = 0, height: int = 0
 ) -> tuple[Places, Mask] | None:
     """Return where pixels of the pinhole image are in the photograph, and which are in it at all.
 
@@ -117,7 +119,7 @@ def _sampled(raster: Picture, grid: Places) -> Picture:
     return grid_sample(raster[None], grid, mode="bilinear", align_corners=False)[0]
 
 
-def pinhole_for(lens: Lens) -> Matrix3:
+def pinhole_for(lens: CameraModel) -> Matrix3:
     """Choose the pinhole that a photograph is undistorted to; ``K`` in float64.
 
     It keeps the lens's principal point and, for a lens that bulges (barrel), its focal
@@ -143,7 +145,7 @@ def pinhole_for(lens: Lens) -> Matrix3:
 
 
 def photograph_pixels(
-    lens: Lens, width: int = 0, height: int = 0
+    lens: CameraModel, width: int = 0, height: int = 0
 ) -> Float[Tensor, "height width 2"]:
     """Find where in the photograph each pixel of its pinhole image comes from.
 
@@ -191,7 +193,7 @@ def with_undistorted_priors(scene: SparseScene) -> SparseScene:
     priors = scene.views.priors
     if all(isinstance(prior, LightPrior) or prior.undistorted for prior in priors):
         return scene
-    lenses: dict[str, Lens | None] = dict.fromkeys(scene.views.names)
+    lenses: dict[str, CameraModel | None] = dict.fromkeys(scene.views.names)
     lenses |= dict(zip(scene.views.names, scene.lenses, strict=False))
     placed: tuple[Prior, ...] = tuple(
         prior if isinstance(prior, LightPrior) or prior.undistorted else _undistorted(prior, lenses)
@@ -200,7 +202,7 @@ def with_undistorted_priors(scene: SparseScene) -> SparseScene:
     return scene.replace(views=scene.views.replace(priors=placed))
 
 
-def _undistorted(prior: AnyMap, lenses: Mapping[str, Lens | None]) -> AnyMap:
+def _undistorted(prior: AnyMap, lenses: Mapping[str, CameraModel | None]) -> AnyMap:
     straight = [
         _straight(prior.take([index]), lenses[name])
         for index, name in enumerate(prior.names)
@@ -209,7 +211,7 @@ def _undistorted(prior: AnyMap, lenses: Mapping[str, Lens | None]) -> AnyMap:
     return type(prior).cat(straight or [prior.take([])]).replace(undistorted=True)
 
 
-def _straight(one: AnyMap, lens: Lens | None) -> AnyMap:
+def _straight(one: AnyMap, lens: CameraModel | None) -> AnyMap:
     """Resample one map; the rest of its raster stays as it is."""
     width, height = one.sizes_px[0].tolist()
     grid = source_grid(lens, one.sizes_px.double(), width, height) if lens else None

@@ -53,8 +53,8 @@ def up_direction(model: SparseModel) -> Float[Tensor, "3"]:
 
     Where the object was turned over between series of photographs, it is that of the first.
     """
-    if len(model.series):
-        first = (model.series == model.series[0]).nonzero()[:, 0]
+    if len(model.sessions):
+        first = (model.sessions == model.sessions[0]).nonzero()[:, 0]
         model = select_views(model, first.tolist())
     level = level_up(model.cam_from_world)
     tracked = model.points_world[model.observed.sum(dim=1) >= 3]

@@ -99,7 +99,9 @@ def soft_masks_of(views: Views, sizes_px: Int[Tensor, "view 2"]) -> SoftMasks | 
     return SoftMasks(inside=torch.sigmoid(odds), given=given, seeds_px=centres)
 
 
-def pointed_at(hull: Hull, cameras: Cameras, seeds_px: Sequence[Float[Tensor, "_ 2"]]) -> Hull:
+def keep_seeded_components(
+    hull: Hull, cameras: Cameras, seeds_px: Sequence[Float[Tensor, "_ 2"]]
+) -> Hull:
     """Keep the components of a hull that rays through seeds meet first.
 
     Returns:
@@ -191,7 +193,7 @@ class Cues(Record):
         if self.plane is not None:
             found.append(parallax.plane_agreement(self.pictures, self.plane, self.fixation, masks))
         if len(self.background_from_view):
-            room = parallax.room_agreement(self.pictures, self.background_from_view, masks)
+            room = parallax.background_agreement(self.pictures, self.background_from_view, masks)
             surrounded = self.surrounded()
             found.append(by_view(lambda one, at: one.masked_fill(at, torch.nan), room, surrounded))
         if not found:
@@ -209,7 +211,7 @@ class Cues(Record):
         voting = given if int(given.sum()) >= FEW else None
         return self.replace(soft=self.soft.replace(given=given)), voting
 
-    def looked_at(self) -> "Cues":
+    def seed_at_fixation(self) -> "Cues":
         """Point at the fixation point in every view."""
         if self.soft is None:
             return self
@@ -255,7 +257,7 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
         soft=soft_masks_of(scene.views, cameras.sizes_px),
     )
     if not len(cues.background_from_view):
-        rests = parallax.room_at_rest(pictures, cues.surrounded())
+        rests = parallax.static_background_maps(pictures, cues.surrounded())
         cues = cues.replace(background_from_view=rests)
     return cues.relearned(None)
 

@@ -29,7 +29,7 @@ from pimper_torch.ground.geometry.opencv import (
 )
 from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
 from pimper_torch.ground.shapes import Map, Maps, Mask, Masks, PerView, Pixels, Scalar, ViewMask
-from pimper_torch.method.silhouettes.cues import FEW, MIN_POINTS, Cues, pointed_at
+from pimper_torch.method.silhouettes.cues import FEW, MIN_POINTS, Cues, keep_seeded_components
 from pimper_torch.method.silhouettes.parallax import DISPUTED, of_views
 from pimper_torch.records import Record, Silhouettes
 from pimper_torch.runtime.ledger import leave_out
@@ -194,7 +194,7 @@ def _compared(cues: Cues, masks: Masks) -> tuple[Cues, Masks, Masks]:
     if agreement is None:
         return cues, masks, torch.zeros_like(masks)
     whole = of_views(lambda view: filled(masks[view], agreement[view]), len(masks))
-    hidden = of_views(lambda view: in_front(whole[view], agreement[view]), len(masks))
+    hidden = of_views(lambda view: occluder_mask(whole[view], agreement[view]), len(masks))
     return cues, whole, hidden
 
 
@@ -212,7 +212,7 @@ def _first(cues: Cues) -> Masks:
             mask = cues.soft.masks[view]
             return mask if agreement is None else mask & ~surely_on_plane(agreement)
         if agreement is not None and (cues.all_round or not cues.has_points):
-            return off_plane(agreement) | not_seen_through(object_px, agreement)
+            return off_plane_mask(agreement) | not_seen_through(object_px, agreement)
         labels = labels_from_points(object_px, cues.background_px[view], agreement, (width, height))
         margin = signed_distance(convex_hull_of(object_px, (width, height)))
         return _cut(grab_cut_halved, cues, view, labels, margin)
@@ -290,7 +290,7 @@ def _voted(
     if cues.plane is not None:
         hull = hull.above(cues.plane.normal_world, cues.plane.offset)
     if cues.soft is not None:
-        hull = pointed_at(hull, cameras, cues.soft.seeds_px)
+        hull = keep_seeded_components(hull, cameras, cues.soft.seeds_px)
     height, width = inside.shape[1:]
 
     def margin(view: int) -> Map:
@@ -359,13 +359,13 @@ def labels_from_soft(labels: Labels, mask: Mask, margin: Map) -> Labels:
     return torch.where(outside, BACKGROUND, labels)
 
 
-def off_plane(agreement: Map) -> Mask:
+def off_plane_mask(agreement: Map) -> Mask:
     """Find what does not show the plane, or where it is always hidden; unknown counts as plane."""
     found = _grainless(agreement < _NOT_PLANE)
     return filled(closed(found, round(1 / 50 * max(agreement.shape))), agreement)
 
 
-def in_front(cut: Mask, agreement: Map) -> Mask:
+def occluder_mask(cut: Mask, agreement: Map) -> Mask:
     """Find what is in front of the plane but not the object, such as a person, who may hide it.
 
     Windows that hold some of the object do not agree with the plane either: what is as narrow as

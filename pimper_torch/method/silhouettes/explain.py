@@ -10,7 +10,7 @@ from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.records import Explained, Mesh, Surface
+from pimper_torch.records import Mesh, SilhouetteCoverage, Surface
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.parallel import side_by_side
 
@@ -18,7 +18,7 @@ from pimper_torch.runtime.parallel import side_by_side
 @torch.no_grad()
 def explain(
     surface: Mesh | Surface, contours: Contours, names: Sequence[str] = (), most: float = 0.1
-) -> Explained:
+) -> SilhouetteCoverage:
     """Compare a surface with the silhouettes that it was made from; a constant to autograd.
 
     Args:
@@ -57,4 +57,4 @@ def explain(
                 f"{most:.0%}. Look at its silhouette in overview.png; `--masks` replaces it.",
                 stacklevel=2,
             )
-    return Explained(uncovered=uncovered, outside=outside)
+    return SilhouetteCoverage(uncovered=uncovered, outside=outside)

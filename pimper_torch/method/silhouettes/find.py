@@ -8,7 +8,7 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from pimper_torch.ground.geometry.supporting_plane import PLANE_TOLERANCE
-from pimper_torch.ground.geometry.visual_hull import box_round, margins, visual_hull
+from pimper_torch.ground.geometry.visual_hull import bounding_box, margins, visual_hull
 from pimper_torch.ground.shapes import ViewMask
 from pimper_torch.method.silhouettes.cues import Cues, cues_of
 from pimper_torch.method.silhouettes.cuts import NUM_VOXELS, Cuts, cut_in_iterations
@@ -21,7 +21,7 @@ from pimper_torch.method.silhouettes.reliability import (
 )
 from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import Failure, Silhouettes, SparseScene
-from pimper_torch.records.scene import OneAPose, with_views
+from pimper_torch.records.scene import ViewPerPose, with_views
 from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.ledger import leave_out
@@ -72,7 +72,7 @@ class FindSilhouettes(Stage):
                 "`silhouettes.object` is masks, but the photographs come without any. Give a "
                 "folder of masks, or let silhouettes be found: `silhouettes.object` auto."
             )
-        return by_series(scene, self._found).to(scene.views.images.device)
+        return by_session(scene, self._found).to(scene.views.images.device)
 
     def _agreeing(self, silhouettes: Silhouettes, scene: SparseScene) -> Silhouettes:
         """Replace masks that clearly contradict the others by what the hull of these shows."""
@@ -85,9 +85,9 @@ class FindSilhouettes(Stage):
                 "whether they show the same object in all photographs, and whether the cameras are "
                 "those of these; or leave the masks out."
             )
-        _tell(doubted, scene.views.names, "its mask contradicts those of the others", _BY_HULL)
+        _warn(doubted, scene.views.names, "its mask contradicts those of the others", _BY_HULL)
         others = silhouettes.replace(reliable=silhouettes.reliable & ~doubted)
-        cameras, box = scene.cameras.to(torch.float32), box_round(others, scene.cameras)
+        cameras, box = scene.cameras.to(torch.float32), bounding_box(others, scene.cameras)
         hull = None
         if box is not None:
             hull = visual_hull(others, cameras, box.float(), num_voxels=NUM_VOXELS)
@@ -108,8 +108,8 @@ class FindSilhouettes(Stage):
         cuts, doubt = _cut(cues)
         if doubt and cues.soft is not None and not cues.soft.points:
             # Several things stand apart: the one that cameras look at is likelier than all.
-            cuts, doubt = _cut(cues.looked_at())
-        leave_out("silhouettes.doubt", bool(doubt))
+            cuts, doubt = _cut(cues.seed_at_fixation())
+        leave_out("silhouettes.disagreement", bool(doubt))
         if cuts is None or doubt:
             above = cues.plane is not None
             what = "above the plane that it stands on" if above else "that the photographs show"
@@ -127,7 +127,7 @@ class FindSilhouettes(Stage):
                 "pixel that shows the object. Choose another by `--object-at`, or give masks that "
                 "hold it."
             )
-        _tell(cuts.doubted, scene.views.names, _UNLIKE, "It is cut as if it had come without")
+        _warn(cuts.doubted, scene.views.names, _UNLIKE, "It is cut as if it had come without")
         return _believed(silhouettes_of(cuts, scene.views), scene.views.names)
 
 
@@ -207,7 +207,7 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
 
 
 def of_all_photographs(
-    scene: SparseScene, few: OneAPose, found: Silhouettes
+    scene: SparseScene, few: ViewPerPose, found: Silhouettes
 ) -> tuple[SparseScene, Silhouettes]:
     """Carry silhouettes of one photograph a pose to all photographs of the scene.
 
@@ -230,11 +230,11 @@ def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
     leave_out("silhouettes.empty", empty, names=names)
     if not bool(empty.any()):
         return silhouettes
-    _tell(empty, names, "its silhouette is empty", "These silhouettes do not constrain the surface")
+    _warn(empty, names, "its silhouette is empty", "These silhouettes do not constrain the surface")
     return silhouettes.replace(reliable=silhouettes.reliable & ~empty)
 
 
-def _tell(views: ViewMask, names: tuple[str, ...], reason: str, done: str) -> None:
+def _warn(views: ViewMask, names: tuple[str, ...], reason: str, done: str) -> None:
     skipped(
         *(
             Failure(stage="silhouettes", what="view", name=names[view], reason=reason, done=done)
@@ -243,7 +243,7 @@ def _tell(views: ViewMask, names: tuple[str, ...], reason: str, done: str) -> No
     )
 
 
-def by_series(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) -> Silhouettes:
+def by_session(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) -> Silhouettes:
     """Find silhouettes in the views of each series, and put them side by side.
 
     Args:
@@ -252,12 +252,12 @@ def by_series(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) ->
     Returns:
         Of all views. Where those of one series are everything, everything above every known plane.
     """
-    if not len(scene.series):
+    if not len(scene.sessions):
         return find(scene)
-    views = [(scene.series == number).nonzero()[:, 0] for number in torch.unique(scene.series)]
+    views = [(scene.sessions == number).nonzero()[:, 0] for number in torch.unique(scene.sessions)]
     found = [find(part(scene, one.tolist())) for one in views]
     doubtful = sum(one.source == "everything" for one in found)
-    leave_out("silhouettes.by_series", doubtful, total=len(found))
+    leave_out("silhouettes.by_session", doubtful, total=len(found))
     if doubtful:
         planes = torch.cat([one.planes_world for one in found])
         return Silhouettes.everything(scene.views, planes)
@@ -275,4 +275,4 @@ def part(scene: SparseScene, views: list[int]) -> SparseScene:
     kept = torch.zeros(scene.views.num_views, dtype=torch.bool)
     kept[views] = True
     some = with_views(scene, kept)
-    return some.replace(series=some.series[:0])
+    return some.replace(sessions=some.sessions[:0])

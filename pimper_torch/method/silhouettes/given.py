@@ -21,7 +21,7 @@ from pimper_torch.ground.geometry.opencv import shrunk, signed_distance
 from pimper_torch.ground.geometry.pixels import grid_from_pixels, scale_intrinsics
 from pimper_torch.ground.geometry.projection import project, rays_through
 from pimper_torch.ground.geometry.supporting_plane import well_tracked
-from pimper_torch.ground.geometry.visual_hull import box_round
+from pimper_torch.ground.geometry.visual_hull import bounding_box
 from pimper_torch.ground.shapes import Maps, Mask, PerView, ViewMask
 from pimper_torch.method.silhouettes.cues import points_at, soft_masks_of
 from pimper_torch.records import Cameras, SilhouettePrior, Silhouettes, SparseScene, Views
@@ -410,7 +410,7 @@ def _denied(borders: Maps, cameras: Cameras, count: int) -> tuple[Places, Places
     """
     masks, views = borders > 0, range(len(borders))
     shown = Silhouettes(inside=masks.float(), reliable=masks.flatten(1).any(dim=1), source="masks")
-    box = box_round(shown, cameras)
+    box = bounding_box(shown, cameras)
     if box is None or not bool(shown.reliable.all()):
         return None
 

@@ -136,7 +136,7 @@ def plane_agreement(
     return texture_agreement(pictures, near, far, hidden)
 
 
-def room_agreement(
+def background_agreement(
     pictures: WorkingPictures, background_from_view: Homographies, hidden: Masks | None = None
 ) -> Maps:
     """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
@@ -168,14 +168,16 @@ def room_agreement(
     return texture_agreement(pictures, raster, raster, hidden)
 
 
-def room_at_rest(pictures: WorkingPictures, surrounded: Masks) -> Float[Tensor, "mapped 3 3"]:
+def static_background_maps(
+    pictures: WorkingPictures, surrounded: Masks
+) -> Float[Tensor, "mapped 3 3"]:
     """Find a static background of an object that turned, also if the camera was shifted meanwhile.
 
     Args:
         surrounded: Pixels that the object's points surround.
 
     Returns:
-        Maps for :func:`room_agreement`; none if the photographs do not agree.
+        Maps for :func:`background_agreement`; none if the photographs do not agree.
     """
     longer, nowhere = max(pictures.grey.shape[1:]), torch.zeros_like(surrounded[0])
     textures = by_view(
@@ -189,7 +191,7 @@ def room_at_rest(pictures: WorkingPictures, surrounded: Masks) -> Float[Tensor, 
     maps = torch.eye(3).double().repeat(len(found), 1, 1)
     maps[:, :2, 2] = torch.stack([shift for shift, _ in found]) / torch.tensor(pictures.factors)
     if torch.stack([alike for _, alike in found]).median() > _ALIKE:
-        shown = (room_agreement(pictures, maps) > _SHOWN) & ~surrounded
+        shown = (background_agreement(pictures, maps) > _SHOWN) & ~surrounded
         if (shown.sum(dim=(1, 2)) / (~surrounded).sum(dim=(1, 2))).median() > _AT_REST:
             return maps
     return maps[:0]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pimper_torch.doors.size.given import Mark, number_of, require_inside
+from pimper_torch.doors.scale.given import Mark, number_of, require_inside
 from pimper_torch.priors.from_maps import silhouettes_from, stacked
 from pimper_torch.priors.prior_files.folder import read_maps, single
 from pimper_torch.priors.prior_files.map_file import Layer

@@ -56,13 +56,13 @@ def textured(
     if atlas is None:
         side = float(surfaces.side_lengths(full.vertices_world[full.faces]).median())
         atlas = unwrapped(few, side / _TEXELS_PER_SIDE)
-    full, doubt = inpainted(full)
+    full, uncertainty = inpainted(full)
     normals = carried_normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
     shape = surfaces.vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
     tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
-    values = torch.cat([carried_normals(full), colors, doubt[:, None]], dim=1)
+    values = torch.cat([carried_normals(full), colors, uncertainty[:, None]], dim=1)
     caster, laid = RayCaster(full.vertices_world, full.faces), _laid(atlas)
     upright = surfaces.unit_face_normals(full.vertices_world, full.faces)
     # Few faces are off by far less than their sides; a surface farther away is elsewhere.
@@ -105,7 +105,7 @@ def textured(
         tangent=tangent,
         normal=(255 * (0.5 + 0.5 * raster[..., :3])).round().to(torch.uint8),
         base_color=to_bytes(raster[..., 3:6]),
-        doubt=(255 * raster[..., 6]).round().to(torch.uint8),
+        uncertainty=(255 * raster[..., 6]).round().to(torch.uint8),
         reflectance=None if reflectance is None else raster[..., 7:],
         charts=atlas.charts,
     )
@@ -121,7 +121,7 @@ def halved(asset: Textured) -> Textured:
     return asset.replace(
         base_color=half(asset.base_color.float()).round().to(torch.uint8),
         normal=half(asset.normal.float()).round().to(torch.uint8),
-        doubt=half(asset.doubt[..., None].float())[..., 0].round().to(torch.uint8),
+        uncertainty=half(asset.uncertainty[..., None].float())[..., 0].round().to(torch.uint8),
         reflectance=None if reflectance is None else half(reflectance),
     )
 

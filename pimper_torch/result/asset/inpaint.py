@@ -29,9 +29,9 @@ def inpainted(mesh: Mesh) -> tuple[Mesh, PerVertex]:
         return mesh, torch.zeros_like(mesh.vertices_world[:, 0])
     finite = albedo.isfinite().all(dim=1)
     sure = (confidence >= _LEAST_CONFIDENCE) & finite
-    doubt = torch.where(sure, 0.0, UNDETERMINED).to(albedo)
+    uncertainty = torch.where(sure, 0.0, UNDETERMINED).to(albedo)
     if not bool(sure.any()):
-        return mesh, doubt
+        return mesh, uncertainty
     edges, _ = face_edges(mesh.faces)
     brightness = albedo.amax(dim=1)
     usual = about_mean(albedo, sure, edges).amax(dim=1)
@@ -40,6 +40,6 @@ def inpainted(mesh: Mesh) -> tuple[Mesh, PerVertex]:
     label = vertex_components(mesh.faces, above)
     bright = above & torch.isin(label, label[above & (brightness > most)]) | ~finite
     if not bool(bright.any()):
-        return mesh, doubt
+        return mesh, uncertainty
     continued = mesh.replace(albedo=about_mean(albedo, ~bright, edges))
-    return continued, torch.where(bright, INPAINTED, doubt)
+    return continued, torch.where(bright, INPAINTED, uncertainty)

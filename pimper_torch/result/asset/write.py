@@ -62,9 +62,9 @@ def write_asset(
     if asset.reflectance is not None:
         pictures = _reflect(material, asset.reflectance, len(images))
         images += [_encoded(picture, texture) for picture in pictures]
-    if bool(asset.doubt.any()):
+    if bool(asset.uncertainty.any()):
         material["extras"] = {"albedo_doubt": {"index": len(images)}}
-        images.append(_encoded(asset.doubt, "png"))
+        images.append(_encoded(asset.uncertainty, "png"))
     data = gltf_of(
         {name: values.numpy() for name, values in attributes.items() if values is not None},
         mesh.faces.numpy(),

@@ -202,7 +202,9 @@ def _fit(
     if len(seen.radiance) == 0:
         none = torch.zeros(1, seen.radiance.shape[1])
         up = torch.tensor([[0.0, 0.0, 1.0]])
-        return ViewLights(direction_world=up, closeness=none[:, 0], ambient=none, directed=none)
+        return ViewLights(
+            direction_world=up, inverse_distance=none[:, 0], ambient=none, directed=none
+        )
     few, many = seen.thinned(_FEW), seen.thinned(_MANY)
     scale = loss_scale(few)
 
@@ -223,7 +225,7 @@ def _fit(
 
     lights = pad(even_directions(_DIRECTIONS).float(), (0, 1))
     if start is not None:
-        lights = torch.cat([start.direction_world, start.closeness[:, None]], dim=1)
+        lights = torch.cat([start.direction_world, start.inverse_distance[:, None]], dim=1)
     else:
         far = best(few, lights[None], shadows=False, most=_CANDIDATES)[0]
         starts = best(few, torch.stack([pad(far[:, :3], (0, 1), value=one) for one in _CLOSENESS]))
@@ -234,7 +236,10 @@ def _fit(
         lights = best(many, _neighbours(lights[0], step)[None])[0]
     ambient, directed, _ = fit_strengths(many, *rendered(many, lights[:1]), scale)
     return ViewLights(
-        direction_world=lights[:1, :3], closeness=lights[:1, 3], ambient=ambient, directed=directed
+        direction_world=lights[:1, :3],
+        inverse_distance=lights[:1, 3],
+        ambient=ambient,
+        directed=directed,
     )
 
 

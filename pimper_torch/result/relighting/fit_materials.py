@@ -79,7 +79,9 @@ class _Trial:
         self.observed = [observed[view].thinned(most) for view in shown]
         self.scales = [loss_scale(seen) for seen in self.observed]
         self.incidence = [
-            surface.incidence(seen.pixels, lights.direction_world[[view]], lights.closeness[[view]])
+            surface.incidence(
+                seen.pixels, lights.direction_world[[view]], lights.inverse_distance[[view]]
+            )
             for view, seen in zip(shown, self.observed, strict=True)
         ]
 

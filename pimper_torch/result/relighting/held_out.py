@@ -6,7 +6,7 @@ from torch import Tensor
 
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
-from pimper_torch.records.finished import Judged, Materials, Relighting, Textured, ViewLights
+from pimper_torch.records.finished import Materials, Relighting, Textured, ViewErrors, ViewLights
 from pimper_torch.result.relighting.fit_lights import Observed, lights_of, observe_all
 from pimper_torch.result.relighting.fit_materials import materials_under
 from pimper_torch.result.relighting.lit_surface import (
@@ -42,7 +42,7 @@ def shaded(
 ) -> Radiance:
     """Return the linear radiance of pixels."""
     material = None if materials is None else materials.at_vertices()[pixels.vertex]
-    incidence = surface.incidence(pixels, light.direction_world, light.closeness)
+    incidence = surface.incidence(pixels, light.direction_world, light.inverse_distance)
     lit = response(pixels, incidence, material)[0]
     return light.ambient * diffuse_color(pixels, material) + light.directed * lit
 
@@ -88,8 +88,8 @@ class Relight(Stage):
         return Relighting(
             lights=lights,
             materials=materials,
-            judged=judge(surface, observed, names, fitted, materials),
-            matte=judge(surface, observed, names, matte),
+            errors=view_errors(surface, observed, names, fitted, materials),
+            matte=view_errors(surface, observed, names, matte),
             held_out=held_out is not None,
         )
 
@@ -100,22 +100,22 @@ def judge_textures(
     """Add the errors of the textured surface under the same lights."""
     surface = TexturedSurface(asset)
     observed = observe_all(surface, scene, silhouettes)
-    judged, few = relighting.judged, relighting.materials
+    errors, few = relighting.errors, relighting.materials
     materials = few.replace(cluster=few.cluster[asset.vertex])
-    found = judge(surface, observed, judged.names, judged.lights, materials)
+    found = view_errors(surface, observed, errors.names, errors.lights, materials)
     return relighting.replace(textured=found)
 
 
-def judge(
+def view_errors(
     surface: LitSurface,
     observed: list[Observed],
     names: tuple[str, ...],
     lights: ViewLights,
     materials: Materials | None = None,
-) -> Judged:
+) -> ViewErrors:
     """Compare photographs with what the surface shows under lights."""
     found = [
         psnr(shaded(surface, seen.pixels, lights.take([view]), materials), seen.radiance)
         for view, seen in enumerate(observed)
     ]
-    return Judged(psnr_db=torch.tensor(found), lights=lights, names=names)
+    return ViewErrors(psnr_db=torch.tensor(found), lights=lights, names=names)

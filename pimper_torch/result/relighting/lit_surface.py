@@ -140,7 +140,7 @@ class LitSurface:
         self,
         pixels: SurfacePixels,
         directions: Float[Tensor, "light 3"],
-        closeness: Float[Tensor, " light"],
+        inverse_distance: Float[Tensor, " light"],
         *,
         shadows: bool = True,
     ) -> Incidence:
@@ -152,7 +152,7 @@ class LitSurface:
             shadows: Whether the surface casts any; without, only back faces are dark.
         """
         offset = (pixels.points_world - self.center_world) / self.radius
-        toward = directions[:, None] - closeness[:, None, None] * offset
+        toward = directions[:, None] - inverse_distance[:, None, None] * offset
         # No point is nearer to a light.
         distance = toward.norm(dim=-1).clamp_min(0.1)
         toward = toward / distance[..., None]

@@ -588,7 +588,7 @@
       this.camera.updateMatrixWorld();
       const towards = this.direction();
       const { fitted, plain } = this;
-      const distance = this.middle.radius / Math.max(fitted?.closeness ?? 0, REMOTE);
+      const distance = this.middle.radius / Math.max(fitted?.inverse_distance ?? 0, REMOTE);
       this.light.position.copy(towards).transformDirection(this.camera.matrixWorld)
         .multiplyScalar(distance).add(this.middle.center);
       // Radiance is albedo times light here; the renderer divides it by pi, and by the distance's

@@ -31,7 +31,15 @@ _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
 # Of summary.json; paths on the machine of the run stay out of a page that is sent to others.
 _SHOWN = (
-    *("doubt", "warnings", "failures", "stages", "seconds", "peak_memory_mb", "peak_memory_stage"),
+    *(
+        "diagnosis",
+        "warnings",
+        "failures",
+        "stages",
+        "seconds",
+        "peak_memory_mb",
+        "peak_memory_stage",
+    ),
     *("registered", "views", "triangles", "vertices", "simplified", "reduced", "relighting"),
 )
 

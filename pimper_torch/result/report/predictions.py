@@ -91,9 +91,9 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
     Args:
         mesh: In the scene's frame, with albedo.
     """
-    surface, judged = LitSurface(mesh), relighting.judged
+    surface, errors = LitSurface(mesh), relighting.errors
     longest = longest_px(scene.views.num_views) // 2  # rays are what they cost
-    worth = dict(zip(judged.names, judged.psnr_db.tolist(), strict=True))
+    worth = dict(zip(errors.names, errors.psnr_db.tolist(), strict=True))
 
     def one(view: int) -> Prediction:
         light, camera = relighting.lights.take([view]), scene.cameras.take([view])
@@ -148,7 +148,7 @@ def view_entries(
             light = predicted.light
             entry["light"] = {
                 "direction": light.direction_world[0].tolist(),
-                "closeness": float(light.closeness[0]),
+                "inverse_distance": float(light.inverse_distance[0]),
                 "directed": light.directed[0].expand(3).tolist(),
                 "ambient": light.ambient[0].expand(3).tolist(),
             }

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.exchange.result import Result, read_result
+from pimper_torch.doors.export.result import Result, read_result
 from pimper_torch.doors.io.estimates import read_estimate
 from pimper_torch.method.chains.chain import Step
 from pimper_torch.method.sfm.model_files import read_model
@@ -76,7 +76,7 @@ def show(
     long as the process: scripts end with :meth:`~pimper_torch.result.viewer.viewer.Viewer.wait`.
 
     Args:
-        result: What a chain or :func:`~pimper_torch.doors.exchange.result.read_result` returned, a
+        result: What a chain or :func:`~pimper_torch.doors.export.result.read_result` returned, a
             mesh, or the path of a folder of results or of a mesh.
         host: Address of this machine that the page is served at.
         port: The next free one is taken where another program has it; 0 takes any.

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pimper_torch.doors.size.aruco import CELLS, cells_of
-from pimper_torch.doors.size.sheet import PAPERS_MM, SIDE_MM, TITLE, Paper, layout
+from pimper_torch.doors.scale.aruco import CELLS, cells_of
+from pimper_torch.doors.scale.sheet import PAPERS_MM, SIDE_MM, TITLE, Paper, layout
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

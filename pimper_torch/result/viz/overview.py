@@ -106,7 +106,7 @@ def headline(result: Reconstruction) -> str:
     taken = result.scene.views.num_views
     given = taken + len(result.scene.unregistered)
     seconds = sum(report.seconds for report in result.report)
-    doubtful = " (cameras doubtful)" if result.scene.doubt else ""
+    doubtful = " (cameras doubtful)" if result.scene.diagnosis else ""
     return (
         f"{taken} of {given} photographs{doubtful}, {len(result.coarse.mesh.faces)} facets, "
         f"{len(result.mesh.vertices_world):,} vertices, {seconds:.0f} s"

@@ -59,7 +59,7 @@ class Store:
             return None
         with suppress(OSError):  # a folder that may only be read
             os.utime(path)
-        return settled(record), json.loads(about)
+        return realigned(record), json.loads(about)
 
     def keep(self, key: str, record: Record, about: Mapping[str, object] | None = None) -> bool:
         """Write a record in place of one of the same key.
@@ -109,7 +109,7 @@ def opened(cache: Store | Path | str | None) -> Store | None:
     return cache if cache is None or isinstance(cache, Store) else Store(folder=cache)
 
 
-def settled(record: AnyRecord) -> AnyRecord:
+def realigned(record: AnyRecord) -> AnyRecord:
     """Copy tensors that are not contiguous at an address of torch's; others stay as they are.
 
     Stages compute the same bits from two records of equal values once both are settled: products
@@ -147,11 +147,11 @@ def kept(
     if found is not None:
         record, about = found
         for event in of_json(about["events"], _Events, "events", {}):
-            _tell(event)
+            _replay(event)
         return record, about["seconds"]
     began = time.perf_counter()
     with noted() as events:
-        record = settled(make())
+        record = realigned(make())
     seconds = time.perf_counter() - began
     if store and key:
         try:
@@ -162,15 +162,15 @@ def kept(
     return record, seconds
 
 
-def _tell(event: str | Failure | LeftOut | StageReport) -> None:
+def _replay(event: str | Failure | LeftOut | StageReport) -> None:
     journal = current()
     if isinstance(event, str):
         caution(event)
     elif isinstance(event, Failure):
         skipped(event)
     elif isinstance(event, LeftOut) and journal.collects:
-        journal.tell(event)
+        journal.note(event)
     elif isinstance(event, StageReport) and journal.observer is not None:
         journal.observer.started(event.name)
-        journal.tell(event.replace(kept=True))
+        journal.note(event.replace(kept=True))
         journal.observer.finished(event.replace(kept=True))

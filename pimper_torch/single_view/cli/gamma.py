@@ -34,7 +34,7 @@ def run(job: "_Job", output: Output) -> None:
             caution(message)
     drawn = None if job.mask is None else read_mask(job.mask, job.max_size_px)
     found = gamma_of_photographs(views, mask=drawn, rank=job.rank)
-    output.say(f"{found}{advice(found)}")
+    output.emit(f"{found}{advice(found)}")
     output.result(gamma=found.gamma, determined=found.determined)
 
 

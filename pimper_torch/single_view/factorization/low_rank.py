@@ -98,7 +98,7 @@ def low_rank_problem(matrix: Matrices, weight: Matrices, start: LeftFactors) -> 
         radiance=known,
         weight=heavy,
         lights=left,
-        anchor=left,
+        prior_mean=left,
         shading=known.new_zeros(len(known), rank, columns),
         regularization=known.new_zeros(len(known), rows),
         manifold=Free(rank=rank),

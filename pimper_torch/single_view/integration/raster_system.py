@@ -16,7 +16,7 @@ from pimper_torch.ground.linalg.multigrid import Multigrid
 from pimper_torch.ground.linalg.prepared import DEFAULT_TOLERANCE
 from pimper_torch.ground.linalg.sparse import SparseCholesky
 from pimper_torch.ground.shapes import Map
-from pimper_torch.paper.integrate import Heights, StepsDown, StepsRight, differences_transposed
+from pimper_torch.published.integrate import Heights, StepsDown, StepsRight, differences_transposed
 
 # A factor takes twice as long to make as a hierarchy (0.17 s against 0.08 s) and a third as long
 # to use; below it is as quick in all, and its solutions are exact.

@@ -20,7 +20,7 @@ from torch.nn.functional import pad
 
 from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.ground.shapes import Mask, Matrix3, Scalars, VectorMap
-from pimper_torch.paper.integrate import fill_smoothly
+from pimper_torch.published.integrate import fill_smoothly
 from pimper_torch.records import Record
 
 Changes = Float[Tensor, "line step"]

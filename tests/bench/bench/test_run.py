@@ -18,7 +18,7 @@ from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.outputs.marker import MARKER
+from pimper_torch.doors.result_folder.marker import MARKER
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.records import CoarseMesh, Estimate, Mesh
 from pimper_torch.runtime.errors import ConfigError, PimperWarning, ReconstructionError

@@ -28,10 +28,10 @@ from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import LINEAR
-from pimper_torch.records import Lens
+from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import InputError
 
-LENS = Lens(camera=1, model="PINHOLE", params=(20.0, 30.0, 7.0, 5.0), width=16, height=12)
+LENS = CameraModel(camera=1, model="PINHOLE", params=(20.0, 30.0, 7.0, 5.0), width=16, height=12)
 
 
 def put(shots, folder, **options):
@@ -87,7 +87,7 @@ def test_names_choose_and_order_photographs(shot, tmp_path):
 
 
 def test_a_lens_is_undistorted_to_the_pinhole_of_the_capture(tmp_path, hand_camera):
-    lens = Lens(
+    lens = CameraModel(
         camera=1,
         model="OPENCV",
         params=(60.0, 62.0, 31.0, 24.5, -0.35, 0.05, 0.004, -0.007),

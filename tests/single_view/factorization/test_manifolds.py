@@ -72,7 +72,7 @@ def test_every_solver_explains_the_data_on_every_manifold(solve, tolerance, mani
         radiance=weight * (lights @ vectors),
         weight=weight,
         lights=start,
-        anchor=start,
+        prior_mean=start,
         shading=near,
         regularization=torch.zeros(2, 25, dtype=torch.float64),
         manifold=manifold,

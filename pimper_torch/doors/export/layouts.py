@@ -1,0 +1,53 @@
+"""Results in the layouts of other programs."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+from pimper_torch.doors.export.alicevision import write_alicevision
+from pimper_torch.doors.export.colmap_workspace import write_workspace
+from pimper_torch.doors.export.map_files import write_maps
+from pimper_torch.doors.export.nerfstudio import write_nerfstudio
+from pimper_torch.doors.export.result import Result, WrittenResult
+from pimper_torch.doors.export.rti import write_rti
+from pimper_torch.records.priors import Axes
+from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.progress import part
+
+Format = Literal["colmap", "nerfstudio", "alicevision", "maps", "rti"]
+
+WITH_PHOTOGRAPHS: Mapping[str, Callable[[Result, Path], None]] = {
+    "colmap": write_workspace,
+    "nerfstudio": write_nerfstudio,
+    "alicevision": write_alicevision,
+}
+"""Writers of the formats that hold photographs; no other one needs them."""
+
+
+def write_formats(
+    result: WrittenResult, formats: Sequence[Format], folder: Path | str, axes: Axes = "opengl"
+) -> None:
+    """Write a result in some layouts, each in a folder of its name.
+
+    Args:
+        result: With its photographs, if one of the formats holds them.
+        axes: That normals of ``maps`` have.
+
+    Raises:
+        InputError: A format holds photographs, and the result was read without them.
+    """
+    chosen = list(dict.fromkeys(formats))
+    for index, name in enumerate(chosen):
+        place = Path(folder) / name
+        with part(index, len(chosen)):
+            if name == "maps":
+                write_maps(result, place, axes)
+            elif name == "rti":
+                write_rti(result, place)
+            elif isinstance(result, Result):
+                WITH_PHOTOGRAPHS[name](result, place)
+            else:
+                raise InputError(
+                    f"{name} holds photographs, but the result was read without them; needed: a "
+                    "result of `read_result`."
+                )

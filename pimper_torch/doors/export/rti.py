@@ -1,0 +1,73 @@
+"""A stack for reflectance transformation imaging (RTI): one viewpoint under many lights."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.doors.camera_files.transforms_json import FLIP
+from pimper_torch.doors.export.result import WrittenResult
+from pimper_torch.ground.geometry.directions import even_directions
+from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.records import Materials, ViewLights
+from pimper_torch.result.relighting.held_out import shaded
+from pimper_torch.result.relighting.lit_surface import LitSurface
+from pimper_torch.runtime.progress import track
+
+# Of directions that are even over the sphere, those more than 15 degrees above the plane of the
+# picture: lower lamps show shadows alone. A choice; the polynomial of a PTM has 6 unknowns a pixel.
+_LIGHTS, _OF_DIRECTIONS = 60, 162
+
+
+def write_rti(result: WrittenResult, folder: Path) -> None:
+    """Write pictures of the surface from the reference view under a dome of lights.
+
+    The pictures are predictions with cast shadows, ``light_00.jpg`` and so on, black where the
+    surface is not. ``lights.lp`` counts them in its first line; each of the others has the name of
+    a picture and the unit vector to its light: x right, y up, z to the viewer. Names are in their
+    own order, as programs match either by names or by order. The object's material is that of
+    ``summary.json`` if it has one; where it has several, the surface is matte.
+
+    Source: parseLP in relight's ``src/lp.cpp``, which takes lines of four words.
+    """
+    camera = result.mesh_cameras.take([result.names.index(result.reference)])
+    surface = LitSurface(result.mesh)
+    pixels, material = surface.pixels(camera), _material(result)
+    towards = even_directions(_OF_DIRECTIONS)[:_LIGHTS]
+    towards_world = (towards * FLIP).float() @ camera.cam_from_world[0, :3, :3]
+    width, height = camera.sizes_px[0].tolist()
+    dark = torch.zeros(1, pixels.base_color.shape[1])
+    folder.mkdir(parents=True)
+    files = [f"light_{index:02d}.jpg" for index in range(_LIGHTS)]
+    for file, direction in zip(track(files), towards_world, strict=True):
+        light = ViewLights(
+            direction_world=direction[None],
+            inverse_distance=torch.zeros(1),
+            ambient=dark,
+            directed=dark + 1,
+        )
+        picture = torch.zeros(height * width, 3)
+        picture[pixels.pixel] = shaded(surface, pixels, light, material).clamp(0, 1)
+        levels = to_bytes(picture).reshape(height, width, 3).numpy()
+        Image.fromarray(levels).save(folder / file, quality=100, subsampling=0)
+    lines = [
+        " ".join([file, *(f"{value:.9f}" for value in direction)])
+        for file, direction in zip(files, towards.tolist(), strict=True)
+    ]
+    text = "\n".join([str(_LIGHTS), *lines, ""])
+    (folder / "lights.lp").write_text(text, encoding="ascii")
+
+
+def _material(result: WrittenResult) -> Materials | None:
+    relighting = result.summary.get("relighting")
+    found = relighting.get("materials") if isinstance(relighting, Mapping) else None
+    if not isinstance(found, list) or len(found) != 1:
+        return None
+    file = DataSetPath(Path("summary.json"), "a result of `pimper reconstruct`")
+    (only,) = file.objects(found, "materials")
+    named = [only.get(name) for name in ("metallic", "roughness", "specular")]
+    values = file.numbers(named, 3, "metallic, roughness and specular")
+    everywhere = torch.zeros(len(result.mesh.vertices_world), dtype=torch.long)
+    return Materials.of(everywhere, values[None].float())

@@ -1,0 +1,245 @@
+"""Alignment: bas-relief transforms that make neighbouring patches agree."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import pad
+
+from pimper_torch.ground.geometry.height_fields import sample_raster
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.ground.linalg.sums import average
+from pimper_torch.ground.shapes import Scalar
+from pimper_torch.published.published_config import AlignConfig
+from pimper_torch.published.seams import (
+    Pulls,
+    Seams,
+    Transforms,
+    by_facet,
+    curvature_along,
+    find_seams,
+    meet_overlaps,
+    mismatches,
+    seam_stiffness,
+    solve_transforms,
+)
+from pimper_torch.records import AlignStatus, DepthPatches, Depths, PatchSet, Record
+from pimper_torch.runtime.progress import report
+from pimper_torch.runtime.stage import Stage
+
+
+def patch_status(
+    facets: Int[Tensor, "seam 2"], met: Bool[Tensor, "seam ray"], count: int
+) -> Int[Tensor, " face"]:
+    """Assign every patch its :class:`~pimper_torch.records.AlignStatus`."""
+    overlapping = met.sum(dim=1) >= 0.25 * met.shape[1]
+    status = torch.full((count,), int(AlignStatus.ALONE), device=facets.device)
+    status[facets[overlapping].flatten()] = int(AlignStatus.ALIGNED)
+    return status
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Anchors(Record):
+    """The vertices of every facet, which its height field is to pass through.
+
+    Attributes:
+        samples: ``(x, y, z)`` of the height field over the vertex, before any transform, patch
+            frame.
+        variance: Of the vertex along the facet's normal, scene units squared.
+        known: Whether there is height field over the vertex.
+    """
+
+    samples: Float[Tensor, "face 3 3"]
+    variance: Float[Tensor, "face 3"]
+    known: Bool[Tensor, "face 3"]
+
+
+def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
+    """Anchor every height field at its facet's three vertices."""
+    mesh, covariance = patches.coarse.mesh, patches.coarse.covariance_world
+    vertices = mesh.vertices_world[mesh.faces].double()
+    if covariance is None:
+        covariance = vertices.new_zeros(len(mesh.vertices_world), 3, 3)
+    found = []
+    for templates, depths in zip(patches.buckets, buckets, strict=True):
+        facet, frames = templates.facet, templates.patch_from_world.double()
+        across = transform(frames, vertices[facet])[..., :2]
+        grid = templates.origin.double(), templates.spacing.double()
+        height = sample_raster(depths.depth[:, None], across, *grid, valid=depths.valid)
+        support = sample_raster(depths.valid[:, None].to(depths.depth), across, *grid)
+        along, spread = frames[:, 2, :3], covariance[mesh.faces[facet]].double()
+        variance = torch.einsum("fi,fvij,fj->fv", along, spread, along).clamp_min(0)
+        found.append((torch.cat([across, height.mT], dim=-1), variance, support[:, 0] > 0.5))
+    samples, variance, known = (by_facet(patches, parts) for parts in zip(*found, strict=True))
+    return Anchors(samples=samples, variance=variance, known=known)
+
+
+# Solves within the first round, so that weights that depend on the answer settle; later
+# rounds begin nearer to it and take one less.
+_REWEIGHTINGS = 3
+
+
+# Lines of samples across each overlap, samples along each, and the distance of the outermost lines
+# from the edge in template samples: `paper` has overlaps of 6.
+_ROWS, _COLUMNS, _REACH = 3, 12, 5.0
+
+
+class Align(Stage):
+    r"""Undo the bas-relief transform that photometry leaves each patch with.
+
+    The height field z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z)`
+    in its own frame, without contradicting its photographs. All h are found together: rays along
+    the bisector of two facets' normals meet both height fields over the edge they share, and
+
+    .. math::
+        \min_h \sum_{seams} k \, \overline{| P_\mu + N_\mu h_\mu^T S_\mu
+        - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'} |^2}
+
+    with P the foot points on the facets' planes and N their normals. Each round meets the
+    overlaps anew and solves one sparse linear system.
+
+    :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, with C the mean square of the height field's
+    curvature along the seam times the edge's length, which grows as :math:`h_z^2`: flattening both
+    height fields does not make :math:`k |r|^2` smaller. The derivative of k enters the right-hand
+    side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve.
+
+    Over coplanar facets a common affine change leaves height fields in agreement, and
+    :math:`h = 0` has no error. Folds determine scales; anchors, each height field passing through
+    its facet's vertices, determine tilts; the prior toward the identity determines the rest. A
+    patch that meets no neighbour stays on the mesh, where its own anchors put it.
+
+    Invariant to rigid motions and the scale of the world. Differentiable in the depths.
+
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; anchors and rounds are
+    ours.
+    """
+
+    def __init__(self, config: AlignConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or AlignConfig()
+
+    def forward(self, depths: DepthPatches) -> DepthPatches:
+        """Align all patches.
+
+        Returns:
+            Changed depths with their transforms, an :class:`~pimper_torch.records.AlignStatus`
+            each, and the distance of neighbours before and after each round; the input where no
+            patch meets a neighbour.
+        """
+        config, patches = self.config, depths.patches
+        seams = find_seams(patches, _ROWS, _COLUMNS, _REACH)
+        if len(seams.facets) == 0:
+            return depths
+        anchors = vertex_anchors(patches, depths.buckets)
+        # h_0 is in units of the edge length here, so that no term of the system has a unit.
+        identity = seams.origins.new_tensor([0, 0, 1, 0])
+        transforms = identity.expand(patches.num_patches, 4)
+        apart = []
+        for done in range(config.iterations):
+            pulls = self._met(depths, seams, anchors, transforms)
+            if not bool((pulls.weight > 0).any()):
+                return depths
+            apart.append(_root_mean_square(pulls, transforms))
+            transforms = self._solve_round(pulls, transforms, fresh=done == 0)
+            report(done + 1, config.iterations)
+        with torch.no_grad():
+            pulls = self._met(depths, seams, anchors, transforms)
+            status = patch_status(pulls.facets, pulls.weight > 0, len(transforms))
+        aligned = (status == int(AlignStatus.ALIGNED))[:, None]
+        if not bool(aligned.all()):
+            # Every height field where its own anchors alone have it.
+            nothing = torch.zeros_like(pulls.curvature)
+            on_mesh = solve_transforms(
+                pulls, identity.expand_as(transforms), nothing[:, 0], nothing
+            )
+            on_mesh = _limit_scales(on_mesh, config.scale_limit)
+            transforms = torch.where(aligned, transforms, on_mesh)
+            with torch.no_grad():
+                pulls = self._met(depths, seams, anchors, transforms)
+        mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * seams.units[3]
+        return depths.replace(
+            buckets=_apply(depths, transforms * seams.units, status),
+            mismatch=mismatch.detach().to(depths.buckets[0].depth),
+        )
+
+    def _met(
+        self, depths: DepthPatches, seams: Seams, anchors: Anchors, transforms: Transforms
+    ) -> Pulls:
+        """Meet the overlaps as transformed so far, and anchor every height field at vertices."""
+        unit, coarse = seams.units[3], depths.patches.coarse
+        in_scene = transforms * seams.units
+        found, feet, both = meet_overlaps(seams, depths.patches, depths.buckets, in_scene)
+        met = both.flatten(1)
+        prior = unit.new_full((4,), self.config.prior)
+        prior[3] = torch.inf  # patches do not move along their normals
+        count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
+        corners = pad(anchors.samples / unit, (0, 1), value=1.0)
+        pulls = Pulls(
+            facets=seams.facets,
+            normals=seams.normals,
+            samples=pad(found.flatten(2, 3) / unit, (0, 1), value=1.0),
+            gap=(feet[:, 0] - feet[:, 1]).flatten(1, 2) / unit,
+            weight=met.to(unit) / count[:, None],
+            curvature=curvature_along(found[..., 2], both, seams.edge_lengths),
+            corners=corners,
+            corner_weight=torch.zeros_like(corners[..., 0]),
+            prior_weight=prior,
+        )
+        # The error of one height field, from the median distance of two.
+        apart = mismatches(pulls, transforms).norm(dim=-1).detach()[met]
+        noise = apart.median().clamp_min(5e-3) / 2**0.5 if len(apart) else torch.ones_like(unit)
+        # The weight of an exact anchor is 1. Vertices that are no points of the cloud are guesses.
+        certain = noise.square() / (noise.square() + anchors.variance / unit.square())
+        weight = torch.where(coarse.is_point[coarse.mesh.faces], certain, 0.1) * anchors.known
+        return pulls.replace(corner_weight=self.config.anchor * weight)
+
+    def _solve_round(self, pulls: Pulls, transforms: Transforms, fresh: bool) -> Transforms:
+        touching = pulls.facets[(pulls.weight > 0).any(dim=1)].flatten()
+        moves = torch.zeros_like(transforms[:, 0]).index_fill(0, touching, 1)
+        pulls = pulls.replace(corner_weight=pulls.corner_weight * moves[:, None])
+        prior = pulls.prior_weight.clone()
+        prior[2] = torch.inf
+        scales_held = pulls.replace(prior_weight=prior)
+        for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
+            distance = mismatches(pulls, transforms).norm(dim=-1)
+            apart = (pulls.weight * distance.square()).sum(dim=1)
+            terms = seam_stiffness(pulls.curvature, transforms[pulls.facets, 2], apart)
+            # What tilts and shifts can repair says nothing about scales.
+            free = scales_held if fresh and solve == 0 else pulls
+            transforms = solve_transforms(free, transforms, *terms)
+            limited = _limit_scales(transforms, self.config.scale_limit)
+            if not torch.equal(limited, transforms):
+                transforms = solve_transforms(scales_held, limited, *terms)
+        return transforms
+
+
+def _limit_scales(transforms: Transforms, limit: float) -> Transforms:
+    hx, hy, hz, h0 = transforms.unbind(dim=-1)
+    return torch.stack([hx, hy, hz.clamp(1 / limit, limit), h0], dim=-1)
+
+
+def _root_mean_square(pulls: Pulls, transforms: Transforms) -> Scalar:
+    square = mismatches(pulls, transforms).square().sum(dim=-1)
+    return average(square[pulls.weight > 0]).sqrt()
+
+
+def _apply(
+    depths: DepthPatches, transforms: Transforms, status: Int[Tensor, " face"]
+) -> tuple[Depths, ...]:
+    buckets = []
+    for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
+        own = transforms[templates.facet]
+        hx, hy, hz, h0 = own[:, :, None, None].unbind(dim=1)
+        x, y, _ = templates.points_patch.double().unbind(dim=-1)
+        depth = hx * x + hy * y + hz * height_field.depth.double() + h0
+        # Transforms chain: whoever aligns twice still learns the way from the first height field.
+        chained = own[:, 2:3] * height_field.transform + own * own.new_tensor([1, 1, 0, 1])
+        buckets.append(
+            height_field.replace(
+                depth=depth.to(height_field.depth),
+                transform=chained.to(height_field.transform),
+                status=status[templates.facet],
+            )
+        )
+    return tuple(buckets)

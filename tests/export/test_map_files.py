@@ -1,0 +1,66 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from pimper_torch.doors.export.map_files import with_axes, write_maps
+from pimper_torch.doors.export.openexr import write_exr
+from pimper_torch.doors.io.decode import decode
+from pimper_torch.result.viz.maps import view_maps
+from pimper_torch.runtime.numpy_files import read_npz
+
+
+@pytest.mark.parametrize("shape", [(37, 53, 3), (37, 53, 1), (1, 1, 1), (16, 5, 3), (33, 4, 1)])
+def test_maps_of_exr_are_read_back_bit_for_bit(shape, tmp_path, read_exr):
+    values = np.random.default_rng(7).normal(size=shape).astype(np.float32)
+    values[: shape[0] // 2] = 0  # which packs, as the noise does not
+    write_exr(values, tmp_path / "x.exr", "what it means")
+    assert np.array_equal(read_exr(tmp_path / "x.exr").reshape(shape), values)
+    assert b"what it means" in (tmp_path / "x.exr").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("axes", "right", "down", "facing"),
+    [
+        ("opencv", [1, 0, 0], [0, 1, 0], [0, 0, -1]),
+        ("opengl", [1, 0, 0], [0, -1, 0], [0, 0, 1]),
+        ("lub", [-1, 0, 0], [0, -1, 0], [0, 0, 1]),
+    ],
+)
+def test_axes_are_as_they_are_called(axes, right, down, facing):
+    ours = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]])
+    assert with_axes(ours, axes).tolist() == [[right, down, facing]]
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opengl", "lub"])
+def test_every_file_has_what_the_view_shows(axes, result, tmp_path, read_exr):
+    write_maps(result, tmp_path, axes)
+    assert json.loads((tmp_path / "README.json").read_text())["axes"] == axes
+    for view, stem in enumerate("abc"):
+        maps = view_maps(result.mesh, result.scene.cameras, view)
+        normals = with_axes(maps.normals_cam, axes)
+        assert np.array_equal(read_exr(tmp_path / "normals" / f"{stem}.exr"), normals)
+        depth = read_exr(tmp_path / "depth" / f"{stem}.exr")
+        assert np.array_equal(depth, maps.depth.nan_to_num(0).numpy())
+        assert np.array_equal(read_exr(tmp_path / "albedo" / f"{stem}.exr"), maps.albedo.numpy())
+        arrays = read_npz(tmp_path / "arrays" / f"{stem}.npz")  # opens no pickle
+        assert np.array_equal(arrays["normals"], normals)
+        assert np.array_equal(arrays["depth"], maps.depth.numpy(), equal_nan=True)
+        assert np.array_equal(arrays["mask"], maps.seen.numpy())
+        assert np.array_equal(arrays["intrinsics"], result.cameras.intrinsics[view].numpy())
+        assert np.array_equal(arrays["cam_from_world"], result.cameras.cam_from_world[view].numpy())
+        assert (str(arrays["axes"]), str(arrays["name"])) == (axes, f"{stem}.png")
+
+
+def test_sixteen_bits_of_a_normal_tell_it_to_half_a_level(result, tmp_path):
+    write_maps(result, tmp_path, "opengl")
+    png = decode(tmp_path / "normals" / "b.png")
+    assert png.bits == 16
+    maps = view_maps(result.mesh, result.scene.cameras, 1)
+    found = (2 * png.samples - 1).movedim(0, -1)[maps.seen]
+    expected = torch.from_numpy(with_axes(maps.normals_cam, "opengl"))[maps.seen]
+    # Half a level of 65,535 for two units, and float32's rounding on the way there and back.
+    assert_close(found, expected, rtol=0, atol=1.02 / 65535)
+    assert (png.samples[:, ~maps.seen] == 0).all()

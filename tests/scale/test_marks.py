@@ -1,0 +1,180 @@
+"""Places that a person points at, in photographs through a lens that bulges."""
+
+import pytest
+import torch
+
+from pimper_torch.doors.scale.find_scale import scale_of_bars, scale_of_cameras
+from pimper_torch.doors.scale.given import CameraDistance, Mark, Pointer, ScaleBar
+from pimper_torch.doors.scale.marks import place_of
+from pimper_torch.ground.geometry.lens_models import distort
+from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.records import Silhouettes
+from pimper_torch.runtime.errors import ConfigError, InputError
+
+
+def direction(*values):
+    vector = torch.tensor(values, dtype=torch.float64)
+    return vector / vector.norm()
+
+
+def pointer(result, view, point_world, digits=6):
+    """Click where a view shows a point, in the photograph before undistortion."""
+    cameras = result.cameras.to(torch.float64)
+    point_cam = transform(cameras.cam_from_world[view], point_world[None])
+    x, y = distort(result.scene.lenses[view], point_cam)[0].tolist()
+    return Pointer(name=f"IMG_{view}", x=round(x, digits), y=round(y, digits))
+
+
+def mark(result, point_world, *views, digits=6):
+    return Mark(pointers=tuple(pointer(result, view, point_world, digits) for view in views))
+
+
+@pytest.mark.parametrize("digits", [6, 0])
+def test_two_clicks_on_the_surface_tell_its_size(ball, digits):
+    first, second = direction(-0.6, 0.4, 0.7), direction(0.5, 0.1, 0.8)
+    true = float((first - second).norm())
+    ends = mark(ball, first, 2, digits=digits), mark(ball, second, 3, digits=digits)
+    bar = ScaleBar(first=ends[0], second=ends[1], length=1000 * true)
+    scale = scale_of_bars(ball, [bar])
+    assert scale.factor == pytest.approx(
+        1000, rel=5e-3 if digits == 0 else 5e-4
+    )  # 0.5 of 220 pixels
+    assert (scale.unit, scale.count) == ("mm", 1)
+
+
+def test_a_place_is_on_the_surface_where_the_lens_images_it(ball):
+    wanted = direction(-0.6, 0.5, 0.6)
+    found = place_of(mark(ball, wanted, 1), ball)
+    # An icosphere of 20,480 faces lies 3e-4 inside; without undistortion it is 0.02 off.
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
+
+
+def test_a_place_in_two_photographs_may_be_anywhere(ball):
+    wanted = torch.tensor([0.7, 0.6, 1.2], dtype=torch.float64)
+    found = place_of(mark(ball, wanted, 0, 4), ball)
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
+
+
+def test_the_tip_of_the_object_is_told_from_the_table_behind_it(ball):
+    """A surface ends a little inside of what it shows: one click beside it is the surface."""
+    plane = torch.tensor([0.0, 1.0, 0.0, 1.0])  # y = -1 and above
+    ball = ball.replace(silhouettes=Silhouettes.everything(ball.scene.views, plane[None]))
+    eye = ball.cameras.to(torch.float64).centers_world[2]
+    toward = eye / eye.norm()
+    down = torch.linalg.cross(direction(1, 0, 0), toward)
+    down = -down if down[1] > 0 else down
+    # The contour: rays from the eye that touch the ball.
+    touching = toward / eye.norm() + down * (1 - 1 / eye.norm() ** 2).sqrt()
+    touched = pointer(ball, 2, touching)
+    beside = Mark(pointers=(Pointer(name="IMG_2", x=touched.x, y=touched.y + 1.0),))
+    assert float((place_of(beside, ball) - touching).norm()) < 0.05
+    far = Mark(pointers=(Pointer(name="IMG_2", x=touched.x, y=touched.y + 40.0),))
+    assert float(place_of(far, ball)[1]) == pytest.approx(-1, abs=1e-5)  # on the table
+
+
+def test_a_ruler_beside_the_object_lies_on_the_plane_of_the_cloud(ball):
+    generator = torch.Generator().manual_seed(5)
+    flat = 6 * torch.rand(200, 3, generator=generator) - 3
+    flat[:, 1] = -1.0
+    count = len(flat)
+    scene = ball.scene.replace(
+        points_world=flat,
+        reprojection_errors_px=torch.zeros(count),
+        observation_point=torch.arange(count).repeat(5),
+        observation_view=torch.arange(5).repeat_interleave(count),
+        observation_pixels=torch.zeros(5 * count, 2),
+    )
+    ball = ball.replace(scene=scene)
+    ends = [torch.tensor([x, -1.0, 0.3], dtype=torch.float64) for x in (-1.3, 1.2)]
+    for end in ends:
+        torch.testing.assert_close(place_of(mark(ball, end, 2), ball), end, rtol=0, atol=1e-4)
+
+
+def test_where_the_silhouette_shows_the_object_the_table_is_not_taken(ball):
+    plane = torch.tensor([0.0, 1.0, 0.0, 1.0])
+    inside = torch.ones(5, 480, 640)
+    silhouettes = Silhouettes(
+        inside=inside, reliable=torch.ones(5) > 0, source="masks", planes_world=plane[None]
+    )
+    place = Mark.read("IMG_2,320,470")
+    with pytest.raises(InputError, match=r"IMG_2,320,470: the silhouette says .*surface is"):
+        place_of(place, ball.replace(silhouettes=silhouettes))
+
+
+def test_a_ray_through_an_opening_meets_no_back_side(ball):
+    mesh = ball.mesh
+    front = mesh.vertices_world[mesh.faces].mean(dim=1)[:, 2] > 0
+    halved = ball.replace(mesh=mesh.replace(faces=mesh.faces[~front]))
+    with pytest.raises(InputError, match="goes through an opening of the surface"):
+        place_of(Mark.read("IMG_2,320,240"), halved)
+
+
+def test_a_place_where_the_surface_is_hardly_determined_is_warned_of(ball):
+    low = ball.mesh.replace(confidence=torch.full((len(ball.mesh.vertices_world),), 0.3))
+    with pytest.warns(UserWarning, match=r"hardly determine the surface there: .* is 0\.30"):
+        place_of(Mark.read("IMG_2,320,240"), ball.replace(mesh=low))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("IMG_7,3,4", "'IMG_7': none of the photographs is named so; needed: one of IMG_0.jpg"),
+        ("IMG_9.jpg,3,4", "IMG_9.jpg: has no place among the cameras that were found"),
+        ("IMG_1,640.5,4", "IMG_1,640.5,4: lies outside of the photograph, which has 640 x 480"),
+        ("IMG_1,3,4", "IMG_1,3,4: the ray behind this pixel misses the surface, and the plane"),
+        ("IMG_1,3,4+IMG_1,3,4", "IMG_1,3,4: these rays differ by .* degrees; needed: 1 at least"),
+        ("IMG_0,300,200+IMG_4,300,400", r"IMG_0,300,200 is \d+ pixels from where the others"),
+    ],
+)
+def test_a_place_that_cannot_be_found_is_named(ball, text, told):
+    with pytest.raises(InputError, match=told):
+        place_of(Mark.read(text), ball)
+
+
+@pytest.mark.parametrize("text", ["", "a", "a,1", "a,1,b", ",1,2", "a,1,2+", "a,nan,2"])
+def test_words_that_are_no_place_are_refused(text):
+    with pytest.raises(InputError, match="is no place in a photograph; needed: NAME,x,y"):
+        Mark.read(text)
+
+
+def test_one_place_twice_has_no_length(ball):
+    end = mark(ball, direction(0, 0, 1), 2)
+    with pytest.raises(InputError, match="is 0 in the result and 5 mm in truth; needed: two"):
+        scale_of_bars(ball, [ScaleBar(first=end, second=end, length=5.0)])
+    with pytest.raises(ConfigError, match=r"length of .* is -1"):
+        ScaleBar(first=end, second=end, length=-1.0)
+
+
+def distances(result, factor, pairs):
+    centers = result.cameras.to(torch.float64).centers_world
+    return [
+        CameraDistance(
+            first=f"IMG_{one}",
+            second=f"IMG_{other}.jpg",
+            length=factor * float((centers[one] - centers[other]).norm()),
+        )
+        for one, other in pairs
+    ]
+
+
+def test_cameras_tell_the_size_exactly(ball):
+    scale = scale_of_cameras(ball, distances(ball, 123.0, [(0, 4), (1, 2), (2, 3)]), "cm")
+    assert scale.factor == pytest.approx(123, rel=1e-6)
+    assert scale.residual < 1e-6
+    assert scale.unit == "cm"
+
+
+def test_the_factor_is_that_of_least_squares(ball):
+    given = distances(ball, 100.0, [(0, 4), (1, 2)])
+    given = [given[0], CameraDistance(first="IMG_1", second="IMG_2", length=1.01 * given[1].length)]
+    found = torch.tensor([one.length for one in distances(ball, 1.0, [(0, 4), (1, 2)])])
+    known = torch.tensor([one.length for one in given])
+    wanted = torch.linalg.lstsq(found[:, None], known[:, None], driver="gelsd").solution
+    assert scale_of_cameras(ball, given).factor == pytest.approx(float(wanted), rel=1e-5)
+
+
+def test_distances_that_contradict_one_another_are_named_with_their_residuals(ball):
+    given = distances(ball, 100.0, [(0, 4), (1, 2), (2, 3)])
+    wrong = CameraDistance(first="IMG_1", second="IMG_2", length=1.2 * given[1].length)
+    with pytest.warns(UserWarning, match=r"camera distances contradict.*IMG_1 to IMG_2 is .*\(-1"):
+        scale_of_cameras(ball, [given[0], wrong, given[2]])
