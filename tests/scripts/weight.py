@@ -84,7 +84,7 @@ BARS = {
     "lines of signatures": 4561,
     "lines of imports": 4248,
     "words of the list in docstrings, comments and messages": 1214,
-    "words of the list in documents": 469,
+    "words of the list in documents": 327,
 }
 
 
