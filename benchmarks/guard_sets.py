@@ -45,7 +45,7 @@ def stamped(folder: Path) -> list[str]:
         place = picture.width - 8, picture.height - 4
         size = picture.height / 16
         ImageDraw.Draw(picture).text(
-            place, "2026-03-14 15:09", "orange", prior_mean="rs", font_size=size
+            place, "2026-03-14 15:09", "orange", anchor="rs", font_size=size
         )
         picture.save(path)
     return []

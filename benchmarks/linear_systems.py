@@ -48,7 +48,7 @@ class Raster:
 
     right: Tensor
     down: Tensor
-    prior_mean: Tensor
+    anchor: Tensor
 
 
 def raster(case: str, side: int) -> Raster:
@@ -78,7 +78,7 @@ def raster(case: str, side: int) -> Raster:
         right = 1e-8 * right
     right = right * (inside[:, 1:] & inside[:, :-1])
     down = down * (inside[1:] & inside[:-1])
-    return Raster(right=right, down=down, prior_mean=ANCHOR * inside.double())
+    return Raster(right=right, down=down, anchor=ANCHOR * inside.double())
 
 
 def mesh(side: int) -> tuple[tuple[Tensor, Tensor, Tensor], int]:
@@ -113,7 +113,7 @@ def entries(case: str, side: int) -> tuple[tuple[Tensor, Tensor, Tensor], int]:
     first = torch.cat([index[:, :-1].flatten(), index[:-1].flatten()])
     second = torch.cat([index[:, 1:].flatten(), index[1:].flatten()])
     weight = torch.cat([weights.right.flatten(), weights.down.flatten()])
-    diagonal = weights.prior_mean.flatten().index_add(0, first, weight).index_add(0, second, weight)
+    diagonal = weights.anchor.flatten().index_add(0, first, weight).index_add(0, second, weight)
     diagonal = torch.where(diagonal > 0, diagonal, 1.0)
     return (
         torch.cat([first, second, index.flatten()]),
@@ -167,7 +167,7 @@ def measure(case: str, name: str, side: int) -> dict[str, float]:
     size = matrix.shape[0]
     wanted = torch.randn(size, generator=torch.Generator().manual_seed(1)).double()
     if case != "mesh":
-        wanted *= raster(case, side).prior_mean.flatten() > 0
+        wanted *= raster(case, side).anchor.flatten() > 0
     rhs = torch.from_numpy(matrix @ wanted.numpy())
     scale = torch.from_numpy(matrix.diagonal()).rsqrt()
     del matrix

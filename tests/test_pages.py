@@ -49,11 +49,11 @@ def links(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_files_and_headings(page):
     for link in links(page):
-        path, _, prior_mean = link.partition("#")
+        path, _, anchor = link.partition("#")
         target = (page.parent / path).resolve() if path else page
         assert target.exists(), link
-        if prior_mean:
-            assert prior_mean in anchors(target), link
+        if anchor:
+            assert anchor in anchors(target), link
 
 
 def bare(text: str) -> str:
