@@ -1,4 +1,4 @@
-"""How the documentation is built: ``sphinx-build -W docs site``; nothing is fetched."""
+"""Build the documentation: ``sphinx-build -W docs site``. Nothing is downloaded."""
 
 import shutil
 import sys
@@ -26,7 +26,7 @@ extensions = [
 ]
 exclude_patterns = ["extensions", "static"]
 
-# Notebooks are pages, with their stored outputs. Sphinx reads only what is in this folder.
+# Notebooks are pages with their stored outputs. Sphinx reads files of this folder only.
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 shutil.copytree(NOTEBOOKS, Path(__file__).parent / "notebooks", dirs_exist_ok=True)
 nb_execution_mode = "off"
@@ -54,7 +54,7 @@ html_show_copyright = False
 
 
 def setup(app: Sphinx) -> None:
-    """Escape what shapes have for several axes, such as ``*batch``, behind napoleon's turn."""
+    """Escape the asterisk of shapes with several axes, such as ``*batch``, after napoleon."""
     app.connect("autodoc-process-docstring", escape_types, priority=900)
     app.connect("source-read", link_notebooks)
 
@@ -67,7 +67,7 @@ def link_notebooks(app: Sphinx, page: str, source: list[str]) -> None:
 def escape_types(
     app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]
 ) -> None:
-    """Take the asterisks of attributes' types for what they are, not for emphasis."""
+    """Escape asterisks in types of attributes, which would start emphasis."""
     for index, line in enumerate(lines):
         if line.startswith((":vartype ", "   :type ")):
             lines[index] = line.replace("*", "\\*")

@@ -1,8 +1,8 @@
 """Draw the pictures of the documentation: ``python docs/pictures.py [captures] [stages] [walk]``.
 
-Captures are sheets of photographs that ``pimper render`` makes; each stands in
-``docs/photographs.md`` under its command. Stages are drawn from the bundled skull, and so is the
-walk of the photographs through the rooms of the package.
+Captures are sheets of photographs that ``pimper render`` makes with the commands in
+``docs/photographs.md``. Stages are drawn from the bundled skull, and so is the path of the
+photographs through the subpackages.
 """
 
 import re
@@ -30,14 +30,14 @@ IMAGES = DOCS / "images"
 PACKAGE = Path(pt.__file__).parent
 CAPTURE = re.compile(r"^    pimper render (.+) -o ([\w-]+)$", flags=re.MULTILINE)
 
-# Of a sheet: photographs side by side, and the width of each.
+# Of a sheet: photographs per row, and the width of each.
 COLUMNS, WIDTH_PX, GAP_PX = 4, 236, 4
 
-# Of the pictures of stages: the longer side of a panel, the photograph that they look from, and
-# room round the object.
+# Of the pictures of stages: the longer side of a panel, the reference photograph, and the
+# margin around the object.
 PANEL_PX, REFERENCE, MARGIN = 320, "37", 0.02
 
-# Of the walk: what a stage's functions are called in, and the size of the photographs.
+# Of the walk: the label of each stage's functions, and the size of the photographs.
 STAGES = {
     "load_views": "load_views",
     "Reconstruct.": "reconstruct",
@@ -77,7 +77,7 @@ def draw_captures() -> None:
 
 
 def draw_stages() -> None:
-    """Reconstruct the bundled skull, and draw what the stages of every pass give."""
+    """Reconstruct the bundled skull, and draw the results of the stages of every pass."""
     views = pt.load_views(bundled_photographs())
     chain = pt.load_chain("default", {"coarse_surface": {"reference": REFERENCE}})
     passes: list[Image.Image] = []
@@ -173,12 +173,12 @@ def stage_of(code: CodeType) -> str | None:
 
 
 def room_of(code: CodeType) -> str | None:
-    """Return the room of the package that a function stands in, or its floor."""
+    """Return the subpackage of a function, or its layer."""
     try:
         folders = Path(code.co_filename).relative_to(PACKAGE).parts[:-1]
     except ValueError:
         return None
-    return folders[:2][-1] if folders else "(modules beside the rooms)"
+    return folders[:2][-1] if folders else "(modules outside subpackages)"
 
 
 def largest(step: pt.Step) -> int:
@@ -192,12 +192,12 @@ def largest(step: pt.Step) -> int:
 
 
 def photograph(views: Views, view: int) -> Image.Image:
-    """Return a photograph as it is looked at."""
+    """Return a photograph for display."""
     return picture(views.images[view].movedim(0, -1).clamp(0, 1) ** (1 / 2.2))
 
 
 def silhouette(step: pt.Step, view: int) -> Image.Image:
-    """Return a photograph with what is not the object left white."""
+    """Return a photograph with white background."""
     shown = step.scene.views.images[view].movedim(0, -1).clamp(0, 1) ** (1 / 2.2)
     inside = step.silhouettes.inside[view] > 0.5
     return picture(torch.where(inside[..., None], shown, torch.ones_like(shown)))

@@ -22,14 +22,14 @@ from PIL import Image
 
 FOLDER = Path(__file__).parent
 
-# Of a cell, seconds: ten times what the longest takes on two cores.
+# Time limit of a cell in seconds: ten times the longest cell on two cores.
 TIMEOUT = 600
 
 # Numbers differ by less than this fraction, or in their last digit: threads sum in any order. A
-# cell whose figures vary more has a tolerance of its own in its metadata.
+# cell whose figures vary more has its tolerance in its metadata.
 TOLERANCE = 0.02
 
-# Pictures differ by less than this in the mean, where 1 is white on black, both shrunk to a stamp.
+# Mean difference of two pictures, reduced to thumbnails; 1 is white on black.
 STAMP_PX, STAMP_TOLERANCE = 48, 0.03
 
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
@@ -83,7 +83,7 @@ def quantized(picture: str) -> str:
 
 
 def texts(cell: NotebookNode) -> str:
-    """Return what a cell printed and returned; a stream comes in any number of pieces."""
+    """Return the text that a cell printed and returned; a stream may be split into pieces."""
     said = ""
     for output in cell.outputs:
         if output.output_type == "stream":
@@ -100,7 +100,7 @@ def pictures(cell: NotebookNode) -> list[Image.Image]:
 
 
 def differences(kept: NotebookNode, fresh: NotebookNode) -> Iterator[str]:
-    """List where two runs of a notebook say something else."""
+    """List the differences between two runs of a notebook."""
     pairs = zip_longest(code_cells(kept), code_cells(fresh))
     for number, (before, after) in enumerate(pairs, start=1):
         if before is None or after is None:
@@ -111,7 +111,7 @@ def differences(kept: NotebookNode, fresh: NotebookNode) -> Iterator[str]:
             yield f"cell {number} said\n{texts(before)}\nand says\n{texts(after)}"
         for old, new in zip_longest(pictures(before), pictures(after)):
             if old is None or new is None or not look_alike(old, new):
-                yield f"cell {number} draws another picture"
+                yield f"cell {number} draws a different picture"
 
 
 def alike(before: str, after: str, tolerance: float) -> bool:
@@ -139,7 +139,7 @@ def unit(number: str) -> float:
 
 
 def look_alike(before: Image.Image, after: Image.Image) -> bool:
-    """Compare two pictures at the size of a stamp."""
+    """Compare two pictures as thumbnails."""
     old, new = (
         np.asarray(one.convert("RGB").resize((STAMP_PX, STAMP_PX), Image.Resampling.BOX)) / 255
         for one in (before, after)

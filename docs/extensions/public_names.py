@@ -1,4 +1,4 @@
-"""The names that the package exports, with their first lines, as a table of links."""
+"""The exported names of the package, with the first lines of their docstrings, as links."""
 
 from inspect import getdoc, ismodule
 
@@ -11,7 +11,7 @@ import pimper_torch
 
 
 def lines() -> list[str]:
-    """Write the table: a link to each name, and what it is for."""
+    """Write the table: a link to each name, and its first line."""
     written = [".. list-table::", "   :widths: 30 70", ""]
     for name in sorted(pimper_torch._names, key=str.lower):
         value = getattr(pimper_torch, name)

@@ -27,7 +27,7 @@ class Setting:
     Attributes:
         name: As on the command line and in YAML, such as ``sweep.window``.
         default: As YAML writes it.
-        effect: What its config's docstring says.
+        effect: Its entry in the config's docstring.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Setting:
 
 def settings_of(config: object, section: str = "") -> list[Setting]:
     """List the settings of a config, and of the configs inside it, in order."""
-    assert dataclasses.is_dataclass(config), f"{config!r} is no dataclass"
+    assert dataclasses.is_dataclass(config), f"{config!r} is not a dataclass"
     described = docstring_parser.parse(getdoc(config) or "")
     effects = {one.arg_name: one.description or "" for one in described.params}
     found: list[Setting] = []

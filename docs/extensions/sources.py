@@ -1,6 +1,6 @@
-"""Which publication each module takes its method from, as its docstrings say.
+"""The publications that modules follow, from the ``Source`` lines of docstrings.
 
-``sources`` writes a list for every room of the packages.
+``sources`` writes a list for every subpackage.
 """
 
 import ast
@@ -24,7 +24,7 @@ SOURCE = re.compile(r"^Source: (.*?)(?:\n\n|\Z)", flags=re.MULTILINE | re.DOTALL
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """What one docstring says of where its method is from.
+    """The source that one docstring states.
 
     Attributes:
         module: Whose docstring, such as ``pimper_torch.method.photometry.cone``.
@@ -51,7 +51,7 @@ def sources() -> Iterator[Source]:
 
 
 def rooms() -> dict[str, list[Source]]:
-    """Group sources by the room of a package that they are in."""
+    """Group sources by subpackage."""
     groups: dict[str, list[Source]] = {}
     for source in sources():
         parts = source.module.removeprefix("pimper_torch.").split(".")
@@ -64,7 +64,7 @@ class Sources(SphinxDirective):
     """The directive."""
 
     def run(self) -> list[nodes.Node]:
-        """Write a section of the page for each room."""
+        """Write a section of the page for each subpackage."""
         written: list[nodes.Node] = []
         for room, found in rooms().items():
             section = nodes.section(ids=[nodes.make_id(f"sources {room}")])

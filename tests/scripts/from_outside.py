@@ -1,4 +1,4 @@
-"""What a program outside the repository uses of the installed package; types are checked, too."""
+"""Use the installed package like a program outside the repository; types are checked as well."""
 
 import sys
 from pathlib import Path
@@ -10,7 +10,7 @@ from pimper_torch.runtime.config import presets
 
 
 def main(site_packages: str) -> None:
-    """Refuse a package that is another one's, or lacks its data."""
+    """Refuse another installation of the package, or one without its data."""
     home = Path(str(pt.__file__)).parent
     assert home == Path(site_packages) / "pimper_torch", home
     assert {"default", "fast", "paper"} <= set(presets())
@@ -22,7 +22,7 @@ def main(site_packages: str) -> None:
 
 
 def reconstructed(folder: str) -> pt.Mesh:
-    """Return what a checker of types has to know the type of; nothing calls it."""
+    """Return values whose types a type checker must know; never called."""
     return assert_type(pt.load_chain("default")(pt.load_views(folder)), pt.Reconstruction).mesh
 
 

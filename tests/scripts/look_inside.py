@@ -9,7 +9,7 @@ import pimper_torch as pt
 
 
 class WithoutHighlights(pt.Stage):
-    """The package's gauge, with albedo held below what nine in ten samples have."""
+    """The gauge of the package, with albedo clamped to the 0.9 quantile of the samples."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What a checker of types refuses: each line would pass for a module of torch's own."""
+"""Lines that a type checker must refuse; each would pass with a plain ``torch.nn.Module``."""
 
 import pimper_torch as pt
 

@@ -2,8 +2,8 @@
 
     python tests/scripts/weight.py
 
-By the syntax tree, so that no way of writing hides anything. The bars only go down: a change that
-lowers a number lowers its bar to it, and what a feature adds to a folder is taken from another.
+Counting uses the syntax tree, so formatting hides nothing. The bars only go down: a change that
+lowers a number lowers its bar to it, and a feature's additional lines are removed elsewhere.
 Paths that documents name are checked by ``test_shown.py``.
 """
 
@@ -22,15 +22,15 @@ DOCUMENTS = sorted(
     - {ROOT / "CHANGELOG.md"}
 )
 
-# Words by which prose reads as translated; each has a plainer one in most sentences (is given by,
-# in front of, next to, around, different, is not).
+# Words by which prose reads as translated; most sentences have a plainer one (is given by, in
+# front of, next to, around, different, is not).
 WORDS = re.compile(
     r"\b(what|tells?|told|telling|stands?|stood|standing|lies?|lying|(is|are) (no|none)|another"
     r"|beside|before (an?|the)|round (an?|the|it)|so many)\b",
     flags=re.IGNORECASE,
 )
 
-# Lines of the floors and rooms of the package; its own modules are ".".
+# Lines of the layers and subpackages; modules at the top level are ".".
 LINES = {
     ".": 75,
     "cli": 2162,
@@ -89,7 +89,7 @@ BARS = {
 
 
 def numbers(tree: ast.Module) -> int:
-    """Count the numbers that names of a module stand for, however they are put together."""
+    """Count the numbers in the constants of a module, however they are composed."""
     return sum(
         isinstance(inner, ast.Constant) and type(inner.value) in (int, float)
         for node in tree.body
@@ -135,7 +135,7 @@ _PROSE = (tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE",
 
 
 def measure(package: Path) -> tuple[dict[str, int], dict[str, int]]:
-    """Return lines by folder, and the numbers beside :data:`BARS`."""
+    """Return lines by folder, and the counts that :data:`BARS` limits."""
     lines: dict[str, int] = {}
     trees = []
     for path in sorted(package.rglob("*.py")):
@@ -149,7 +149,7 @@ def measure(package: Path) -> tuple[dict[str, int], dict[str, int]]:
 
 
 def over(found: Mapping[str, int], bars: Mapping[str, int]) -> Iterator[str]:
-    """Tell every number beside its bar, and yield those above it."""
+    """Print every count with its bar, and yield those above it."""
     for name, number in found.items():
         bar = bars.get(name, 0)
         sys.stdout.write(f"{number:6d} of {bar:6d} at most: {name}\n")
@@ -158,7 +158,7 @@ def over(found: Mapping[str, int], bars: Mapping[str, int]) -> Iterator[str]:
 
 
 def main() -> int:
-    """Print every number beside its bar; 1 where one is above it."""
+    """Print every count with its bar; return 1 if one is above it."""
     lines, counts = measure(PACKAGE)
     heavy = [*over(lines, LINES), *over(counts, BARS)]
     sys.stdout.write(f"{sum(lines.values()):6d} lines of the package\n")
