@@ -1,13 +1,13 @@
-"""Alignment of many patches: what it undoes, seconds and peak memory.
+"""Alignment of many patches: remaining error, seconds and peak memory.
 
     python benchmarks/alignment.py [--facets 5000] [--side 60] [--noise 0.0]
 
-Facets of a subdivided icosahedron on a sphere with bumps of a facet's size; every patch has
-the exact height field, spoiled by a bas-relief transform of its own: tilts of 0.15, scales of a
-factor 1.4, offsets of a fiftieth of an edge, one standard deviation each; ``--what scale``
-spoils scales only. ``--noise`` adds waves of
-a quarter edge's length to each patch, in fractions of the height field's own root mean square.
-Times are the best of ``--repeat`` runs, memory is what the process holds above its size before.
+Facets of a subdivided icosahedron on a sphere with bumps of a facet's size. Every patch has the
+exact height field, changed by a random bas-relief transform: tilts of 0.15, scales of a factor 1.4,
+offsets of a fiftieth of an edge, one standard deviation each. ``--what scale`` changes scales only.
+``--noise`` adds waves of a quarter edge's length to each patch, as fractions of the height field's
+root mean square. Times are the best of ``--repeat`` runs; memory is the peak above the process's
+size before the run.
 """
 
 import argparse

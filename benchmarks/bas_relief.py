@@ -1,12 +1,11 @@
-"""Compare what resolves the bas-relief ambiguity of uncalibrated photometric stereo.
+"""Compare resolvers of the bas-relief ambiguity of uncalibrated photometric stereo.
 
     python benchmarks/bas_relief.py [--size 64] [--scenes 8]
 
-Prints Markdown tables of mean normal errors in degrees, the median over scenes with the worst in
-brackets. Scenes are balls and bumps, painted in five colours by regions or in one, under random
-point lights; shading is fitted with the true lights to values out of shadow and hidden by a random
-bas-relief, so that the tables show the resolvers alone. `best` is the height field nearest to the
-truth.
+Prints Markdown tables of mean normal errors in degrees: the median over scenes, with the worst in
+brackets. Scenes are balls and bumps in five colours by regions or in one, under random point
+lights. Shading is fitted with the true lights to values out of shadow, then transformed by a random
+bas-relief, so the tables show the resolvers alone. `best` is the height field nearest to the truth.
 """
 
 import argparse
@@ -74,7 +73,7 @@ def scene(
 
 
 def fitted(made: OneView) -> tuple[Tensor, Tensor]:
-    """Fit shading with the true lights; tell which pixels have four values or more."""
+    """Fit shading with the true lights; also return which pixels have at least four values."""
     values = made.images.sum(dim=1)[:, made.mask]
     lit = (values > DARK * values.max()).double()
     known = lit.sum(dim=0) >= 4

@@ -1,13 +1,13 @@
-"""Measure a carton: how flat its sides came out, and how near to right its angles.
+"""Measure a carton: the flatness of its sides, and their angles.
 
     python benchmarks/carton.py MESH.ply [--band 0.02]
     python benchmarks/carton.py --data FOLDER [--preset default] [--reference NAME] [--out DIR]
         [--views 15] [--max-size 0]
 
 FOLDER is an LLFF set (``poses_bounds.npy``, ``images``, masks) with its cloud in ``pts.pkl``. The
-cloud has no tracks: a point counts as seen by the views that the surface round it faces, at where
-it projects. With ``--sfm`` structure from motion runs on the photographs instead; ``--model DIR``
-writes them, their masks, their known cameras and the cloud with those tracks as a COLMAP model,
+cloud has no tracks: a point is observed, at its projection, by the views that the surface around it
+faces. With ``--sfm`` structure from motion runs on the photographs instead. ``--model DIR`` writes
+the photographs, their masks, their known cameras and the cloud with those tracks as a COLMAP model,
 and stops: ``pimper reconstruct DIR/images --masks DIR/masks --sparse DIR/sparse/0``.
 """
 
@@ -38,11 +38,11 @@ from pimper_torch.result.viz.render import crop
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.stage import Given
 
-# Fraction of the views whose masks a point must lie in to be the object's: masks were drawn for
-# each view apart, and miss a pixel of the contour here and there.
+# A point of the object is inside this fraction of the views' masks, which were drawn independently
+# and miss a pixel of the contour in places.
 IN_MASKS = 0.9
 
-# Neighbours that a plane is fitted to round a point, and the least cosine it must face a view by.
+# Neighbours for the plane fitted at a point, and the minimum cosine between its normal and a view.
 NEIGHBOURS, MIN_FACING = 16, 0.25
 
 # Angles further from right than this belong to the gable; and only sides with this fraction of the
@@ -51,10 +51,10 @@ RIGHT, WALL = 10.0, 0.12
 
 
 class Arrays(pickle.Unpickler):
-    """Reads arrays and nothing else: a pickle may hold any program."""
+    """Reads arrays only, because a pickle can run any program."""
 
     def find_class(self, module: str, name: str) -> object:
-        """Return what arrays are made of."""
+        """Return the classes that arrays consist of."""
         if module.split(".")[0] == "numpy" and name in ("_reconstruct", "ndarray", "dtype"):
             return super().find_class(module, name)
         raise InputError(f"{module}.{name} in a pickle; needed: an array of numbers alone.")
@@ -160,7 +160,7 @@ def read_cloud(folder: Path) -> Float[Tensor, "point 3"]:
 
 
 def on_object(cloud: Float[Tensor, "point 3"], capture: Capture) -> Bool[Tensor, " point"]:
-    """Mark points that lie in the masks of nearly all views they are in the frame of."""
+    """Mark points inside the masks of nearly all views whose frame contains them."""
     _, framed, masked = _looked_at(cloud, capture)
     return (masked & framed).sum(dim=0) >= IN_MASKS * framed.sum(dim=0).clamp_min(1)
 
@@ -242,7 +242,7 @@ def _looked_at(
     """Project points to all views: where, whether in the frame, whether in the mask."""
     cameras, masks = cameras_of(capture), capture.views.masks
     if masks is None:
-        raise InputError("the set has no masks; needed: a folder `images_mask` beside `images`.")
+        raise InputError("the set has no masks; needed: a folder `images_mask` next to `images`.")
     pixels, depth = project(cloud, cameras.cam_from_world, cameras.intrinsics)
     framed = ((pixels > 0) & (pixels < cameras.sizes_px[:, None])).all(dim=-1) & (depth > 0)
     height, width = masks.shape[-2:]

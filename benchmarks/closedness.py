@@ -1,4 +1,4 @@
-"""Whether a surface is closed: its openings, its edges that are none of a surface's, its folds."""
+"""Check whether a surface is closed: openings, non-manifold edges, folds."""
 
 import math
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from pimper_torch.runtime.errors import InputError
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Closedness(Record):
-    """What keeps a mesh from being the skin of a body.
+    """The defects that keep a mesh from bounding a solid.
 
     Attributes:
         loops: Length of every loop of the border, the longest first, scene units.
         edges: How many edges each has.
         crowded: Edges that three faces share, or more.
         twisted: Edges whose two faces disagree about which side is out.
-        folds: Edges where the surface turns by more than the angle that was asked for.
-        pieces: Of faces that hang together by edges.
+        folds: Edges where the surface turns by more than the given angle.
+        pieces: Components of faces connected by edges.
         euler: Vertices less edges plus faces; 2 for a sphere, 1 for a disc.
         diagonal: Of the bounding box, scene units.
     """
@@ -54,19 +54,19 @@ class Closedness(Record):
 
     @property
     def handles(self) -> int:
-        """How many handles the pieces have together.
+        """Total number of handles of all pieces.
 
-        No telling where edges are crowded, or pieces or openings meet in a vertex.
+        Meaningless with crowded edges, or if pieces or openings meet in a vertex.
         """
         return (2 * self.pieces - self.euler - len(self.loops)) // 2
 
 
 def closedness(mesh: Mesh, *, fold_deg: float = 90.0) -> Closedness:
-    """Look for what keeps a mesh from being closed.
+    """Find the defects that keep a mesh from being closed.
 
     Args:
-        mesh: Any; vertices without faces do not count. Vertices that lie at one point without
-            being one are a border.
+        mesh: Any; vertices without faces are ignored. Duplicate vertices at one position are
+            a border.
         fold_deg: Angle between the normals of neighbouring faces, above which it is folded
             there. Faces without area have none.
 
@@ -77,7 +77,7 @@ def closedness(mesh: Mesh, *, fold_deg: float = 90.0) -> Closedness:
     if len(faces) == 0:
         raise InputError(
             f"closedness: a mesh of {len(vertices)} vertices without faces; needed: a surface. "
-            "Look at what the mesh's file holds."
+            "Check the mesh file."
         )
     ends, index = face_edges(faces)
     sharing = torch.bincount(index.flatten(), minlength=len(ends))

@@ -1,7 +1,7 @@
-"""Photograph an object among other things on a patterned table, along an arc.
+"""Render an object among other objects on a patterned table, along an arc.
 
-Run as ``python benchmarks/clutter.py FOLDER [--scene jar] [--num-views 16] [--width 640]``; writes
-``photos`` and ``masks``, white on the object alone.
+Run as ``python benchmarks/clutter.py FOLDER [--scene jar] [--num-views 16] [--width 640]``. Writes
+``photos`` and ``masks``, which are white on the object alone.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
 from pimper_torch.ground.radiometry import srgb_from_linear
 
-# Scene, size, turn in degrees and place: behind and beside the object, which they do not hide.
+# Scene, size, rotation in degrees and position: behind and next to the object, not occluding it.
 AROUND = (
     ("potatoes", 0.7, 40, (-2.1, 0.3)),
     ("balls", 0.7, -30, (2.2, 0.4)),
@@ -50,7 +50,7 @@ class Placed:
 
 
 def things() -> Iterator[SceneObject]:
-    """List what stands around."""
+    """List the surrounding objects."""
     generator = torch.Generator().manual_seed(7)
     for name, scale, turn_deg, shift in AROUND:
         for item in RECIPES[name](generator):

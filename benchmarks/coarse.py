@@ -1,11 +1,12 @@
-"""Compare ways to the coarse surface of a rendered scene, true masks given.
+"""Compare coarse surfaces of a rendered scene, with true masks.
 
     python benchmarks/coarse.py SCENE [SCENE ...] [--cache DIR]
 
-SCENE is a folder that ``pimper render`` wrote. Cameras are found without masks. Each way is
-simplified to the facets of ``default`` and compared with the truth before any round: in the
-reference view the fraction of the object's pixels that it meets, the 3D error and the normals of
-its shape there; accuracy, and completeness of what three views see, in per cent of the diagonal.
+SCENE is a folder that ``pimper render`` wrote. Cameras are estimated without masks. Each surface is
+simplified to the number of facets of ``default`` and compared with the truth before the first pass.
+In the reference view: the fraction of the object's pixels that it covers, the 3D error and the
+normals of its shape. In percent of the diagonal: accuracy, and completeness of the surface that
+three views see.
 """
 
 import argparse
@@ -55,7 +56,7 @@ from pimper_torch.runtime.errors import PimperWarning
 
 Surface = tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
 
-# Facets of the cut count where they are so many pixels from all points and contours.
+# Facets of the cut count if they are this many pixels from all points and contours.
 _UNKNOWN_PX = 8.0
 
 
@@ -94,7 +95,7 @@ def masks_of(folder: Path, scene: SparseScene) -> Silhouettes:
 
 
 def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[], Surface]]:
-    """List the surfaces to compare; the later ones share what the photographs told."""
+    """List the surfaces to compare; the later ones share results of the photographs."""
     builder = CoarseSurface()
     contours = TraceContours()(silhouettes, scene.cameras)
     hull = contours.hull

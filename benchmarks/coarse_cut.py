@@ -1,8 +1,8 @@
-"""A rival of the coarse surface: the tetrahedra that rays from cameras leave full, by min-cut.
+"""A rival of the coarse surface: full tetrahedra after ray carving, by minimum cut.
 
 Labatut, Pons & Keriven, Robust and efficient surface reconstruction from range data, CGF 28(8),
-2009, with random points between the matched ones, so that facets can run where nothing was
-matched. What lies outside the visual hull is empty: a mask is rays more.
+2009, with random points between the matched ones, so that facets also exist without matches. Space
+outside the visual hull is empty: a mask contributes additional rays.
 """
 
 import numpy as np
@@ -37,13 +37,13 @@ def cut_surface(
     views_each: int = 3,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Separate what rays cross from what they end on.
+    """Separate the tetrahedra that rays cross from those that they end on.
 
     Args:
         cloud: Matched points.
         maps: Which views see a point: those whose depth is the point's.
-        hull: Nothing is outside.
-        contour: Points that are seen from the view whose silhouette they lie on.
+        hull: Contains the whole surface.
+        contour: Points on silhouettes, observed by the view of their silhouette.
         max_points: Of the cloud; as many random ones come in between.
         views_each: Rays of each point, at most.
         seed: Of both.
@@ -69,7 +69,7 @@ def cut_surface(
     arcs, source, sink = _votes(mesh, points[point], center.double(), sigma)
     empty = hull.depth_of(corners.mean(dim=1).float()) < 0
     source[empty.numpy()] += 1e6 / _UNIT
-    # What no ray crosses is full rather than empty: half a ray's worth.
+    # Tetrahedra that no ray crosses are full rather than empty, by half a ray's weight.
     untold = ~empty.numpy()
     untold[np.concatenate(arcs[:2]).astype(int)] = False
     sink[untold] += 0.5
@@ -111,7 +111,7 @@ def _votes(
     length = towards.norm(dim=1, keepdim=True)
     towards = towards / length
     near = torch.linspace(0, _SPAN * sigma, _PLACES // 2).double()
-    # Beyond the span a ray costs the same everywhere, and only says what is empty.
+    # Beyond the span the cost of a ray is constant, and only marks space as empty.
     far = torch.logspace(0, 1.5, _PLACES // 2).double() * _SPAN * sigma
     along = torch.cat([near + 1e-3 * sigma, far[1:]])
     places = points[:, None] + along[:, None] * towards[:, None]
@@ -132,7 +132,7 @@ def _votes(
 
 
 def _shapes(corners: Float[Tensor, "cell 4 3"], beside: Int[Tensor, "cell 4"]) -> Arcs:
-    """Price facets by the angles with the circumspheres: skinny cells are no surface."""
+    """Weight facets by their angles with the circumspheres: thin cells are not surface."""
     edges = corners[:, 1:] - corners[:, :1]
     safe = edges + 1e-12 * torch.eye(3, dtype=edges.dtype)
     offset = torch.linalg.solve(safe, 0.5 * edges.square().sum(dim=2, keepdim=True))[..., 0]

@@ -1,9 +1,9 @@
-"""Derivatives that autograd gives, beside finite differences of the same function.
+"""Compare derivatives of autograd with finite differences of the same function.
 
-A stage that selects (which view, which face, which sample is valid) has jumps, and one that
-interpolates has kinks: no derivative there. They show in the finite differences alone: those of two
-step sizes disagree, or those forward and backward. What jumps or bends is left out and counted;
-where all agree, autograd has to agree with them.
+A stage that selects (a view, a face, valid samples) has jumps, and one that interpolates has kinks:
+no derivative exists there. Finite differences detect both: those of two step sizes disagree, or
+forward and backward ones. Such elements are counted and excluded. Where finite differences agree,
+autograd must agree with them.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,10 +19,10 @@ from pimper_torch.records import Record
 # and backward ones a kink.
 _JUMP = 0.01
 
-# Of so many roundings a function's value is made.
+# Number of rounding errors in a function's value.
 _ROUNDINGS = 16
 
-# A direction in which more than this fraction of an output's elements jump tells nothing of it.
+# A direction is uninformative if more than this fraction of an output's elements jump.
 _MAX_JUMPS = 0.5
 
 Tensors = Mapping[str, Tensor]
@@ -182,7 +182,7 @@ def _differences(
 
 
 def _rounding(values: Tensor, step: float) -> Tensor:
-    """Return what is left of a difference of equal values over a step."""
+    """Return the rounding error of a difference of equal values, over a step."""
     return _ROUNDINGS * torch.finfo(values.dtype).eps * values.abs().max() / step
 
 

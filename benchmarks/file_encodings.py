@@ -1,8 +1,8 @@
-"""What is lost where files do not say how their samples encode radiance, or are not heard.
+"""Error if files do not state the encoding of their samples, or if it is ignored.
 
-Run as ``python benchmarks/file_encodings.py SCENE -o FOLDER``: what ``pimper render`` wrote
+Run as ``python benchmarks/file_encodings.py SCENE -o FOLDER``, with a scene from ``pimper render``
 with ``--bits 16 --encoding linear``. Its photographs are written as PNG in other encodings, with
-the chunks that say so and without; each set is reconstructed with the true cameras and masks and
+and without the chunks that state it. Each set is reconstructed with the true cameras and masks and
 measured. Prints rows of a table.
 """
 

@@ -1,8 +1,8 @@
-"""Gamma from the factorization's residual: matrices whose gamma is known, and photographs.
+"""Gamma from the factorization's residual: matrices with known gamma, and photographs.
 
     python benchmarks/gamma.py FOLDER
 
-FOLDER holds `uw_ps/images` (the UW photometric stereo set) and
+FOLDER contains `uw_ps/images` (the UW photometric stereo set) and
 `yale_b02/photometrics_images/yaleB02` (a face of the Yale database B).
 """
 

@@ -1,12 +1,12 @@
-"""Time and memory of gradients, by stage and of the chain whole.
+"""Time and memory of gradients, for each stage and for the whole chain.
 
     python benchmarks/gradient_cost.py SCENE [--scales 0.25 0.5] [--only factorize chain]
 
-SCENE is a folder of `pimper render`; cameras and masks are true. Each stage is called with what the
-chain hands it in its last pass: without gradients, then with gradients of all its results (the sum
-of their squares) by all tensors that it is handed. Seconds are of the clock, the better of two
-calls; memory is what the process grows by during the call, at most, where Linux tells, and what it
-then takes in all. Gradients that are not finite are counted.
+SCENE is a folder of `pimper render`; cameras and masks are true. Each stage gets the inputs of the
+chain's last pass. It runs first without gradients, then with gradients of all results (the sum of
+their squares) with respect to all input tensors. Seconds are wall time, the better of two calls.
+Memory is the maximum growth of the process during the call, where Linux reports it, and the total
+after it. Gradients that are not finite are counted.
 """
 
 import argparse
@@ -87,7 +87,7 @@ def measured(work: Callable[[], Any]) -> tuple[float, float, float, Any]:
 
 
 def peak_gigabytes() -> float:
-    """Return the peak of the process's memory, 0 where it is not told."""
+    """Return the peak memory of the process, 0 if the system does not report it."""
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
     return next((int(line.split()[1]) / 2**20 for line in lines if line.startswith("VmHWM")), 0.0)

@@ -1,11 +1,10 @@
 """Measure how time and memory grow with the number of photographs and with their size.
 
 Run as ``python benchmarks/growth.py FOLDER... [--num-views 10 20 30] [--max-size-px 800 1600]``.
-Each folder holds photographs, or a rendered scene. Runs ``pimper reconstruct`` on so many of them,
-equally far apart, shrunk to each size, one run after the other. Prints a Markdown table: facets,
-vertices before simplification, seconds, CPU seconds and GB of the whole process, and the seconds
-and GB that ``pimper doctor`` estimates beside them. Options after ``--`` are those of ``pimper
-reconstruct``.
+Each folder contains photographs, or a rendered scene. Runs ``pimper reconstruct`` on each number of
+them, evenly spaced, scaled to each size, one run after another. Prints a Markdown table: facets,
+vertices before simplification, seconds, CPU seconds and GB of the process, and the seconds and GB
+that ``pimper doctor`` estimates. Options after ``--`` are passed to ``pimper reconstruct``.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Photographs for `guards.py`: plain sets, and for guards the sets that these are there for."""
+"""Photographs for `guards.py`: plain sets, and sets on which each guard is needed."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from pimper_bench.scenes import SceneConfig, render_scene
 
 SKULL = Path(pimper_torch.__file__).parent / "data" / "skull"
 
-# Beside the repository, not part of it: meshes whose y axis is up.
+# Next to the repository, not part of it: meshes whose y axis is up.
 MESHES = Path(__file__).parents[2] / "shared" / "data" / "meshes"
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 

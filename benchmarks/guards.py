@@ -1,14 +1,14 @@
-"""What guards leave out of plain photographs, and what they gain where they are needed.
+"""Measure the data that guards remove from plain photographs, and their gain where needed.
 
     python benchmarks/guards.py FOLDER [--presets fast default] [--sets NAME ...] [--tiny]
     python benchmarks/guards.py FOLDER --without extract.borders [--sets NAME ...]
     python benchmarks/guards.py FOLDER --table
 
-Every set is rendered once into FOLDER, run with the ledger's listener, and judged by the truth:
-a photograph is right unless it was spoilt, a doubt if the cameras are good, faces, facets and
-points if they lie near the true surface, pixels if they show the object. Features and matches are
-counted. Results are kept, one JSON a run, under set, preset and key: a run that was interrupted
-goes on with the same command.
+Every set is rendered once into FOLDER, run with a listener of the ledger, and compared with the
+truth. Data is valid, and its removal wrong, in these cases: a photograph that was not degraded;
+faces, facets and points near the true surface; pixels of the object. A warning is wrong if the
+cameras are good. Features and matches are only counted. Results are kept, one JSON per run, under
+set, preset and key; the same command resumes an interrupted run.
 """
 
 import argparse
@@ -45,10 +45,10 @@ from pimper_torch.records import Estimate, LeftOut, Reconstruction
 from pimper_torch.runtime.errors import PimperError
 from pimper_torch.runtime.ledger import GUARDS, listening
 
-# A place is right within this fraction of the object's diagonal: five times what accurate surfaces
-# are off. Cameras are good within these errors; all choices.
+# A position is correct within this fraction of the object's diagonal: five times the error of
+# accurate surfaces. Cameras are good within these errors; all choices.
 NEAR, MOST_DEG, MOST_PERCENT = 0.005, 1.0, 2.0
-SAMPLES = 5_000  # places of an entry that are judged
+SAMPLES = 5_000  # positions of an entry that are compared with the truth
 
 # Of a run, in the order of the table; covered and normals in the middle view. Bars of the
 # meshes under a lamp: 98 % covered, normals of 5 degrees, 1 % sticking out.
@@ -68,7 +68,7 @@ def everything(like: int) -> Callable[..., Tensor]:
     return lambda *given, **_: torch.ones(len(given[like]), dtype=torch.bool)
 
 
-# What stands in for each guard that can be switched off, and settings that switch it off.
+# The replacement of each guard that can be switched off, and the settings that switch it off.
 PATCHES: dict[str, dict[str, object]] = {
     "sfm.static_background": {"sfm.static_background.StaticBackground.detected": False},
     "sfm.moved_object": {"sfm.registration.link_sessions": lambda *_: ()},
@@ -97,12 +97,12 @@ CHANGES: dict[str, dict[str, object]] = {
 
 @dataclass
 class Heard:
-    """The ledger's listener: entries, places of what was taken, and masks of pixels."""
+    """A listener of the ledger: entries, positions of removed elements, and masks of pixels."""
 
     entries: list[tuple[LeftOut, Tensor | None, Tensor | None]] = field(default_factory=list)
 
     def __call__(self, entry: LeftOut, mask: Tensor | None, places: Tensor | None) -> None:
-        """Keep an entry with as many places as are judged."""
+        """Keep an entry with a sample of its positions."""
         if mask is not None and places is not None and entry.count:
             taken = places.detach()[mask.flatten()]
             places = taken[:: math.ceil(len(taken) / SAMPLES)].double().cpu()
@@ -112,7 +112,7 @@ class Heard:
 
 @dataclass(frozen=True)
 class Judge:
-    """The truth about what guards took; without a true scene it tells nothing of places."""
+    """The truth about removed elements; without a true scene, positions cannot be judged."""
 
     names: tuple[str, ...]
     spoilt: list[str]
@@ -123,7 +123,7 @@ class Judge:
     shown: Tensor | None = None
 
     def right(self, entry: LeftOut, places: Tensor | None, pixels: Tensor | None) -> float | None:
-        """Return the fraction of what was taken that was right; ``None`` where nothing tells."""
+        """Return the fraction of removed elements that were valid; ``None`` if it is unknown."""
         if entry.what == "photographs" and entry.names:
             return sum(name not in self.spoilt for name in entry.names) / len(entry.names)
         if entry.what == "warning" and self.good is not None:
@@ -183,7 +183,7 @@ def shown_by(place: Path, capture: Capture, names: tuple[str, ...]) -> Tensor | 
 
 
 def run(place: Path, spoilt: list[str], preset: str, without: str) -> dict[str, Any]:
-    """Reconstruct a set once, and count what every guard took, and how much of it was right."""
+    """Reconstruct a set once; count the removals of every guard, and those of valid elements."""
     heard, result, failure = Heard(), None, ""
     chain = load_chain(preset, CHANGES.get(without, {}))
     began = time.perf_counter()
@@ -225,7 +225,7 @@ def told(found: dict[str, Any]) -> str:
 
 
 def table(found: dict[tuple[str, str, str], dict[str, Any]]) -> Iterator[str]:
-    """Lay out runs by set, what guards took on plain sets, and what they gain on their own."""
+    """Format runs by set, removals on plain sets, and gains on the sets of each guard."""
     head = "views | ° | centres % | accuracy % | Chamfer % | covered % | normals ° | sticks out %"
     head += " | error | s | taken by its guards"
     yield f"\n| set | preset | without | {head} |"
@@ -259,7 +259,7 @@ def table(found: dict[tuple[str, str, str], dict[str, Any]]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Read the command line, do what is left to do, and print the tables."""
+    """Read the command line, run the remaining sets, and print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path, help="of rendered scenes and results")
     parser.add_argument("--sets", nargs="+", choices=SETS, default=list(SETS), metavar="NAME")
@@ -267,7 +267,7 @@ def main() -> None:
     parser.add_argument("--without", choices=sorted({*PATCHES, *CHANGES}), help="on every set")
     parser.add_argument("--key", help="of the results; the commit by default")
     parser.add_argument("--tiny", action="store_true", help="8 photographs of 240x180 each")
-    parser.add_argument("--table", action="store_true", help="print what is there, run nothing")
+    parser.add_argument("--table", action="store_true", help="print existing results, run nothing")
     options = parser.parse_args()
     commit = ("git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD")
     key = options.key or subprocess.run(commit, capture_output=True, text=True).stdout.strip()

@@ -1,11 +1,10 @@
-"""Sparse solvers on the systems of rasters and meshes: seconds, memory, iterations, residual.
+"""Sparse solvers on systems of rasters and meshes: seconds, memory, iterations, residual.
 
     OMP_NUM_THREADS=1 python benchmarks/linear_systems.py [--sides 500] [--cases mesh]
 
-Every row is measured in a process of its own, so that peak memory is its own; it includes the
-0.3 GB that importing the package takes. CPU seconds, which on one thread do not depend on what
-else the machine does, are the best of three runs; of one for rivals and for more than a million
-unknowns.
+Every row is measured in a separate process, so peak memory is its own; it includes the 0.3 GB of
+importing the package. CPU seconds, which on one thread do not depend on other programs, are the
+best of three runs, or of one run for rivals and for more than a million unknowns.
 """
 
 import argparse
@@ -129,7 +128,7 @@ def compressed(case: str, side: int) -> csr_array:
 
 
 def solver(name: str, case: str, side: int) -> tuple[Callable[[], object], Callable[..., tuple]]:
-    """Return what prepares, and what solves with the prepared for solution and iterations."""
+    """Return a function that prepares, and one that solves and returns solution and iterations."""
     if name in ("spsolve", "cg", "cg, diagonal"):
         matrix = compressed(case, side)
         scale = 1 / matrix.diagonal()

@@ -1,14 +1,14 @@
-"""Integration of normal maps: error and seconds, method by method.
+"""Integration of normal maps: error and seconds of each method.
 
     python benchmarks/normal_integration.py FOLDER [--figure FILE]
 
-FOLDER holds ``diligent/NAME`` with ``normal_map.png, mask.png, K.txt, depth_gt.npz``, and next
-to it maps without depth, as the bilateral-integration set distributes them. The error is the
-mean absolute error of depth in mm after the scale that the median ratio gives; ``published`` is
-bilateral normal integration (Cao et al. 2022). ``weights from the truth`` solves once, with the
-robust weights at the true depth: what is left is in the normals themselves. Where there is no
-depth, the angle between the given normals and those of the surface found, over steps that it
-takes, tells whether creases survive.
+FOLDER contains ``diligent/NAME`` with ``normal_map.png, mask.png, K.txt, depth_gt.npz``, and maps
+without depth, as the bilateral-integration set distributes them. The error is the mean absolute
+error of depth in mm after scaling by the median ratio. ``published`` is bilateral normal
+integration (Cao et al. 2022). ``weights from the truth`` solves once, with the robust weights at
+the true depth: the remaining error is in the normals themselves. For maps without depth, the angle
+between the given normals and those of the surface, over steps that it keeps, shows whether creases
+survive.
 """
 
 import argparse
@@ -38,7 +38,7 @@ PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1":
 # Occluding contours divide it into parts; normals say nothing of their distances.
 SPLIT = "goblet"
 METHODS = ("weighted", "discontinuities")
-# At the true depth residuals are noise and rounding; what is beyond is a jump.
+# At the true depth, residuals are noise and rounding; larger ones are discontinuities.
 TRUE_SCALE_PX = 0.1
 
 

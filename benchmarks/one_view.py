@@ -1,4 +1,4 @@
-"""Normals and albedo photographed from one viewpoint under many distant lights, camera frame."""
+"""Normals and albedo rendered from one viewpoint under many distant lights, camera frame."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from pimper_torch.records import Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OneView(Record):
-    """Photographs from one viewpoint, and what they show.
+    """Photographs from one viewpoint, with the true normals, albedo and lights.
 
     Attributes:
         normals: Unit, of the pixels inside the mask in raster order.
@@ -40,8 +40,8 @@ def photograph(
     """Render a Lambertian surface, attached shadows black.
 
     Args:
-        noise: Standard deviation of what is added to each value before negative ones are cut
-            off, as a fraction of the brightest.
+        noise: Standard deviation of Gaussian noise, as a fraction of the maximum; added before
+            negative values are clipped.
     """
     n, rho = normals[mask].mT, albedo[mask].mT
     values = (lights @ n).clamp_min(0)[:, None] * rho
@@ -55,7 +55,7 @@ def photograph(
 def point_lights(
     views: int, generator: torch.Generator, widest_deg: float = 50.0
 ) -> Float[Tensor, "view 3"]:
-    """Draw distant point lights evenly over the cap round the view, of strength 0.7 to 1.3."""
+    """Draw distant point lights evenly over the cap around the view, of strength 0.7 to 1.3."""
     widest = torch.cos(torch.deg2rad(torch.tensor(widest_deg, dtype=torch.float64)))
     drawn = torch.rand(3, views, generator=generator, dtype=torch.float64)
     z = 1 - (1 - widest) * drawn[0]

@@ -1,4 +1,4 @@
-"""Small sets from one viewpoint: two for photometric stereo, and normal maps to integrate."""
+"""Readers of small single-view sets: two for photometric stereo, and normal maps."""
 
 import re
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ def read_uw_ps(folder: Path | str, name: str, *, max_size_px: int = 0) -> Captur
     the mask's). The files hold linear radiance: the grey sphere follows the cosine to 4 % as
     they are, to 15 % with sRGB undone. Directions have y up and z towards the viewer and are
     turned to x right, y down, z forward; the grey sphere's own shading then gives them back to
-    2.8 degrees in the mean. There are no cameras: the world is the camera's frame.
+    2.8 degrees on average. There are no cameras: the world frame is the camera's.
 
     Args:
         folder: With ``lights.txt``.
@@ -41,7 +41,7 @@ def read_uw_ps(folder: Path | str, name: str, *, max_size_px: int = 0) -> Captur
         max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
 
     Raises:
-        InputError: Another layout; names what was expected and what was found.
+        InputError: Another layout; names the expected and the actual content.
     """
     root = DataSetPath(Path(folder), _UW)
     listed = root.inner(f"{name}/{name}.txt")
@@ -49,7 +49,7 @@ def read_uw_ps(folder: Path | str, name: str, *, max_size_px: int = 0) -> Captur
     count, *names = listed.read_text().split() or ["0"]
     listed.expect(
         count.isdecimal() and len(names) == int(count) + 1 > 1,
-        "a number, so many names of photographs, and the mask's name",
+        "a number N, N names of photographs, and the mask's name",
         f"{count!r} and {len(names)} names",
     )
     lights = root.inner("lights.txt")
@@ -71,9 +71,9 @@ def read_yale_b(
 ) -> Capture:
     """Read a face of the Yale database B in its frontal pose, cropped to 168 x 192.
 
-    The names tell the light: ``yaleB02_P00A+035E-20.pgm`` has azimuth 35 degrees towards the
+    The names give the light: ``yaleB02_P00A+035E-20.pgm`` has azimuth 35 degrees towards the
     left of the image (the right hand of the face) and elevation -20, that is from below. The
-    values are taken for linear radiance. World and camera are one frame: x right, y down,
+    values are read as linear radiance. World and camera are one frame: x right, y down,
     z forward.
 
     Args:
@@ -132,7 +132,7 @@ def _capture(views: Views, directions: torch.Tensor) -> Capture:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class NormalMap(Record):
-    """A normal map to integrate, with what is known about the surface behind it.
+    """A normal map to integrate, with the known data of its surface.
 
     Attributes:
         normals: Unit, facing the viewer (``n_z < 0``), camera frame; zero off the mask.
@@ -158,7 +158,7 @@ def read_normal_map(folder: Path | str) -> NormalMap:
     better than 38. ``K`` counts pixel centres from 0.
 
     Raises:
-        InputError: Another layout; names what was expected and what was found.
+        InputError: Another layout; names the expected and the actual content.
 
     Source: Cao, Santo, Shi, Okura & Matsushita, Bilateral Normal Integration, ECCV 2022.
     """

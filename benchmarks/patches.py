@@ -1,11 +1,11 @@
-"""Factorization of many patches at once: seconds, steps, and what reading the data would take.
+"""Factorization of many patches: seconds, steps, and the time of reading the data.
 
     python benchmarks/patches.py [--patches 206] [--views 30] [--samples 3660] [--missing 0.58]
 
-The numbers are those of the published Jar. Patches are drawn: normals about a facet's, albedo,
-first-order lights that neighbours nearly share, noise of 1 %, contiguous parts missing from
-each view. Lights start 0.1 off, normals at the facet's. Robust objectives are taken with the
-weights that each solver ended with, and compare solvers only roughly.
+The numbers are those of the published Jar. Patches are random: normals around a facet's, albedo,
+first-order lights that are similar in neighbouring views, noise of 1 %, contiguous parts missing
+from each view. Initial lights are 0.1 off, and initial normals are the facet's. Robust objectives
+use the weights that each solver ended with, and compare solvers only approximately.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from pimper_torch.method.photometry.cone import Cone
 from pimper_torch.method.photometry.factorize import SOLVERS
 from pimper_torch.method.photometry.light_field import harmonics
 
-# How strongly lights are held to their start, as a fraction of what the data say, and the loss.
+# Weight of the lights' prior relative to the data, and the loss.
 CASES = ((1.0, Squares()), (1.0, Cauchy(2.0)), (1e-6, Squares()))
 LIMITS = {"variable-projection": 60, "balm": 300}
 TOLERANCES = {"variable-projection": 1e-4, "balm": 1e-3}
@@ -89,7 +89,7 @@ def main() -> None:
 def draw(
     patches: int, views: int, samples: int, missing: float
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return radiance, what is seen, starting lights, and normals: the facet's and the true."""
+    """Return radiance, visibility, initial lights, and the facet's and the true normals."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> torch.Tensor:

@@ -1,11 +1,11 @@
-"""Photometric stereo from one viewpoint: normals and lights, by every method, in one table.
+"""Photometric stereo from one viewpoint: normals and lights of every method, in one table.
 
     python benchmarks/photometric_stereo.py FOLDER [FOLDER ...]
 
-Each FOLDER is one of: `images` of the UW photometric stereo set, a face of the Yale database B,
-or meshes, of which spot.obj and bunny_hr.obj are rendered under 20 point lights with cast shadows.
+Each FOLDER is one of: `images` of the UW photometric stereo set, a face of the Yale database B, or
+meshes, of which spot.obj and bunny_hr.obj are rendered under 20 point lights with cast shadows.
 Only the grey sphere (its circle is fitted to the mask) and the rendered meshes have true normals;
-the others are compared with those of known lights, and say so.
+the others are compared with calibrated photometric stereo, as their rows state.
 """
 
 import argparse
@@ -57,7 +57,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Photographs, and what they are compared with."""
+    """Photographs with their references."""
 
     name: str
     images: Tensor
@@ -67,7 +67,7 @@ class Scene:
 
 
 def main() -> None:
-    """Print one row a scene, method and way to resolve what it leaves free."""
+    """Print a row for each scene, method and resolver of its ambiguity."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--only", nargs="*", default=[], help="parts of the scenes' names")
@@ -223,7 +223,7 @@ def sphere_normals(mask: Tensor) -> Tensor:
 
 
 def encoding(folder: Path) -> str:
-    """Tell whether the grey sphere is matte as its files are, or with sRGB undone."""
+    """Report whether the grey sphere is matte with its file values, or after decoding sRGB."""
     scene = uw(folder, "gray")
     inner = (scene.normals[..., 2] < -0.3) & scene.mask
     normals = scene.normals[inner].double()

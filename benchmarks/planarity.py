@@ -1,6 +1,6 @@
-"""How flat the flat sides of an object came out, and the angles between them.
+"""Flatness of the planar sides of an object, and the angles between them.
 
-A carton has no scan to be compared with, but its sides are planes at right angles.
+A carton has no reference scan, but its sides are planes at right angles.
 """
 
 import math
@@ -26,17 +26,17 @@ from pimper_torch.runtime.errors import InputError
 # Points that candidates for planes are scored on, and candidates for each plane.
 _JUDGES, _CANDIDATES = 20_000, 256
 
-# Rounds of fitting a plane to what lies near it, and taking what lies near that.
+# Iterations of fitting a plane to its inliers, and of selecting the inliers.
 _REFITS = 8
 
-# Normals are averaged over about this fraction of the diagonal, for noise tilts small faces by far.
+# Normals are averaged over this fraction of the diagonal, because noise tilts small faces.
 _SMOOTHING = 0.01
 
-# Vertices that must lie away from a side's border for that to be left out: a side of a few
-# large facets is nothing but border.
+# The border is ignored if a side has this many vertices away from it; a side of a few large facets
+# is only border.
 _FEWEST_INSIDE = 12
 
-# At so many rounds over the mesh, at most.
+# Maximum number of smoothing iterations over the mesh.
 _MAX_ITERATIONS = 60
 
 
@@ -98,20 +98,20 @@ def planar_faces(
 ) -> tuple[PlanarFace, ...]:
     """Find the flat sides of a mesh, the largest first.
 
-    Sequential consensus: of planes through random positions of what is left (as many as area has
-    it, along its smoothed normal) the one with most area near it is refitted by least squares,
-    and its largest connected part taken.
+    Sequential RANSAC: of planes through random positions on the remaining surface (uniform by area,
+    along its smoothed normal), the one with most area near it is refitted by least squares, and its
+    largest connected component is a side.
 
     Args:
         mesh: Orientation outward.
         generator: On the CPU; for the positions.
-        band: How far a side may lie off its plane, as a fraction of the mesh's diagonal. What is
-            farther belongs to no side, nor to its flatness.
-        max_angle_deg: How far its smoothed normals may turn away.
-        min_fraction: Of the mesh's area, that a side must have.
-        margin: At the border, as a fraction of the side's edge: not looked at for flatness, as
-            edges are rounded.
-        most: How many sides to find at most.
+        band: Maximum distance of a side from its plane, as a fraction of the mesh's diagonal.
+            Farther vertices belong to no side and do not count in its flatness.
+        max_angle_deg: Maximum angle of its smoothed normals with the plane's.
+        min_fraction: Minimum area of a side, as a fraction of the mesh's.
+        margin: Width of the border that flatness ignores, as a fraction of the side's edge,
+            because edges are rounded.
+        most: Maximum number of sides.
 
     Raises:
         InputError: A mesh without area.
@@ -120,8 +120,8 @@ def planar_faces(
     area = face_normals(vertices, faces).norm(dim=1) / 2
     if not bool(area.sum() > 0):
         raise InputError(
-            f"planes: a mesh of {len(faces)} faces without area; needed: a surface. Look at what "
-            "the mesh's file holds."
+            f"planes: a mesh of {len(faces)} faces without area; needed: a surface. Check "
+            "the mesh file."
         )
     diagonal = (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()
     normals = _smoothed_face_normals(vertices, faces, _SMOOTHING * float(diagonal))
@@ -267,7 +267,7 @@ def _measured(
 
 
 def _rectangle(hull: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> tuple[float, float]:
-    """Return the sides of the smallest rectangle about a convex polygon: one lies along an edge."""
+    """Return the sides of the smallest rectangle around a convex polygon: one is along an edge."""
     steps = np.roll(hull, -1, axis=0) - hull
     along = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)

@@ -1,12 +1,12 @@
-"""Gain of guesses about photographs, and cost of wrong ones.
+"""Gain of priors on photographs, and cost of wrong ones.
 
     python benchmarks/priors.py SCENE [SCENE ...] [--kinds none normals:2 normals:2:5 ...]
 
-Scenes are folders of `pimper render`; cameras and masks are true. A kind is a prior made of the
-true maps: `normals:DEG` with independent noise of DEG degrees in every pixel, `smooth:DEG` with
-errors that change over a fifth of the picture, as those of networks do, `depth:MILLE` with noise of
-so many thousandths of the mean depth, `inliers` with what the renderer lit without a highlight; a
-third number divides the variance that is stated.
+Scenes are folders of `pimper render`; cameras and masks are true. A kind is a prior made from the
+true maps: `normals:DEG` with independent noise of DEG degrees per pixel, `smooth:DEG` with errors
+that vary over a fifth of the image, like those of networks, `depth:MILLE` with noise of MILLE
+thousandths of the mean depth, `inliers` with the pixels that were rendered without a highlight. A
+third number divides the stated variance.
 """
 
 import argparse

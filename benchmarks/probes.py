@@ -1,8 +1,8 @@
-"""Gradients of every stage, and of the whole chain, against finite differences.
+"""Gradients of every stage and of the whole chain, against finite differences.
 
-The chain runs once on a small closed-form scene; every stage is then evaluated again with its
-arguments perturbed. Photographs, cameras and the tensors of records between stages are inputs;
-the coarse mesh is given in place of structure from motion.
+The chain runs once on a small closed-form scene; every stage is then evaluated again with perturbed
+arguments. Photographs, cameras and the tensors of records between stages are inputs; a given coarse
+mesh replaces structure from motion.
 """
 
 from collections.abc import Callable, Iterator

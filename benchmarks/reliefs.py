@@ -1,7 +1,7 @@
-r"""Surfaces from one viewpoint in closed form: balls and bumps, and their bas-relief alignment.
+r"""Closed-form surfaces from one viewpoint: balls and bumps, and their bas-relief alignment.
 
-Depth is a sum of Gaussian bumps, or a ball's, so its slopes are exact; albedo is one colour a
-region. Camera frame: x right, y down, z forward, normals facing the viewer.
+Depth is a sum of Gaussian bumps, or a ball's, so slopes are exact; each region has one albedo.
+Camera frame: x right, y down, z forward, normals facing the viewer.
 """
 
 from dataclasses import dataclass
@@ -162,14 +162,14 @@ def align_reliefs(
     reference: Float[Tensor, "3 sample"],
     weight: Float[Tensor, " sample"],
 ) -> BasRelief:
-    r"""Find the bas-relief transformation that brings one factorization closest to another.
+    r"""Find the bas-relief transformation that best aligns one factorization with another.
 
     Minimises :math:`\sum_k w_k \lVert s G b_k - \bar b_k \rVert^2` over ``G`` and the factor
     ``s``, which is linear in ``s``, ``s lambda``, ``s mu``, ``s nu``.
 
     Args:
         shading: ``B`` to be aligned, albedo times normal.
-        reference: What it is aligned to.
+        reference: The shading that it is aligned with.
         weight: Not negative.
 
     Ill-posed where all normals are parallel. Differentiable.

@@ -1,15 +1,16 @@
-"""Print how long many objects take on many workers, and check the model on this machine.
+"""Print the time of many objects on many workers, and check the model on this machine.
 
 Run as ``python benchmarks/scaling.py``. Prints a Markdown table of hours for 1, 10 and 100 workers
 and 10^2 to 10^5 photographs, in objects of ``--num-views`` each. It assumes that
 
-- a worker has 2 cores and carries out one object at a time with ``default``, in the seconds that
+- a worker has 2 cores and processes one object at a time with ``default``, in the seconds that
   ``pimper doctor`` estimates from measured stages;
-- ``pimper batch`` takes a start for each run, and looks at every object before the first begins;
-- CPU seconds of an object do not depend on how many run at once, disks keep up, and none fails.
+- ``pimper batch`` starts a process per run, and checks every object before the first begins;
+- CPU seconds of an object do not depend on the number of concurrent runs, disks are fast enough,
+  and no run fails.
 
-``--check FOLDER`` renders eight small objects there, reconstructs them by 1, 2 and 4 processes of
-one thread each, and prints CPU and wall seconds, the latter beside the model's, from one process.
+``--check FOLDER`` renders eight small objects there, reconstructs them with 1, 2 and 4 processes of
+one thread each, and prints CPU and wall seconds, the latter next to the model's prediction.
 """
 
 import argparse
@@ -62,7 +63,7 @@ def wall(objects: int, workers: int, seconds: float) -> float:
 
 
 def check(folder: Path) -> None:
-    """Reconstruct small objects by more and more processes, and print what that takes."""
+    """Reconstruct small objects with increasing numbers of processes, and print their times."""
     scene = folder / "scene"
     pimper("render", "jar", "-o", scene, *SMALL.split(), "--overwrite")
     rows = [f"object{number},scene/photos,scene/truth/sparse,scene/masks" for number in range(8)]

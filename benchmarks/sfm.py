@@ -1,13 +1,12 @@
 """Compare settings of structure from motion on folders of photographs.
 
-Run as ``python benchmarks/sfm.py PHOTOS [PHOTOS ...]``; prints Markdown tables, and below each
-what the runs warned of. With ``--reference MODEL``, a COLMAP model whose images have the
-photographs' names, or a folder with LLFF's ``poses_bounds.npy``, each view's rotation is compared
-with the model's; a view more than 2 degrees off counts as wrong. With ``--truth FOLDER``, as
-``pimper render`` writes it, focal lengths and the places of the object's points are compared: where
-exact rays put them, after the similarity on cameras and after the best. With several ``--seeds``
-each gets a row: matches and models are found with random numbers. With ``--threads 1`` a seed
-gives the same figures again.
+Run as ``python benchmarks/sfm.py PHOTOS [PHOTOS ...]``; prints Markdown tables, each followed by
+the warnings of the runs. ``--reference MODEL`` is a COLMAP model with the same image names, or a
+folder with LLFF's ``poses_bounds.npy``: each view's rotation is compared with it, and a view more
+than 2 degrees off is wrong. With ``--truth FOLDER``, as ``pimper render`` writes it, focal lengths
+and the positions of the object's points are compared with exact rays, after the similarity on
+cameras and after the best. Several ``--seeds`` give a row each, because matches and models are
+random. With ``--threads 1`` a seed gives the same figures again.
 """
 
 import argparse
@@ -156,7 +155,7 @@ def row(
 
 
 def figures(scene: SparseScene, reference: Path | None, truth: Capture | None) -> list[str]:
-    """Count what was found, and compare cameras with the reference and the truth if any."""
+    """Count the results, and compare cameras with the reference and the truth if given."""
     length = torch.bincount(scene.observation_point)
     wrong, median = "", ""
     if reference is not None:

@@ -2,11 +2,11 @@
 
     python benchmarks/sides.py RESULT PHOTOS -o sides.jpg [--sides 6] [--width 420]
 
-RESULT is a folder that ``pimper reconstruct`` wrote, PHOTOS the photographs it was made of. The
-first side is the reference view, each further one the view that looks from furthest away from
-those before. What lies beyond a photograph's border is black. The surface is grey matte stuff
-under a point light from the upper left: what looks like height field is height field. Printed is
-whether the surface is closed, and what keeps it from that.
+RESULT is a folder that ``pimper reconstruct`` wrote, PHOTOS the photographs it was made from. The
+first side is the reference view, and each further one is the view farthest from those before.
+Pixels beyond a photograph's border are black. The surface is matte grey under a point light from
+the upper left. Prints whether the surface is closed, and the defects that keep it from being
+closed.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def tell(skin: Closedness) -> None:
-    """Print what keeps a surface from being closed."""
+    """Print the defects that keep a surface from being closed."""
     state = "closed" if skin.closed else "open"
     print(  # noqa: T201
         f"{state}: {len(skin.loops)} openings, {skin.border_percent:.2f} % of the diagonal round "
@@ -86,7 +86,7 @@ def square_round(
 
 
 def drawn(mesh: Mesh, camera: Cameras) -> UInt8[np.ndarray, "height width 3"]:
-    """Shade what a camera sees."""
+    """Shade the surface in a camera."""
     return np.uint8(255 * shade(mesh, camera).numpy())
 
 

@@ -1,10 +1,10 @@
-"""Compare silhouettes that are found with masks that are known.
+"""Compare estimated silhouettes with given masks.
 
 Run as ``python benchmarks/silhouettes.py PHOTOS=MASKS [PHOTOS=MASKS ...]``; prints a Markdown
-table, one row a folder of photographs. Masks go by the photographs' names; alpha channels serve.
-With ``--overlays DIR`` every photograph is written there with its silhouette drawn in. With
-``--soft DIR`` (one a folder of photographs, in their order) soft masks of a segmenter are followed
-as ``pimper reconstruct --silhouettes`` does, and compared by themselves, too: ``raw``.
+table, one row per folder of photographs. Masks have the photographs' names; alpha channels are
+accepted. ``--overlays DIR`` writes every photograph with its silhouette drawn in. ``--soft DIR``
+(one per folder of photographs, in their order) uses soft masks of a segmenter like ``pimper
+reconstruct --silhouettes``, and also compares them directly: ``raw``.
 """
 
 import argparse
@@ -102,7 +102,7 @@ def known_masks(folder: str, scene: SparseScene) -> list[Tensor]:
 
 
 def soft_masks(scene: SparseScene) -> Iterator[Tensor]:
-    """Cut the soft masks of a scene at one half; nothing where there is none."""
+    """Threshold the soft masks of a scene at one half; views without one are empty."""
     prior = scene.views.priors[0]
     assert isinstance(prior, SilhouettePrior)
     for name, (width, height) in zip(scene.views.names, scene.views.sizes_px.tolist(), strict=True):

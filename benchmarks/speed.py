@@ -1,24 +1,23 @@
-"""Measure where the time and the memory of a run go, stage by stage.
+"""Measure the time and memory of a run, stage by stage.
 
 Run as ``python benchmarks/speed.py TARGET [options of pimper reconstruct]``. TARGET is ``demo``, a
 rendered scene's name (it is rendered first, to ``--renderings``), or a folder: of photographs, or
-as ``pimper render`` writes it. Prints a Markdown table: the rounds' stages added up, or one by one
-with ``--scales``. ``busy cores`` is CPU seconds over seconds and cores, so that other programs
-lower it. ``of floor`` is the time over what cannot be avoided, measured in the same run:
+as ``pimper render`` writes it. Prints a Markdown table: the stages summed over passes, or one by
+one with ``--scales``. ``busy cores`` is CPU seconds over seconds and cores; other programs lower
+it. ``of floor`` is the ratio to a lower bound on the time, measured in the same run:
 
-- ``warp``, ``sweep``: one pass over all radiance that is looked up, as fast as memory is copied.
-- ``factorize``: one Gauss-Newton pass over it, as fast as batched products are.
+- ``warp``, ``sweep``: one pass over all sampled radiance at the speed of copying memory.
+- ``factorize``: one Gauss-Newton pass over it at the speed of batched products.
 - ``photometry``: these three, which run bucket by bucket; each on one thread.
-- ``fuse``: one multigrid cycle on each round's finest system.
+- ``fuse``: one multigrid cycle on the finest system of each pass.
 - ``reconstruct``, with ``--colmap``: structure from motion with COLMAP's own settings.
 
-``import`` is what the process took before, ``aside`` what the chain did in no stage: hashes,
-records kept for a next run, and the rest. The share of the wall clock that no line has is printed
-below.
+``import`` is the time before the chain, ``aside`` the chain's time outside stages: hashes, records
+kept for the next run, and the rest. The share of wall time in no row is printed below.
 
-``-o FILE`` keeps the figures as JSON; ``--against FILE`` prints ratios to those of an earlier run.
-``--scaling`` runs photographs at half, at 0.71 and at their full size, each in a process of its
-own, and prints the exponents of time and memory in the samples.
+``-o FILE`` writes the figures as JSON; ``--against FILE`` prints ratios to those of an earlier run.
+``--scaling`` runs photographs at 0.5, 0.71 and 1 times their size, each in a separate process, and
+prints the exponents of time and memory in the number of samples.
 """
 
 import argparse
@@ -66,15 +65,15 @@ _ENTRY_FLOPS = 2 * (4 + 2 * 14)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cost:
-    """What a stage, or several, took.
+    """The cost of one or several stages.
 
     Attributes:
         stage: Its name.
         seconds: Wall clock.
         cpu_seconds: Of all threads.
         page_faults: Minor: pages that the kernel had to provide.
-        peak_mb: Most resident memory meanwhile; NaN where the system does not tell.
-        floor_seconds: Least that it could take; NaN where there is no such figure.
+        peak_mb: Peak resident memory; NaN if the system does not report it.
+        floor_seconds: Lower bound of the time; NaN if there is none.
     """
 
     stage: str
@@ -111,7 +110,7 @@ class Meter:
 
     Attributes:
         costs: Of the stages in the order they ended.
-        figures: What each found.
+        figures: The figures of each stage's report.
         cycles: Seconds of multigrid cycles since the stage began, by the size of their system.
     """
 
@@ -137,7 +136,7 @@ class Meter:
         self.ended(report.name, report.figures)
 
     def ended(self, stage: str, figures: Mapping[str, float] | None = None) -> None:
-        """Take down what a stage cost."""
+        """Record the cost of a stage."""
         self._remember_peak()
         began = self._open.pop(stage)
         cost = replace(clocks(stage) - began, peak_mb=began.peak_mb)
@@ -155,7 +154,7 @@ class Meter:
 
 
 def clocks(stage: str) -> Cost:
-    """Read the clocks: what the process has cost so far."""
+    """Read the clocks: the cost of the process so far."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return Cost(
         stage=stage,
@@ -166,7 +165,7 @@ def clocks(stage: str) -> Cost:
 
 
 def added(stage: str, costs: Sequence[Cost]) -> Cost:
-    """Add up costs of what ran one after the other.
+    """Add up the costs of consecutive stages.
 
     A round without a floor, as of a fusion so small that it is solved directly, is taken to be as
     far from it as the others.
@@ -237,7 +236,7 @@ def job_of(target: str, others: Sequence[str], out: Path) -> Job:
 
 
 def since_start() -> float:
-    """Return the seconds since this process started; NaN where the system does not tell."""
+    """Return the seconds since this process started; NaN if the system does not report it."""
     try:
         fields = Path("/proc/self/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     except OSError:
@@ -301,7 +300,7 @@ def measured(job: Job, imports: Cost, colmap: bool) -> dict[str, Any]:
 def with_floors(
     costs: Sequence[Cost], floors: Mapping[str, float], entries: Sequence[float]
 ) -> list[Cost]:
-    """Put the least time beside what each stage took.
+    """Add lower bounds to the costs of stages.
 
     Args:
         costs: Of the stages as they ran.
@@ -326,7 +325,7 @@ def with_floors(
 
 
 def watch_cycles(meter: Meter) -> None:
-    """Time every multigrid cycle; where they are made otherwise, there is no floor."""
+    """Time every multigrid cycle; other solvers have no lower bound."""
     try:
         from pimper_torch.ground.linalg.hierarchy import Hierarchy
 
@@ -344,7 +343,7 @@ def watch_cycles(meter: Meter) -> None:
 
 
 def copy_bytes_per_s(size: int = 2**26) -> float:
-    """Measure how fast memory is copied; what is read and what is written both count."""
+    """Measure the speed of copying memory; bytes read and bytes written both count."""
     source, target = torch.ones(size), torch.zeros(size)
     return 2 * source.nbytes / quickest(lambda: target.copy_(source))
 
@@ -367,7 +366,7 @@ def quickest(work: Callable[[], object], times: int = 5) -> float:
 
 def colmap_seconds(views: Views) -> float:
     """Run structure from motion with COLMAP's own settings."""
-    from sfm import COLMAP  # the script beside this one
+    from sfm import COLMAP  # the script in this folder
 
     from pimper_torch.method.sfm.reconstruct import Reconstruct
 
@@ -414,7 +413,7 @@ def gather_samples(found: Mapping[str, Any], scales: bool = False) -> list[Cost]
 
 
 def print_table(found: Mapping[str, Any], scales: bool) -> None:
-    """Print what a run cost."""
+    """Print the cost of a run."""
     cores, floors = found["machine"]["cores"], found["floors"]
     width, height = found["size_px"]
     say(
@@ -493,7 +492,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def number(value: float) -> str:
-    """Write three digits, or a dash for what is not known."""
+    """Write three digits, or a dash for an unknown value."""
     if math.isnan(value):
         return "-"
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

@@ -1,12 +1,12 @@
-"""Photographs by five strangers beside those of one camera, of the same scene from the same places.
+"""Compare photographs by five strangers with those of one camera, from the same positions.
 
     python benchmarks/strangers.py FOLDER [--scene potatoes] [--num-views 36] [--width 640]
 
-Writes ``FOLDER/one`` and so on, unless they are there, reconstructs each set with the settings of
-``default``, and prints a table. The strangers have cameras of five sizes, focal lengths and
-distortions, expose over four stops, balance white as they like, and have people before the object
-in every third photograph; without these in ``alone``. All sets have the same lights, by day and at
-dusk.
+Writes ``FOLDER/one``, ``FOLDER/alone`` and ``FOLDER/strangers`` unless they exist, reconstructs
+each set with ``default``, and prints a table. The strangers have cameras of five sizes, focal
+lengths and distortions, exposures over four stops, arbitrary white balance, and people in front of
+the object in every third photograph; ``alone`` has no people. All sets have the same lights, by day
+and at dusk.
 """
 
 import argparse
@@ -122,7 +122,7 @@ def taken(radiance: Tensor, lens: CameraModel, focal_px: float) -> Tensor:
 
 
 def with_person(radiance: Tensor, generator: torch.Generator) -> Tensor:
-    """Paint a person in clothes of many folds before the left or the right third of a picture."""
+    """Paint a person in clothes with folds in front of the left or right third of an image."""
     _, height, width = radiance.shape
     pixels = pixel_centers(width, height, like=radiance)
     draws = torch.rand(6, generator=generator)

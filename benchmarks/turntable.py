@@ -1,9 +1,9 @@
-"""Compare cameras of rendered turntables with the true ones, without and with the object's masks.
+"""Compare cameras of rendered turntables with the true ones, with and without masks.
 
 Run as ``python benchmarks/turntable.py SCENE [SCENE ...]``, folders that ``pimper render`` wrote
-with ``--path turntable``; prints rows of a table. ``centres`` is the distance of camera
-centres from the true ones after the similarity on cameras, against the radius of the circle that
-the camera goes round the object.
+with ``--path turntable``; prints rows of a table. ``centres`` is the distance of camera centres
+from the true ones after the similarity on cameras, relative to the radius of the camera's circle
+around the object.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def row(
     except PimperError as error:
         return [f"{type(error).__name__}: {str(error).split(';')[0]}", "", "", "", ""]
     errors = center_errors(scene, names, true)
-    doubt = getattr(scene, "diagnosis", None)  # commits before the one that brought it are compared
+    doubt = getattr(scene, "diagnosis", None)  # earlier commits lack it
     return [
         f"{scene.views.num_views} of {views.num_views}",
         str(len(scene.points_world)),

@@ -1,10 +1,9 @@
 """Measure how structure from motion grows with the number of photographs.
 
-Run as ``python benchmarks/walk.py [--num-views 30 60 120 300] [--scene mug]``: renders walks round
-a scene on a patterned table to ``--renderings``, unless they are there, and prints a Markdown table
-with the CPU seconds of each part of structure from motion, and how far off its cameras are.
-``growth`` is the CPU seconds of a photograph over those of the first walk's. A line comes as soon
-as its walk is done.
+Run as ``python benchmarks/walk.py [--num-views 30 60 120 300] [--scene mug]``: renders walks around
+a scene on a patterned table to ``--renderings``, unless they exist, and prints a Markdown table
+with the CPU seconds of each part of structure from motion, and the camera errors. ``growth`` is the
+CPU seconds per photograph relative to the first walk. A row is printed when its walk is done.
 """
 
 import argparse
