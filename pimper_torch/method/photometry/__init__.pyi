@@ -1,4 +1,4 @@
-# Public names, which are imported when they are asked for (`__init__.py`).
+# Public names, imported lazily (`__init__.py`).
 __all__: list[str]
 from .balm import solve_balm as solve_balm
 from .bilinear import Bilinear as Bilinear

@@ -1,7 +1,7 @@
 r"""Augmented Lagrangian factorization: BALM.
 
-``N`` is split in two: ``S``, free, fits the data, and ``N`` is on the manifold. Multipliers ``U``
-and a growing penalty :math:`\mu` make them equal,
+``N`` is split in two: ``S`` is free and fits the data, ``N`` is on the manifold. Multipliers ``U``
+and an increasing penalty :math:`\mu` make them equal,
 
 .. math::
 
@@ -27,10 +27,9 @@ from pimper_torch.method.photometry.bilinear import Bilinear, Factors, Shading, 
 from pimper_torch.method.photometry.quadratics import diagonal, solve_packed
 from pimper_torch.records import StopCause
 
-# The penalty starts at this fraction of the mean eigenvalue of a sample's data term, and grows by
-# the factor below in each step up to the cap. A stiff penalty couples lights and shading, and
-# convergence is slow: of 0.01 to 0.3, this start needed the fewest steps to a residual of 1e-8
-# with 60 % of the entries missing.
+# Initial penalty, as a fraction of the mean eigenvalue of a sample's data term; growth factor per
+# step; maximum. A stiff penalty couples lights and shading, which slows convergence: of 0.01 to
+# 0.3, this start needed the fewest steps to a residual of 1e-8 with 60 % of the entries missing.
 PENALTY_START = 0.03
 PENALTY_GROWTH = 1.01
 PENALTY_CAP = 1.0
@@ -42,17 +41,17 @@ class _State(State):
 
 
 def solve_balm(problem: Bilinear, max_iterations: int, tolerance: float) -> Factors:
-    """Factorize a batch of patches by augmented Lagrangian.
+    """Return the factors of a batch of patches by the augmented Lagrangian.
 
     Args:
-        tolerance: A patch has converged when both the last change of its shading vectors and
-            their distance from the manifold are below this fraction of their length.
+        tolerance: A patch has converged when the last change of its shading vectors and the
+            distance of ``S`` from ``N`` are both below this fraction of their length.
 
     Returns:
         Factors with ``N`` exactly on the manifold. Lights without ``regularization`` keep their
         initial scale. A patch without data keeps its initial values.
 
-    Constant to autograd. Patches are independent.
+    Not differentiable. Patches are independent.
     """
 
     def advance(work: Bilinear, state: _State, step: int) -> tuple[_State, Int[Tensor, " patch"]]:
@@ -78,18 +77,18 @@ def _step(problem: Bilinear, state: _State, step: int) -> tuple[_State, Float[Te
     rank = state.lights.shape[2]
     # The trace of L^T W L, the data term of a sample.
     trace = (weight * state.lights.square().sum(dim=2, keepdim=True)).sum(dim=1)
-    seen = trace > 0
+    observed = trace > 0
     fraction = min(PENALTY_START * PENALTY_GROWTH**step, PENALTY_CAP)
-    penalty = fraction * trace.sum(dim=1) / (rank * seen.sum(dim=1)).clamp_min(1)
+    penalty = fraction * trace.sum(dim=1) / (rank * observed.sum(dim=1)).clamp_min(1)
     penalty = penalty.clamp_min(torch.finfo(A.dtype).tiny ** 0.5)[:, None, None]
     A[:, diagonal(rank)] += penalty
     free = solve_packed(A, b + penalty * (state.shading - state.multiplier))
     shading = problem.manifold.project((free + state.multiplier).mT).mT
     multiplier = state.multiplier + free - shading
     lights = solve_packed(*bilinear.equations_of_views(problem, free, weight)).mT
-    size = shading.norm(dim=(1, 2)).clamp_min(torch.finfo(A.dtype).tiny ** 0.5)
+    length = shading.norm(dim=(1, 2)).clamp_min(torch.finfo(A.dtype).tiny ** 0.5)
     change = (shading - state.shading).norm(dim=(1, 2)).maximum((free - shading).norm(dim=(1, 2)))
     scaled, shading = bilinear.keep_scale(problem, state.lights, lights, shading)
     _, multiplier = bilinear.keep_scale(problem, state.lights, lights, multiplier)
-    found = _State(lights=scaled, shading=shading, multiplier=multiplier, weight=weight)
-    return found, change / size
+    updated = _State(lights=scaled, shading=shading, multiplier=multiplier, weight=weight)
+    return updated, change / length

@@ -1,4 +1,4 @@
-r"""The bilinear problem that every solver takes: lights and shading vectors from radiance.
+r"""The bilinear problem that every solver solves: lights and shading vectors from radiance.
 
 .. math::
 
@@ -7,12 +7,12 @@ r"""The bilinear problem that every solver takes: lights and shading vectors fro
     + \sum_k n_k^\top P_k n_k
     \quad \text{with } n_k \in \mathcal M
 
-for every patch of a batch, with ``M`` the photometric manifold of some order of lighting and
+for every patch of a batch, with ``M`` the photometric manifold for an order of lighting and
 :math:`\phi` a loss. With ``c = 0``, ``P = 0``, squares and the cone this is the published
 problem; with a linear manifold it is low-rank factorization with missing data.
 
-A solver is a function of such a problem, a maximum number of iterations and a tolerance, and
-iterates a batch of patches until each has stopped (:func:`iterate`).
+A solver is a function of a problem, a maximum number of iterations and a tolerance. It iterates
+over a batch of patches until each has stopped (:func:`iterate`).
 """
 
 import dataclasses
@@ -38,8 +38,8 @@ Entries = Float[Tensor, "patch view sample"]
 Packed = Float[Tensor, "patch packed sample"]
 """A symmetric matrix for each sample, see :mod:`~pimper_torch.method.photometry.quadratics`."""
 
-# Steps between updates of the robust weights: they change slowly, and the scale of the residuals
-# costs as much as a step.
+# Steps between updates of the robust weights: they change slowly, and estimating the scale of the
+# residuals takes as long as a step.
 REWEIGHT_EVERY = 3
 
 
@@ -50,16 +50,16 @@ class Bilinear(Record):
 
     Attributes:
         radiance: ``J``, zero where missing.
-        weight: ``D``: how much each entry counts; 0 where missing.
-        anchor: What the lights are pulled to.
-        shading: Where ``N`` starts, columns on the manifold.
-        regularization: ``c_f`` per view.
-        prior: ``P``, packed: what else is known of the shading vectors, such as normals they
-            should not bend away from (:meth:`Cone.bend
-            <pimper_torch.method.photometry.cone.Cone.normal_prior>`); ``None`` for none.
-        manifold: What shading vectors can be.
-        loss: What residuals cost, their deviation estimated patch by patch.
-        stride: The deviation is taken over every so many samples.
+        weight: ``D``, the weight of each entry; 0 where missing.
+        lights: Initial ``L``.
+        prior_mean: Prior mean of the lights.
+        shading: Initial ``N``, columns on the manifold.
+        regularization: ``c_f``, weight of the lights' prior per view.
+        prior: ``P``, packed: prior of the shading vectors, such as
+            :meth:`~pimper_torch.method.photometry.cone.Cone.normal_prior`; ``None`` for none.
+        manifold: Set of possible shading vectors.
+        loss: Loss of the residuals; their deviation is estimated per patch.
+        stride: The deviation is estimated from every ``stride``-th sample.
     """
 
     radiance: Entries
@@ -77,23 +77,23 @@ class Bilinear(Record):
     def requires_grad(self) -> bool:
         """Whether gradients of the solution are required."""
         data = (self.radiance, self.weight, self.prior_mean, self.regularization, self.prior)
-        return any(part is not None and part.requires_grad for part in data)
+        return any(tensor is not None and tensor.requires_grad for tensor in data)
 
     @property
     def has_kernel(self) -> bool:
-        """Whether compiled kernels know its manifold and loss."""
+        """Whether compiled kernels support its manifold and loss."""
         return isinstance(self.manifold, Cone) and self.loss.code is not None
 
     @property
     def dense_prior(self) -> Packed:
-        """``P``, zero where there is none, as kernels take it."""
+        """``P``, zeros if ``None``, as kernels require."""
         patches, _, samples = self.radiance.shape
         return self.radiance.new_zeros(patches, 10, samples) if self.prior is None else self.prior
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Factors(Record):
-    """The solution.
+    """The solution of a :class:`Bilinear` problem.
 
     Attributes:
         lights: ``L``.
@@ -111,7 +111,7 @@ Solver = Callable[[Bilinear, int, float], Factors]
 
 
 def robust_weights(problem: Bilinear, lights: Lights, shading: Shading) -> Entries:
-    """Return ``D`` times the loss's weights at the current residuals."""
+    """Return ``D`` times the weights of the loss at the current residuals."""
     if isinstance(problem.loss, Squares):
         return problem.weight
     residual = problem.radiance - lights @ shading
@@ -122,7 +122,7 @@ def robust_weights(problem: Bilinear, lights: Lights, shading: Shading) -> Entri
 def equations_of_samples(
     problem: Bilinear, lights: Lights, weight: Entries
 ) -> tuple[Packed, Shading]:
-    """Assemble the normal equations for every sample's shading vector, lights given."""
+    """Return the normal equations for every sample's shading vector, given the lights."""
     packed = quadratics.outer(lights.mT) @ weight
     if problem.prior is not None:
         packed = packed + problem.prior
@@ -132,7 +132,7 @@ def equations_of_samples(
 def equations_of_views(
     problem: Bilinear, shading: Shading, weight: Entries
 ) -> tuple[Float[Tensor, "patch packed view"], Float[Tensor, "patch rank view"]]:
-    """Assemble the normal equations for every view's light, its prior included."""
+    """Return the normal equations for every view's light, including its prior."""
     packed = (weight @ quadratics.outer(shading).mT).mT.clone()
     packed[:, quadratics.diagonal(shading.shape[1])] += problem.regularization[:, None, :]
     pull = problem.regularization[..., None] * problem.prior_mean
@@ -140,20 +140,20 @@ def equations_of_views(
 
 
 def curvature_of_views(shading: Shading, weight: Entries) -> Float[Tensor, "patch unknown unknown"]:
-    """Return the block diagonal of the Gauss-Newton matrix: one block per view, shading fixed."""
+    """Return the Gauss-Newton matrix with fixed shading: block diagonal, one block per view."""
     batch, views, rank = len(weight), weight.shape[1], shading.shape[1]
     products = (shading[:, :, None] * shading[:, None]).flatten(1, 2)
     blocks = (weight @ products.mT).reshape(batch, views, rank, rank)
-    whole = shading.new_zeros(batch, views, rank, views, rank)
+    matrix = shading.new_zeros(batch, views, rank, views, rank)
     index = torch.arange(views, device=shading.device)
-    whole[:, index, :, index] = blocks.transpose(0, 1)
-    return whole.reshape(batch, views * rank, views * rank)
+    matrix[:, index, :, index] = blocks.transpose(0, 1)
+    return matrix.reshape(batch, views * rank, views * rank)
 
 
 def evaluate(
     problem: Bilinear, lights: Lights, shading: Shading, weight: Entries
 ) -> tuple[Float[Tensor, " patch"], Lights]:
-    """Return the objective, its robust weights given, and minus half its gradient by the lights."""
+    """Return the objective for given robust weights, and minus half its gradient by the lights."""
     residual = problem.radiance - lights @ shading
     weighted = weight * residual
     cost = torch.linalg.vecdot(weighted.flatten(1), residual.flatten(1))
@@ -168,10 +168,10 @@ def evaluate(
 def update_shading(
     problem: Bilinear, packed: Packed, rhs: Shading, shading: Shading, steps: int = 1
 ) -> Shading:
-    r"""Minimize :math:`s^\top A s - 2 b^\top s` over every sample's shading vector on the manifold.
+    r"""Return shading vectors on the manifold that minimize :math:`s^\top A s - 2 b^\top s`.
 
-    By Gauss-Newton steps along the tangents, of bounded length; a step that does not lower the
-    objective is rejected. On a linear manifold the first step is exact.
+    Takes Gauss-Newton steps of bounded length along the tangents, and rejects a step that does not
+    lower the objective. On a linear manifold the first step is exact.
     """
     if problem.manifold.flat:
         return quadratics.PackedCholesky(packed, shading.shape[1]).solve(rhs)
@@ -179,22 +179,21 @@ def update_shading(
     value = quadratics.dot(shading, image - 2 * rhs)
     for step in range(steps):
         moved = tangent_step(problem.manifold, packed, rhs - image, shading)
-        reached = quadratics.apply_packed(packed, moved)
-        after = quadratics.dot(moved, reached - 2 * rhs)
-        # The last steps lower the objective by less than its rounding.
+        moved_image = quadratics.apply_packed(packed, moved)
+        after = quadratics.dot(moved, moved_image - 2 * rhs)
+        # The last steps lower the objective by less than its rounding error.
         better = (after <= value + 8 * torch.finfo(value.dtype).eps * value.abs())[:, None]
         shading = torch.where(better, moved, shading)
         if step + 1 < steps:
-            image = torch.where(better, reached, image)
+            image = torch.where(better, moved_image, image)
             value = torch.where(better[:, 0], after, value)
     return shading
 
 
 def tangent_step(manifold: Manifold, packed: Packed, slope: Shading, shading: Shading) -> Shading:
-    r"""Take the step :math:`(B^\top A B)^{-1} B^\top r`, ``B`` the manifold's tangents.
+    r"""Return shading after the step :math:`(B^\top A B)^{-1} B^\top r`, ``B`` the tangents.
 
     Args:
-        manifold: Whose tangents are ``B``.
         packed: ``A``.
         slope: ``r = b - A s``.
         shading: ``s``.
@@ -219,10 +218,10 @@ def curvature_along(columns: list[Tensor], packed: Packed) -> Float[Tensor, "pat
 def keep_scale(
     problem: Bilinear, before: Lights, lights: Lights, shading: Shading
 ) -> tuple[Lights, Shading]:
-    """Normalize lights without regularization to their former size; rescale shading inversely."""
-    old, size = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
-    unanchored = (problem.regularization.amax(dim=1) == 0) & (size > 0) & (old > 0)
-    factor = torch.where(unanchored, (old / torch.where(size > 0, size, 1)).sqrt(), 1)
+    """Rescale unregularized lights to their previous norm, and shading inversely; return both."""
+    old_square, square = before.square().sum(dim=(1, 2)), lights.square().sum(dim=(1, 2))
+    free = (problem.regularization.amax(dim=1) == 0) & (square > 0) & (old_square > 0)
+    factor = torch.where(free, (old_square / torch.where(square > 0, square, 1)).sqrt(), 1)
     factor = factor[:, None, None]
     return lights * factor, shading / factor
 
@@ -238,15 +237,15 @@ def root_mean_square(
 
 
 def residual_deviation(problem: Bilinear, residual: Entries) -> Float[Tensor, " patch"]:
-    """Estimate the standard deviation of each patch's residuals, robustly."""
+    """Return a robust standard deviation of each patch's residuals."""
     subset = residual[:, :, :: problem.stride].flatten(1)
-    seen = problem.weight[:, :, :: problem.stride].flatten(1) > 0
+    observed = problem.weight[:, :, :: problem.stride].flatten(1) > 0
     count = problem.weight.sum(dim=(1, 2)).clamp_min(1)
-    level = problem.radiance.abs().sum(dim=(1, 2)) / count
-    return robust_deviation(subset, seen).maximum(MIN_DEVIATION * level)
+    mean_radiance = problem.radiance.abs().sum(dim=(1, 2)) / count
+    return robust_deviation(subset, observed).maximum(MIN_DEVIATION * mean_radiance)
 
 
-# In place of a cause, for a patch that has not stopped.
+# Instead of a stop cause, for a patch that has not stopped.
 RUNNING = -1
 
 
@@ -257,7 +256,7 @@ class State(Record):
     Attributes:
         lights: ``L``.
         shading: ``N``, columns on the manifold.
-        weight: Of each entry, robust weights included.
+        weight: Weight of each entry, including robust weights.
     """
 
     lights: Lights
@@ -274,18 +273,18 @@ def iterate(
     advance: Callable[[Bilinear, AnyState, int], tuple[AnyState, Int[Tensor, " patch"]]],
     max_iterations: int,
 ) -> Factors:
-    """Iterate until every patch has stopped; those that have leave the batch.
+    """Iterate until every patch has stopped, and return the last state of each.
 
     Args:
-        advance: One step of the remaining patches: from problem, state and index of the step
-            to the next state and, for each patch, a :class:`StopCause` or ``RUNNING``.
+        advance: One step of the remaining patches: maps problem, state and step index to the next
+            state and, for each patch, a :class:`StopCause` or ``RUNNING``.
 
     Returns:
-        Every patch's last lights, shading and weights, its number of steps, and its stop cause.
+        Lights, shading, weights, number of steps and stop cause of every patch.
     """
-    whole = problem
+    full = problem
     patches = torch.arange(len(problem.radiance), device=problem.radiance.device)
-    taken = torch.full_like(patches, max_iterations)
+    iterations = torch.full_like(patches, max_iterations)
     causes = torch.full_like(patches, int(StopCause.LIMIT))
     running = torch.ones_like(patches, dtype=torch.bool)
     names = [field.name for field in dataclasses.fields(state)]
@@ -294,21 +293,21 @@ def iterate(
         state, cause = advance(problem, state, step)
         ended = running & (cause != RUNNING)
         _store(final, state, names, patches, ended)
-        taken[patches[ended]] = step + 1
+        iterations[patches[ended]] = step + 1
         causes[patches[ended]] = cause[ended]
         running = running & ~ended
         if not bool(running.any()):
             break
-        # Patches that have stopped leave a batch by quarters: copying the rest costs about a step.
+        # Stopped patches are removed once they are a quarter: copying the rest takes about a step.
         if float((~running).double().mean()) >= 0.25:
             keep = running.nonzero()[:, 0]
             state, problem, patches = state.take(keep), problem.take(keep), patches[keep]
             running = running[keep]
     _store(final, state, names, patches, running)
-    has_data = whole.weight.sum(dim=(1, 2)) > 0
+    has_data = full.weight.sum(dim=(1, 2)) > 0
     convergence = Convergence(
-        iterations=taken,
-        residual=root_mean_square(whole, final.lights, final.shading),
+        iterations=iterations,
+        residual=root_mean_square(full, final.lights, final.shading),
         cause=torch.where(has_data, causes, int(StopCause.EMPTY)),
     )
     return Factors(

@@ -1,9 +1,9 @@
-r"""Photometric manifolds: the sets of possible shading vectors. First-order light has a cone.
+r"""Photometric manifolds: sets of possible shading vectors. For first-order light, a cone.
 
 Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
-albedo and normal alone: :math:`s = \rho (1, n)` to first order, of rank four, whose ambiguity is
-a scaled Lorentz transformation. It is a cone of light in four dimensions: the time axis is albedo,
-the space axes the normal. Other orders of light, and low-rank matrices, are in
+albedo and normal alone. To first order it is :math:`s = \rho (1, n)`, of rank four, and the
+ambiguity is a scaled Lorentz transformation: the vectors are a light cone in four dimensions, with
+albedo as time axis and the normal as space axes. Other orders of light and low-rank matrices are in
 :mod:`pimper_torch.single_view.factorization.low_rank`.
 
 Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
@@ -21,24 +21,24 @@ from pimper_torch.method.photometry.light_field import harmonics
 
 
 def project_to_cone(shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    r"""Replace each shading vector by the nearest one a Lambertian surface can produce.
+    r"""Return the nearest shading vectors that a Lambertian surface can produce.
 
-    Albedo :math:`\rho` and unit normal :math:`n` reach the images only as
-    :math:`(b_0, b) = (\rho, \rho n)`, which ties :math:`b_0` to :math:`\lVert b \rVert`.
-    Factorization ignores the tie; this restores it in the least-squares sense, with
+    Images depend on albedo :math:`\rho` and unit normal :math:`n` only through
+    :math:`(b_0, b) = (\rho, \rho n)`, so :math:`b_0 = \lVert b \rVert`. Factorization ignores
+    this constraint. It is restored in the least-squares sense by
     :math:`\rho = \max(0, b_0 + \lVert b \rVert) / 2` and :math:`n = b / \lVert b \rVert`.
 
     Args:
         shading: ``(b_0, b_x, b_y, b_z)`` in the patch frame; albedo in image units, up
-            to the scale all patches share.
+            to the scale that all patches share.
 
     Returns:
-        Vectors on the cone. One without direction (``b = 0``), or nearest to the apex,
+        Vectors on the cone. A vector without direction (``b = 0``), or nearest to the apex,
         becomes zero: that pixel has no normal, and the caller masks it.
 
-    Differentiable except at ``b = 0`` and ``b_0 = -|b|``; masked vectors get zero gradient.
+    Differentiable except at ``b = 0`` and ``b_0 = -|b|``; masked vectors have zero gradient.
 
-    Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007, for the tie; the closed form
+    Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007, for the constraint; the closed form
     is ours, checked in ``test_cone.py``.
 
     >>> project_to_cone(torch.tensor([1.0, 0.0, 0.0, -3.0]))
@@ -48,23 +48,23 @@ def project_to_cone(shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
     length, directed = _length(vector)
     albedo = torch.where(directed, (scalar + length).clamp_min(0) / 2, 0)
     ratio = albedo / length
-    return _vectors([albedo, *(torch.where(directed, part, 0) * ratio for part in vector)])
+    return _vectors([albedo, *(torch.where(directed, axis, 0) * ratio for axis in vector)])
 
 
 def split_shading(shading: Float[Tensor, "*batch 4"]) -> tuple[Scalars, Vectors]:
-    """Read albedo and unit normal off vectors on the cone.
+    """Return albedo and unit normal of vectors on the cone.
 
-    A vector without direction gives the normal zero. Differentiable away from the apex.
+    The normal of a vector without direction is zero. Differentiable away from the apex.
     """
     albedo, *vector = shading.unbind(dim=-1)
     length, directed = _length(vector)
-    return albedo, _vectors([torch.where(directed, part / length, 0) for part in vector])
+    return albedo, _vectors([torch.where(directed, axis / length, 0) for axis in vector])
 
 
 def tangents(normals: Vectors) -> tuple[Vectors, Vectors]:
-    """Return two unit vectors that span, with each unit normal, a right-handed frame.
+    """Return two unit vectors that form a right-handed frame with each unit normal.
 
-    Continuous except where ``n_z`` changes sign, which viewer-facing normals never do.
+    Continuous except where ``n_z`` changes sign, which does not occur for viewer-facing normals.
 
     Source: Duff et al., Building an orthonormal basis, revisited, JCGT 6(1), 2017.
     """
@@ -78,7 +78,7 @@ def tangents(normals: Vectors) -> tuple[Vectors, Vectors]:
 
 
 def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
-    r"""Span the tangent space of the cone at each column :math:`\rho (1, n)`.
+    r"""Return a basis of the cone's tangent space at each column :math:`\rho (1, n)`.
 
     Returns:
         Three arrays of columns: :math:`(1, n)`, which changes albedo, and
@@ -95,21 +95,21 @@ def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
 
 
 def _length(vector: list[Tensor]) -> tuple[Scalars, Bool[Tensor, "*batch"]]:
-    """Return lengths, 1 for zero vectors, and which vectors are not zero.
+    """Return lengths, 1 for zero vectors, and whether vectors are not zero.
 
-    So are vectors whose directions have no derivative in the dtype's range: of 3e-10 and less in
-    single precision.
+    Vectors count as zero if the derivative of their direction exceeds the dtype's range: of length
+    3e-10 or less in single precision.
     """
     x, y, z = vector
     square = x * x + y * y + z * z
     directed = square > torch.finfo(square.dtype).tiny ** 0.5
-    # The root has no gradient at zero.
+    # The square root has no gradient at zero.
     return torch.where(directed, square, 1).sqrt(), directed
 
 
-def _vectors(parts: list[Tensor]) -> Float[Tensor, "..."]:
-    """Stack components on the last axis, each contiguous, for products with lights."""
-    return torch.stack(parts, dim=-2).mT if parts[0].ndim else torch.stack(parts)
+def _vectors(components: list[Tensor]) -> Float[Tensor, "..."]:
+    """Return components stacked on the last axis, each contiguous, for products with lights."""
+    return torch.stack(components, dim=-2).mT if components[0].ndim else torch.stack(components)
 
 
 @runtime_checkable
@@ -118,25 +118,25 @@ class Manifold(Protocol):
 
     @property
     def flat(self) -> bool:
-        """Whether it is the whole space, so that normal equations give the minimum."""
+        """Whether it is the full space, so that normal equations give the minimum."""
 
     def project(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
         """Return the nearest vector of the manifold."""
 
     def retract(self, shading: Float[Tensor, "*batch rank"]) -> Float[Tensor, "*batch rank"]:
-        """Map the end of a small step along the tangents back to the manifold."""
+        """Return the vector of the manifold for the end of a small step along the tangents."""
 
     def tangents(self, shading: Float[Tensor, "*batch rank sample"]) -> list[Tensor]:
-        """Span the tangent space at each column."""
+        """Return a basis of the tangent space at each column."""
 
     def curvature(
         self,
         shading: Float[Tensor, "*batch rank sample"],
         slope: Float[Tensor, "*batch rank sample"],
     ) -> Float[Tensor, "*batch sample tangent tangent"]:
-        r"""Return :math:`g \cdot \partial^2 s` by the tangents' coordinates, ``slope`` being ``g``.
+        r"""Return :math:`g \cdot \partial^2 s` in tangent coordinates, with ``slope`` as ``g``.
 
-        It is the manifold's part of the second derivatives of a function with gradient ``g``.
+        This is the manifold's part of the second derivatives of a function with gradient ``g``.
         """
 
     def split(self, shading: Float[Tensor, "*batch rank"]) -> tuple[Scalars, Vectors]:
@@ -157,11 +157,11 @@ class Cone:
     def curvature(
         self, shading: Float[Tensor, "*batch 4 sample"], slope: Float[Tensor, "*batch 4 sample"]
     ) -> Float[Tensor, "*batch sample 3 3"]:
-        r"""Return the manifold's part of second derivatives; see :meth:`Manifold.curvature`."""
+        """Return the manifold's part of second derivatives; see :meth:`Manifold.curvature`."""
         albedo, normal = self.split(shading.mT)
         first, second = tangents(normal)
         along, on_first, on_second = (
-            (slope[..., 1:, :].mT * part).sum(dim=-1) for part in (normal, first, second)
+            (slope[..., 1:, :].mT * axis).sum(dim=-1) for axis in (normal, first, second)
         )
         zero = torch.zeros_like(albedo)
         rows = [[zero, on_first, on_second], [on_first, -along, zero], [on_second, zero, -along]]
@@ -169,13 +169,13 @@ class Cone:
         return matrix / torch.where(albedo > 0, albedo, 1)[..., None, None]
 
     def join(self, albedo: Scalars, normals: Vectors) -> Float[Tensor, "*batch 4"]:
-        """Return the vectors of albedo and normal."""
+        """Return the shading vectors of albedo and normals."""
         return albedo[..., None] * harmonics(normals)
 
     def normal_prior(
         self, normals: Float[Tensor, "*batch 3 sample"]
     ) -> Float[Tensor, "*batch 10 sample"]:
-        r"""Return penalty :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
+        r"""Return :math:`\lVert b - \rho \bar n \rVert^2` as a quadratic form, packed."""
         n = normals
         one, zero = torch.ones_like(n[..., 0, :]), torch.zeros_like(n[..., 0, :])
         x, y, z = n.unbind(dim=-2)

@@ -1,12 +1,12 @@
 r"""Gradients of factorizations by the implicit function theorem.
 
-A solution satisfies :math:`\nabla E(x; \theta) = 0`, so that with the Hessian ``H``
+A solution satisfies :math:`\nabla E(x; \theta) = 0`. With the Hessian ``H``,
 
 .. math:: \frac{dx}{d\theta} = -H^{-1} \frac{\partial \nabla E}{\partial \theta},
 
-whatever the solver. One Newton step with constant ``H`` has this derivative, and length zero.
-``H`` is exact: it includes the curvature of the manifold, of the loss and of the product of
-lights and shading, and the dependence of robust weights on the residuals' deviation. Samples are
+for any solver. One Newton step with constant ``H`` has this derivative, and length zero. ``H`` is
+exact: it includes the curvature of the manifold, of the loss and of the product of lights and
+shading, and the dependence of robust weights on the deviation of the residuals. Samples are
 eliminated, as in :mod:`~pimper_torch.method.photometry.variable_projection`.
 """
 
@@ -30,28 +30,28 @@ from pimper_torch.records import Record
 Tangential = Float[Tensor, "patch tangent sample"]
 """Coordinates of each sample's step along the tangents of the manifold."""
 
-# The step of the lights, over these, that ends Newton's method: a choice.
-_CLOSE = 1e-11
+# Relative step of the lights at which Newton's method ends: a choice.
+_CONVERGED = 1e-11
 
 
 def differentiable(problem: Bilinear, factors: Factors) -> Factors:
-    r"""Make a solution differentiable in its data.
+    """Return the solution of a problem, differentiable in its data.
 
     Newton's method first refines the solution to rounding, as the implicit function theorem
-    holds at the optimum alone. A patch whose gradient it does not reduce keeps its solution.
+    holds at the optimum only. A patch keeps its solution if this does not reduce its gradient.
 
     Args:
-        problem: Gradients reach its ``radiance``, ``weight``, ``prior_mean``, ``regularization``
-            and ``prior``.
-        factors: Its solution, near enough to a minimum that the Hessian is positive definite.
+        problem: The result is differentiable in its ``radiance``, ``weight``, ``prior_mean``,
+            ``regularization`` and ``prior``.
+        factors: Its solution, so close to a minimum that the Hessian is positive definite.
 
     Returns:
-        Lights, shading, weights and residuals at the optimum, with gradients, those through the
-        robust weights and their scale included.
+        Lights, shading, weights and residuals at the optimum. Gradients include those through the
+        robust weights and their scale.
 
     Checked against the solvers in ``test_factor_gradients.py``. The Hessian is in float64. Where
     the solver is compiled, so are refinement and adjoint
-    (:mod:`~pimper_torch.ground.kernels.factor_adjoint`), which is differentiable once.
+    (:mod:`~pimper_torch.ground.kernels.factor_adjoint`), and the result is differentiable once.
     """
     if problem.has_kernel and compiled_for(problem.radiance.detach()):
         data = problem.radiance, problem.weight, problem.prior_mean, problem.regularization
@@ -77,30 +77,30 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
 
 
 class _Compiled(torch.autograd.Function):
-    """Solution of a problem, as a function of its data, by the kernel and its adjoint."""
+    """The solution of a problem as a function of its data, by the kernel and its adjoint."""
 
     @staticmethod
     def forward(
         ctx: Any, problem: Bilinear, factors: Factors, *data: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Refine the solution; return lights, shading, weights and residuals."""
+        """Return lights, shading, weights and residuals of the refined solution."""
         from pimper_torch.ground.kernels import factor_adjoint
 
         code, scale, stride = problem.loss.code, problem.loss.scale, problem.stride
-        assert code is not None  # the caller asks
+        assert code is not None  # has_kernel
         radiance = data[0].detach().double()
-        found = (
+        arrays = (
             factors.lights.detach().to(torch.float64, copy=True).contiguous(),
             factors.shading.detach().to(torch.float64, copy=True).contiguous(),
             torch.zeros_like(radiance, memory_format=torch.contiguous_format),
             radiance.new_zeros(len(radiance)),
         )
-        given = factor_adjoint.FactorData(*(as_array(each, torch.float64) for each in data))
-        solution = factor_adjoint.FactorSolution(*map(as_array, found))
-        factor_adjoint.refine(given, code, scale, stride, solution)
+        inputs = factor_adjoint.FactorData(*(as_array(tensor, torch.float64) for tensor in data))
+        solution = factor_adjoint.FactorSolution(*map(as_array, arrays))
+        factor_adjoint.refine(inputs, code, scale, stride, solution)
         ctx.loss = code, scale, stride
-        ctx.save_for_backward(*found[:2], *data)
-        lights, shading, weight, residual = (each.to(data[0]) for each in found)
+        ctx.save_for_backward(*arrays[:2], *data)
+        lights, shading, weight, residual = (tensor.to(data[0]) for tensor in arrays)
         return lights, shading, weight, residual
 
     @staticmethod
@@ -112,29 +112,29 @@ class _Compiled(torch.autograd.Function):
         lights, shading, *data = ctx.saved_tensors
         code, scale, stride = ctx.loss
         contiguous, exact = torch.contiguous_format, torch.float64
-        found = [torch.zeros_like(each, dtype=exact, memory_format=contiguous) for each in data]
+        gradients = [torch.zeros_like(x, dtype=exact, memory_format=contiguous) for x in data]
         factor_adjoint.pull_back(
-            factor_adjoint.FactorData(*(as_array(each, exact) for each in data)),
+            factor_adjoint.FactorData(*(as_array(tensor, exact) for tensor in data)),
             code,
             scale,
             stride,
             as_array(lights),
             as_array(shading),
-            factor_adjoint.FactorSolution(*(as_array(each, exact) for each in cotangents)),
-            factor_adjoint.FactorData(*map(as_array, found)),
+            factor_adjoint.FactorSolution(*(as_array(tensor, exact) for tensor in cotangents)),
+            factor_adjoint.FactorData(*map(as_array, gradients)),
         )
-        return None, None, *(each.to(data[0]) for each in found)
+        return None, None, *(tensor.to(data[0]) for tensor in gradients)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class FactorStep(Record):
-    """A step of all unknowns: of the lights, and of the samples along their tangents."""
+    """A step of all unknowns: the lights, and the samples along their tangents."""
 
     lights: Lights
     along_tangents: Tangential
 
     def moved(self, factor: Float[Tensor, " patch"], other: "FactorStep") -> "FactorStep":
-        """Add a multiple of another step."""
+        """Return the step plus a multiple of a second one."""
         return FactorStep(
             lights=self.lights + factor[:, None, None] * other.lights,
             along_tangents=self.along_tangents + factor[:, None, None] * other.along_tangents,
@@ -146,11 +146,11 @@ class Hessian(Record):
     """Half the second derivatives of the objective, constant, samples eliminated.
 
     Attributes:
-        columns: The manifold's tangents there.
-        loss_curvature: The loss's second derivative at each entry, weighted.
-        weighted_residual: Of each entry.
-        inverse: Of the diagonal blocks of the samples.
-        schur: The Schur complement, of the lights.
+        columns: Tangents of the manifold at ``shading``.
+        loss_curvature: Weighted second derivative of the loss at each entry.
+        weighted_residual: Weight times residual of each entry.
+        inverse: Inverse diagonal blocks of the samples.
+        schur: Schur complement for the lights.
     """
 
     lights: Lights
@@ -164,23 +164,23 @@ class Hessian(Record):
 
 @torch.no_grad()
 def _newton_refined(problem: Bilinear, factors: Factors) -> Factors:
-    """Take Newton steps, patch by patch, as long as they reduce the gradient's norm."""
+    """Return factors after Newton steps, which each patch takes if they reduce its gradient."""
     L, N = factors.lights.double(), factors.shading.double()
-    size = _gradient_size(problem, L, N)
-    fraction, step = torch.ones_like(size), _newton_step(problem, _hessian(problem, L, N))
+    norm = _gradient_size(problem, L, N)
+    fraction, step = torch.ones_like(norm), _newton_step(problem, _hessian(problem, L, N))
     for _ in range(30):
         moved = quadratics.combination(problem.manifold.tangents(N), step.along_tangents)
-        part = fraction[:, None, None]
-        lights = L + part * step.lights
-        shading = problem.manifold.retract((N + part * moved).mT).mT
+        scale = fraction[:, None, None]
+        lights = L + scale * step.lights
+        shading = problem.manifold.retract((N + scale * moved).mT).mT
         after = _gradient_size(problem, lights, shading)
-        better = after < size
-        at_rest = part[:, 0, 0] * step.lights.norm(dim=(1, 2)) <= _CLOSE * L.norm(dim=(1, 2))
+        better = after < norm
+        converged = scale[:, 0, 0] * step.lights.norm(dim=(1, 2)) <= _CONVERGED * L.norm(dim=(1, 2))
         fraction = torch.where(better, (2 * fraction).clamp_max(1), fraction / 2)
         keep = better[:, None, None]
         L, N = torch.where(keep, lights, L), torch.where(keep, shading, N)
-        size = torch.where(better, after, size)
-        if bool((at_rest | (fraction < 1e-3)).all()):
+        norm = torch.where(better, after, norm)
+        if bool((converged | (fraction < 1e-3)).all()):
             break
         if bool(better.any()):
             step = _newton_step(problem, _hessian(problem, L, N))
@@ -193,14 +193,14 @@ def _gradient_size(problem: Bilinear, L: Lights, N: Shading) -> Float[Tensor, " 
 
 
 def _newton_step(problem: Bilinear, hessian: Hessian) -> FactorStep:
-    r"""Return Newton's step; differentiable in the data, the Hessian constant.
+    r"""Return the Newton step; differentiable in the data with a constant Hessian.
 
     The scale of the robust weights is a multiple of the residuals' deviation :math:`d`, which
-    adds a rank-one term to the Hessian: the gradient's derivative by :math:`d` times the
-    derivative of :math:`d` by the unknowns. It is inverted by the Sherman-Morrison formula.
+    adds a rank-one term to the Hessian: the derivative of the gradient by :math:`d` times the
+    derivative of :math:`d` by the unknowns. The Sherman-Morrison formula inverts the sum.
     """
-    at = hessian.lights, hessian.shading, hessian.columns
-    step = _solved(hessian, *_gradient(problem, *at))
+    point = hessian.lights, hessian.shading, hessian.columns
+    step = _solved(hessian, *_gradient(problem, *point))
     if isinstance(problem.loss, Squares):
         return step
     with torch.no_grad():
@@ -211,7 +211,7 @@ def _newton_step(problem: Bilinear, hessian: Hessian) -> FactorStep:
 
 
 def _solved(hessian: Hessian, on_lights: Lights, on_samples: Tangential) -> FactorStep:
-    """Apply the Hessian's inverse, samples eliminated."""
+    """Return the inverse Hessian times a gradient, samples eliminated."""
     inner = _apply(hessian.inverse, on_samples)
     slope = on_lights - _apply_mixed(hessian, inner)
     flat = slope.reshape(len(slope), -1, 1)
@@ -223,10 +223,10 @@ def _solved(hessian: Hessian, on_lights: Lights, on_samples: Tangential) -> Fact
 
 
 def _by_deviation(problem: Bilinear, hessian: Hessian) -> tuple[Entries, tuple[Lights, Tangential]]:
-    """Return the deviation's derivatives by the residuals, and the gradient's by the deviation."""
+    """Return derivatives of the deviation by residuals, and of the gradient by the deviation."""
     residual = problem.radiance.double() - hessian.lights @ hessian.shading
     deviation, deviation_slope = with_slope(partial(bilinear.residual_deviation, problem), residual)
-    # w depends on r / d alone, so that d dw/dd = w - d(w r)/dr: no derivative of it is needed.
+    # w depends on r / d only, so d dw/dd = w - d(w r)/dr: the derivative of w is not needed.
     deviation = deviation[:, None, None].clamp_min(1e-300)
     weighted_residual = (hessian.weighted_residual - hessian.loss_curvature * residual) / deviation
     return deviation_slope, (
@@ -256,13 +256,13 @@ def _hessian(problem: Bilinear, L: Lights, N: Shading) -> Hessian:
         prior = problem.prior.double()
         packed, slope = packed + prior, slope + quadratics.apply_packed(prior, N)
     A, B = quadratics.unpacked(packed, N.shape[1]), torch.stack(columns, dim=-1).transpose(1, 2)
-    own = B.mT @ A @ B + problem.manifold.curvature(N, slope)
-    diagonal = own.diagonal(dim1=2, dim2=3).abs().sum(dim=-1)
-    eye = torch.eye(own.shape[-1], dtype=own.dtype, device=own.device)
+    block = B.mT @ A @ B + problem.manifold.curvature(N, slope)
+    diagonal = block.diagonal(dim1=2, dim2=3).abs().sum(dim=-1)
+    eye = torch.eye(block.shape[-1], dtype=block.dtype, device=block.device)
     # A sample without data does not move.
     moves = (diagonal > 0)[..., None, None]
-    inverse = torch.where(moves, torch.linalg.inv_ex(torch.where(moves, own, eye)).inverse, 0)
-    found = Hessian(
+    inverse = torch.where(moves, torch.linalg.inv_ex(torch.where(moves, block, eye)).inverse, 0)
+    hessian = Hessian(
         lights=L,
         shading=N,
         columns=columns,
@@ -271,7 +271,7 @@ def _hessian(problem: Bilinear, L: Lights, N: Shading) -> Hessian:
         inverse=inverse,
         schur=L.new_zeros(len(L), 0, 0),
     )
-    return found.replace(schur=_schur(problem, found))
+    return hessian.replace(schur=_schur(problem, hessian))
 
 
 def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown unknown"]:
@@ -283,20 +283,20 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
     mean = total.diagonal(dim1=1, dim2=2).mean(dim=1)
     size = max(1, 10_000_000 // (batch * views * rank * len(hessian.columns)))
     for first in range(0, N.shape[2], size):
-        part = slice(first, first + size)
+        chunk = slice(first, first + size)
         mixed = torch.stack(
             [
-                (hessian.loss_curvature[..., part] * (L @ column[..., part]))[:, :, None]
-                * N[:, None, :, part]
-                - hessian.weighted_residual[:, :, None, part] * column[:, None, :, part]
+                (hessian.loss_curvature[..., chunk] * (L @ column[..., chunk]))[:, :, None]
+                * N[:, None, :, chunk]
+                - hessian.weighted_residual[:, :, None, chunk] * column[:, None, :, chunk]
                 for column in hessian.columns
             ],
             dim=-1,
         ).flatten(1, 2)
         total = total - mixed.flatten(2) @ (
-            (mixed[..., None, :] @ hessian.inverse[:, None, part])[..., 0, :].flatten(2).mT
+            (mixed[..., None, :] @ hessian.inverse[:, None, chunk])[..., 0, :].flatten(2).mT
         )
-    # Undetermined directions, as Lorentz transformations of free lights, do not move.
+    # Undetermined directions, such as Lorentz transformations of free lights, do not move.
     ridge = 1e-10 * mean.clamp_min(1e-300)
     return total + torch.diag_embed(ridge[:, None].expand(-1, views * rank))
 
@@ -304,7 +304,7 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
 def _gradient(
     problem: Bilinear, L: Lights, N: Shading, columns: Sequence[Shading]
 ) -> tuple[Lights, Tangential]:
-    """Return minus half the gradient by lights and samples, as a function of the data."""
+    """Return minus half the gradient by lights and samples, differentiable in the data."""
     residual = problem.radiance.double() - L @ N
     deviation = bilinear.residual_deviation(problem, residual)[:, None, None]
     robust = problem.loss.weights(residual, deviation)

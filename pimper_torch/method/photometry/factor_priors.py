@@ -1,7 +1,7 @@
-"""Priors of the factorization: each tells something of lights, normals, albedo or outliers.
+"""Priors of the factorization, on lights, normals, albedo or outliers.
 
-A factorization takes a list of them. Leaving one out removes its effect, and one that is written
-elsewhere, such as a network, is added to the list: nothing else names it.
+The factorization takes a list of priors, and nothing else depends on them: to disable one, remove
+it from the list; to use a custom one, such as a network, append it.
 """
 
 from dataclasses import dataclass
@@ -14,28 +14,28 @@ from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Record
 
 # Standard deviation of residuals over the radiance of albedo 1: a choice, in the middle of rendered
-# scenes. By it variances become weights: a normal that is known to 5.4 degrees counts as a tenth of
-# a view.
+# scenes. It converts variances to weights: a normal with a standard error of 5.4 degrees has the
+# weight of a tenth of a view.
 RELATIVE_NOISE = 0.03
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PatchSamples(Record):
-    """A batch of patches before it is factorized, the samples of each in a row.
+    """A batch of patches before factorization, samples flattened; ``guessed_*``: the views' priors.
 
     Attributes:
         radiance: Gray, linear; zero where missing.
         seen: False where missing, and in the padding.
-        normals: Of the surface so far, unit, patch frame.
-        albedo: Gray, that suits these and the lights best.
-        lights: Of the field, first-order harmonics in the patch frame.
-        viewers: Direction to each camera, unit, patch frame; ``None`` where unknown.
-        guessed_normals: That views carry, unit, patch frame.
+        normals: Normals of the current surface, unit, patch frame.
+        albedo: Gray least-squares albedo for these normals and the lights.
+        lights: First-order harmonics of the light field, patch frame.
+        viewers: Direction to each camera, unit, patch frame; ``None`` if unknown.
+        guessed_normals: Unit, patch frame.
         guessed_information: Inverse variance of these, one over squared radians; 0 where unknown.
-        guessed_albedo: That views carry, gray, up to a factor; 0 where unknown.
+        guessed_albedo: Gray, up to a factor; 0 where unknown.
         guessed_albedo_variance: Relative.
-        guessed_inlier: Probability of diffuse reflection that views carry; 1 where unknown.
-        guessed_lights: That views carry, patch frame, up to a factor.
+        guessed_inlier: Probability of diffuse reflection; 1 where unknown.
+        guessed_lights: Patch frame, up to a factor.
         guessed_light_variance: Relative; infinite where unknown.
     """
 
@@ -56,14 +56,14 @@ class PatchSamples(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PriorTerms(Record):
-    """Statement of a prior on a batch of patches; ``None`` where it makes none.
+    """Means and weights of a prior on a batch of patches; ``None`` for quantities without prior.
 
     Attributes:
         lights: Patch frame.
-        light_weight: In units of each view's own data.
+        light_weight: In units of the weight of each view's data.
         normals: Unit, patch frame.
         normal_weight: In views, see :func:`views_worth`.
-        albedo: Gray, in units of the lights.
+        albedo: Gray, in the scale of the lights.
         albedo_weight: In views.
         inlier: Factor of the weight of every entry, in [0, 1].
     """
@@ -78,18 +78,18 @@ class PriorTerms(Record):
 
 
 class FactorPrior(nn.Module):
-    """A prior of the factorization; one of your own overrides :meth:`forward`."""
+    """A prior of the factorization; a custom one overrides :meth:`forward`."""
 
     def forward(self, samples: PatchSamples) -> PriorTerms:
-        """Return what is known of some patches."""
+        """Return means and weights for a batch of patches."""
         raise NotImplementedError
 
 
 class FieldLights(FactorPrior):
-    """Lights are those of the light field.
+    """Prior of the lights, with the light field as mean.
 
     Args:
-        weight: In units of each view's own data.
+        weight: In units of the weight of each view's data.
     """
 
     def __init__(self, weight: float = 1.0) -> None:
@@ -97,13 +97,13 @@ class FieldLights(FactorPrior):
         self.weight = weight
 
     def forward(self, samples: PatchSamples) -> PriorTerms:
-        """Return the field's lights."""
+        """Return the lights of the field and their weight."""
         weight = torch.full_like(samples.lights[..., 0], self.weight)
         return PriorTerms(lights=samples.lights, light_weight=weight)
 
 
 class SurfaceNormals(FactorPrior):
-    """Normals are those of the surface so far.
+    """Prior of the normals, with those of the current surface as mean.
 
     Args:
         weight: In views.
@@ -114,51 +114,51 @@ class SurfaceNormals(FactorPrior):
         self.weight = weight
 
     def forward(self, samples: PatchSamples) -> PriorTerms:
-        """Return the surface's normals."""
+        """Return the normals of the surface and their weight."""
         weight = torch.full_like(samples.albedo, self.weight)
         return PriorTerms(normals=samples.normals, normal_weight=weight)
 
 
 class MapPriors(FactorPrior):
-    """Normals, albedo, lights and inliers are those that views carry, to their variance.
+    """Prior of normals, albedo, lights and inliers from the views' prior maps and their variance.
 
-    Albedo and lights are taken up to a factor for each patch.
+    Albedo and lights are scaled by a factor per patch.
     """
 
     def forward(self, samples: PatchSamples) -> PriorTerms:
-        """Return the guesses in units of the light field and the albedo under it."""
-        known = PriorTerms(normals=samples.guessed_normals, inlier=samples.guessed_inlier)
+        """Return the prior maps in the scale of the light field and of the albedo under it."""
+        terms = PriorTerms(normals=samples.guessed_normals, inlier=samples.guessed_inlier)
         if (information := samples.guessed_information) is not None:
-            known = known.replace(normal_weight=views_worth(information))
+            terms = terms.replace(normal_weight=views_worth(information))
         albedo, variance = samples.guessed_albedo, samples.guessed_albedo_variance
         if albedo is not None and variance is not None:
-            both = (albedo > 0) & (samples.albedo > 0)
-            if bool(both.any()):
-                scale = _median_ratio(samples.albedo, albedo, both)
-                weight = torch.where(both, views_worth(1 / variance), 0)
-                known = known.replace(albedo=scale * albedo, albedo_weight=weight)
+            valid = (albedo > 0) & (samples.albedo > 0)
+            if bool(valid.any()):
+                scale = _median_ratio(samples.albedo, albedo, valid)
+                weight = torch.where(valid, views_worth(1 / variance), 0)
+                terms = terms.replace(albedo=scale * albedo, albedo_weight=weight)
         lights, variance = samples.guessed_lights, samples.guessed_light_variance
         if lights is not None and variance is not None:
             length = lights.norm(dim=2)
-            both = variance.isfinite() & (length > 0)
-            scale = _median_ratio(samples.lights.norm(dim=2), length, both)
-            # The field itself is 6 degrees off: a variance of 0.01 of its square.
-            weight = torch.where(both, 0.01 / torch.where(both, variance, 1), 0)
-            known = known.replace(lights=scale[..., None] * lights, light_weight=weight)
-        return known
+            valid = variance.isfinite() & (length > 0)
+            scale = _median_ratio(samples.lights.norm(dim=2), length, valid)
+            # The error of the field is 6 degrees: a variance of 0.01 of its square.
+            weight = torch.where(valid, 0.01 / torch.where(valid, variance, 1), 0)
+            terms = terms.replace(lights=scale[..., None] * lights, light_weight=weight)
+        return terms
 
 
 def _median_ratio(
-    own: Float[Tensor, "patch item"], guess: Float[Tensor, "patch item"], known: Tensor
+    values: Float[Tensor, "patch item"], guess: Float[Tensor, "patch item"], mask: Tensor
 ) -> Float[Tensor, "patch 1"]:
-    """Return each patch's factor from guesses to its own values; 0 where nothing is known."""
-    ratio = torch.where(known, own / torch.where(known, guess, 1), torch.nan)
+    """Return each patch's median ratio of values to guesses; 0 if the mask is empty."""
+    ratio = torch.where(mask, values / torch.where(mask, guess, 1), torch.nan)
     return ratio.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
 
 
 def views_worth(information: Scalars) -> Scalars:
-    """Return the views that tell as much of an angle or of relative albedo; one at most.
+    """Return the number of views that give the same information on an angle or relative albedo.
 
-    So photographs overrule guesses.
+    It is at most one, so that photographs outweigh guesses.
     """
     return (RELATIVE_NOISE**2 * information).clamp_max(1)

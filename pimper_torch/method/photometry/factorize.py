@@ -60,7 +60,7 @@ from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.runtime.stage import Stage
 
 SOLVERS: dict[str, Solver] = {
-    # 256 samples are ten for each of 24 lights' coefficients.
+    # 256 samples are about ten per light of 24 views.
     "variable-projection": partial(solve_variable_projection, small_steps=1, curvature_samples=256),
     "balm": solve_balm,
 }
@@ -72,7 +72,7 @@ LOSSES: dict[str, Callable[..., Loss]] = {
     "geman-mcclure": GemanMcClure,
 }
 
-# Iterations at most, and tolerance, where gradients are required: from there Newton's method
+# Maximum number of iterations and tolerance if gradients are required: Newton's method then
 # converged to rounding in all of 60 patches of a sphere; from the default tolerance, in 37.
 TO_CONVERGENCE = 300, 1e-9
 
@@ -91,28 +91,28 @@ class _Bucket(Record):
 class Factorize(Stage):
     r"""Separate albedo, normals and light: ``J = L N`` with ``N`` on the photometric cone.
 
-    Every patch is factorized by itself. The light field (:class:`FitLight
-    <pimper_torch.method.photometry.fit_light.FitLight>`) is the prior mean of its lights; colours
-    and exposures of views are divided out first. Samples in shadow of the point light are left out,
-    or, where they are most of a patch in a lit room, those outside it. Each sample gets a last
-    Gauss-Newton step, and albedo is fitted to every channel.
+    Patches are factorized independently. The light field (:class:`FitLight
+    <pimper_torch.method.photometry.fit_light.FitLight>`) is the prior mean of their lights; colours
+    and exposures of views are divided out first. Samples in shadow of the point light are excluded.
+    If a patch in a lit room is mostly in shadow in a view, its lit samples are excluded instead.
+    Each sample takes a last Gauss-Newton step, and albedo is fitted in every channel.
 
-    Gauge: albedo and light share one free factor for the whole scene, which :class:`FixGauge
-    <pimper_torch.method.photometry.gauge.FixGauge>` sets. With ``light_prior=0`` each patch has its
-    own Lorentz ambiguity besides, fixed by the initial values.
+    Gauge: albedo and light share one free factor per scene, which :class:`FixGauge
+    <pimper_torch.method.photometry.gauge.FixGauge>` sets. With ``light_prior=0`` each patch also
+    has a Lorentz ambiguity, which the initial values fix.
 
-    Where it fails softly: samples lit in fewer than ``min_views`` views, or whose normal faces
+    Undetermined samples: those lit in fewer than ``min_views`` views, or with a normal that faces
     away, keep the coarse normal, are not ``valid`` and have information 0. Patches that light
-    does not determine keep coarse normals, and their status names the cause (see
-    :class:`~pimper_torch.records.PatchStatus`); a :class:`PimperWarning` counts them. A view
-    that does not see a patch has light zero there. NaN and infinity in the radiance
-    count as missing.
+    does not determine keep coarse normals, and their status is the cause (see
+    :class:`~pimper_torch.records.PatchStatus`); a :class:`PimperWarning` counts them. The light
+    of a view that does not see a patch is zero there. NaN and infinity in the radiance count as
+    missing.
 
     Differentiable in the radiance and in the initial templates and normals: light field, lights
     and samples by the implicit function theorem at the optimum (see
     :mod:`~pimper_torch.method.photometry.factor_gradients`), to which Newton's method converges
-    where gradients are required. Which samples are valid is constant, and so are colours and
-    exposures of views, and a room's harmonics over its ambient light.
+    if gradients are required. Constant: which samples are valid, colours and exposures of views,
+    and a room's harmonics over its ambient light.
     """
 
     def __init__(
@@ -122,19 +122,19 @@ class Factorize(Stage):
         self.config = config = config or FactorizeConfig()
         require(config.loss in LOSSES, "factorize.loss", config.loss, " or ".join(LOSSES))
         if priors is None:
-            own = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
-            priors = [*own, MapPriors()]
+            defaults = FieldLights(config.light_prior), SurfaceNormals(config.geometry_weight)
+            priors = [*defaults, MapPriors()]
         for prior in priors:
             needed = "modules derived from FactorPrior"
             require(isinstance(prior, FactorPrior), "Factorize: priors", prior, needed)
         self.priors = nn.ModuleList(priors)
 
     def forward(self, seen: PatchViews, light: Illumination) -> PhotometricPatches:
-        """Factorize patches, independently of one another.
+        """Return albedo, normals and lights of patches.
 
         Args:
-            seen: Of all patches, or of some buckets.
-            light: As :class:`~pimper_torch.method.photometry.fit_light.FitLight` fits it.
+            seen: Samples of all patches, or of a few buckets.
+            light: Result of :class:`~pimper_torch.method.photometry.fit_light.FitLight`.
 
         Returns:
             Albedo and lights up to the factor of the scene, see
@@ -142,18 +142,18 @@ class Factorize(Stage):
         """
         mesh = seen.patches.surface or seen.patches.coarse.mesh
         caster = ray_caster(mesh) if light.shadows else None
-        parts = list(zip(seen.patches.buckets, seen.buckets, strict=True))
-        one = partial(self._solved, seen.patches.coarse, light, caster)
-        return PhotometricPatches(patches=seen.patches, buckets=tuple(side_by_side(one, parts)))
+        buckets = list(zip(seen.patches.buckets, seen.buckets, strict=True))
+        solve = partial(self._solved, seen.patches.coarse, light, caster)
+        return PhotometricPatches(patches=seen.patches, buckets=tuple(side_by_side(solve, buckets)))
 
     def _solved(
         self,
         coarse: CoarseMesh,
         light: Illumination,
         caster: RayCaster | None,
-        part: tuple[Templates, Observations],
+        bucket_samples: tuple[Templates, Observations],
     ) -> Photometry:
-        templates, registered = part
+        templates, registered = bucket_samples
         light = light.replace(field=templates.own(light.field))
         bucket = _Bucket(
             templates=templates,
@@ -172,9 +172,10 @@ class Factorize(Stage):
     def _prepare(
         self, bucket: _Bucket, illuminated: PatchMasks, shadowed: PatchMasks, light: Illumination
     ) -> tuple[FlatSamples, Int[Tensor, " patch"], Bilinear]:
-        """Return samples, status and problem; in light that never moves, shadows take part.
+        """Return samples, status and problem.
 
-        There shadows are at rest on the surface; elsewhere they move over it as false texture.
+        Shadows are excluded, as they would move over the surface like texture. They are kept if the
+        light does not vary: then they are static on the surface.
         """
         config = self.config
         patch_from_world = bucket.templates.patch_from_world.to(bucket.normals)
@@ -192,44 +193,44 @@ class Factorize(Stage):
             config.min_light_variation,
         )
         raster = bucket.normals.shape[1] * bucket.normals.shape[2]
-        refused = status != int(PatchStatus.DETERMINED)
-        shown = rows.seen.sum(dim=2)
-        at_rest = refused & ~light_varies(prior_mean, shown, config.min_light_variation)
-        rows = rows.only(lit | at_rest[:, None, None])
+        undetermined = status != int(PatchStatus.DETERMINED)
+        counts = rows.seen.sum(dim=2)
+        constant = undetermined & ~light_varies(prior_mean, counts, config.min_light_variation)
+        rows = rows.only(lit | constant[:, None, None])
         prior_mean = torch.where(
-            refused[:, None, None], recomputed(_exposed, rows, prior_mean), prior_mean
+            undetermined[:, None, None], recomputed(_exposed, rows, prior_mean), prior_mean
         )
         variance = light.guess_variance
-        problem = self._problem(rows, prior_mean, refused, raster, bucket.registered, variance)
+        problem = self._problem(rows, prior_mean, undetermined, raster, bucket.registered, variance)
         return rows, status, problem
 
     def _photometry(
         self, bucket: _Bucket, rows: FlatSamples, status: Int[Tensor, " patch"], problem: Bilinear
     ) -> Photometry:
-        """Solve the problem, and put what light determines on the rasters."""
+        """Return the solution of the problem as rasters."""
         factors = self._solve(problem)
         if torch.is_grad_enabled() and problem.requires_grad:
             factors = differentiable(problem, factors)
         gray, normals, information = recomputed(refine_on_manifold, problem, factors)
-        views = rows.seen.shape[1]  # a view beyond them represents known albedo
+        views = rows.seen.shape[1]  # a further view represents the prior of albedo
         lights, weight = factors.lights[:, :views], factors.weight[:, :views]
-        prior_mean, given = problem.prior_mean[:, :views], problem.weight[:, :views]
+        prior_mean, initial_weight = problem.prior_mean[:, :views], problem.weight[:, :views]
         finite = lights.isfinite().flatten(1).all(dim=1)
         estimated = normals.isfinite().all(dim=2) & gray.isfinite()
         estimated &= (gray > 0) & (rows.seen.sum(dim=1) >= self.config.min_views)
-        outvoted = (weight < given / 2) & rows.seen
+        outvoted = (weight < initial_weight / 2) & rows.seen
         leave_out("photometry.robust", int(outvoted.sum()), total=int(rows.seen.sum()))
         failed = (status == int(PatchStatus.DETERMINED)) & ~(finite & estimated.any(dim=1))
         status = torch.where(failed, int(PatchStatus.FAILED), status)
-        lost, reason = bucket.templates.facet[failed], "the solver found no finite solution"
-        skipped_patches("factorize", lost, reason, _COARSE_NORMALS)
+        facets, reason = bucket.templates.facet[failed], "the solver found no finite solution"
+        skipped_patches("factorize", facets, reason, _COARSE_NORMALS)
         determined = (status == int(PatchStatus.DETERMINED))[:, None]
         valid = estimated & determined & (normals[..., 2] < 0)
         fitted = finite & rows.seen.flatten(1).any(dim=1)
         lights = torch.where(fitted[:, None, None], lights, prior_mean)
         lights = lights * rows.seen.any(dim=2)[..., None]
         normals = torch.where(valid[..., None], normals, rows.normals)
-        weight = torch.where(determined[..., None], weight, given)
+        weight = torch.where(determined[..., None], weight, initial_weight)
         basis = harmonics(normals).mT
         albedo = recomputed(fit_albedo, rows.radiance, weight, lights, basis)
         blank = torch.zeros_like(bucket.normals[..., 0])
@@ -250,7 +251,7 @@ class Factorize(Stage):
         self,
         rows: FlatSamples,
         field: Float[Tensor, "patch view 4"],
-        refused: Bool[Tensor, " patch"],
+        undetermined: Bool[Tensor, " patch"],
         raster: int,
         registered: Observations,
         variance: Scalar,
@@ -261,29 +262,29 @@ class Factorize(Stage):
         basis = harmonics(rows.normals).mT
         shading = recomputed(initial_shading, gray, rows.seen, field, basis)
         samples = _samples(rows, gray, field, shading[:, 0], registered, variance)
-        known = [cast("PriorTerms", prior(samples)) for prior in self.priors]
-        for each in known:
-            if each.inlier is not None:
-                weight = weight * each.inlier
-        prior_mean, light_weight = _prior_mean(field, known)
+        terms = [cast("PriorTerms", prior(samples)) for prior in self.priors]
+        for term in terms:
+            if term.inlier is not None:
+                weight = weight * term.inlier
+        prior_mean, light_weight = _prior_mean(field, terms)
         square = shading[:, 0] ** 2
         count = (square > 0).sum(dim=1).clamp_min(1)
         seen_square = (weight @ square[..., None])[..., 0]
-        # Views with few samples borrow 16 from the others.
+        # 16 mean samples are added, for views with few samples.
         unit = seen_square + (16 * square.sum(dim=1) / count)[:, None]
         views = rows.seen.any(dim=2).sum(dim=1).clamp_min(1)
-        level = (field**2).sum(dim=(1, 2)) / views
-        # Where light determines no normals, thirty views move these by 3 % of the way.
-        pulls = [(rows.normals, torch.where(refused, 1e3, 0)[:, None].expand_as(square))]
+        light_power = (field**2).sum(dim=(1, 2)) / views
+        # If light does not determine normals, 30 views move them by 3 % of the way.
+        pulls = [(rows.normals, torch.where(undetermined, 1e3, 0)[:, None].expand_as(square))]
         pulls += [
-            (each.normals, torch.where(refused[:, None], 0, each.normal_weight))
-            for each in known
-            if each.normals is not None and each.normal_weight is not None
+            (term.normals, torch.where(undetermined[:, None], 0, term.normal_weight))
+            for term in terms
+            if term.normals is not None and term.normal_weight is not None
         ]
         prior: Float[Tensor, "patch packed sample"] | None = None
         for normals, pull in pulls:
             if bool((pull > 0).any()):
-                penalty = (level[:, None] * pull)[:, None] * cone.normal_prior(normals.mT)
+                penalty = (light_power[:, None] * pull)[:, None] * cone.normal_prior(normals.mT)
                 prior = penalty if prior is None else prior + penalty
         problem = Bilinear(
             radiance=gray,
@@ -291,16 +292,16 @@ class Factorize(Stage):
             lights=prior_mean,
             prior_mean=prior_mean,
             shading=shading,
-            # At least a millionth of the data holds the light of views with few samples.
+            # A millionth of the data, at least, determines the light of views with few samples.
             regularization=light_weight.clamp_min(1e-6) * unit,
             prior=prior,
             manifold=cone,
             loss=LOSSES[config.loss](*([config.loss_scale] if config.loss_scale else [])),
-            stride=max(1, raster // 512),  # some 500 samples determine the residuals' deviation
+            stride=max(1, raster // 512),  # 500 samples suffice for the residuals' deviation
         )
-        for each in known:
-            if each.albedo is not None and each.albedo_weight is not None:
-                problem = _with_albedo(problem, each.albedo, each.albedo_weight, level)
+        for term in terms:
+            if term.albedo is not None and term.albedo_weight is not None:
+                problem = _with_albedo(problem, term.albedo, term.albedo_weight, light_power)
         return problem
 
     def _solve(self, problem: Bilinear) -> Factors:
@@ -308,13 +309,13 @@ class Factorize(Stage):
         limits, dtype = (config.max_iterations, config.tolerance), problem.radiance.dtype
         if torch.is_grad_enabled() and problem.requires_grad:
             limits = max(limits[0], TO_CONVERGENCE[0]), min(limits[1], TO_CONVERGENCE[1])
-            # Newton's method goes on from there in float64.
+            # Newton's method continues in float64.
             problem = problem.to(torch.float32)
         return SOLVERS[config.solver](problem.detach(), *limits).to(dtype)
 
 
 def _balanced(registered: Observations, field: LightField) -> Observations:
-    """Divide radiance by each view's gain, and guessed lights by its exposure: constants."""
+    """Return radiance over each view's gain, and prior lights over its exposure, both constant."""
     priors = registered.priors
     if field.gain is None or field.exposure is None or bool((field.gain == 1).all()):
         return registered
@@ -333,9 +334,9 @@ def _lit(
     illuminated: PatchMasks,
     shadowed: PatchMasks,
 ) -> tuple[Bool[Tensor, "patch view sample"], Float[Tensor, "patch view 4"]]:
-    """Find samples under first-order light, and that light.
+    """Return the samples under first-order light, and that light.
 
-    What is mostly in shadow of the lamp has the room's light in that view.
+    It is the room's light in views where a patch is mostly in shadow of the lamp.
     """
     lights, soft, point_light = lights_in_patches(field, patch_from_world)
     lit = (
@@ -344,7 +345,7 @@ def _lit(
         & faces_light(point_light, rows.normals)
     )
     shaded = flatten_samples(shadowed, rows.index) | faces_light(-point_light, rows.normals)
-    # Directed soft light that shades by much beside a point light.
+    # Directed soft light whose shading is strong compared with the point light.
     directed, strength = (soft[..., 1:] != 0).any(dim=-1), point_light.norm(dim=-1)
     strong = directed & (strength > 0) & (soft[..., 0] - soft[..., 3] > strength / 4)
     by_soft = shaded & rows.seen & strong[..., None]
@@ -360,8 +361,8 @@ def _samples(
     registered: Observations,
     variance: Scalar,
 ) -> PatchSamples:
-    """Lay out what priors are asked about."""
-    guessed = registered.priors
+    """Return the samples for the priors; ``variance`` is added to that of the views' normals."""
+    priors = registered.priors
     samples = PatchSamples(
         radiance=gray,
         seen=rows.seen,
@@ -370,52 +371,52 @@ def _samples(
         lights=field,
         viewers=registered.viewers,
     )
-    if guessed is None:
+    if priors is None:
         return samples
 
     def row(raster: PatchRaster) -> Float[Tensor, "patch sample"]:
         return raster.flatten(1).gather(1, rows.index)
 
-    normals, information = guessed.normals_patch.flatten(1, 2), guessed.normal_information
-    inlier = guessed.inlier
+    normals, information = priors.normals_patch.flatten(1, 2), priors.normal_information
+    inlier = priors.inlier
     return samples.replace(
         guessed_normals=normals.gather(1, rows.index[..., None].expand(-1, -1, 3)),
         guessed_information=row(information / (1 + information * variance)),
-        guessed_albedo=row(guessed.albedo),
-        guessed_albedo_variance=row(guessed.albedo_variance),
+        guessed_albedo=row(priors.albedo),
+        guessed_albedo_variance=row(priors.albedo_variance),
         guessed_inlier=None if inlier is None else flatten_samples(inlier, rows.index),
-        guessed_lights=guessed.lights_patch,
-        guessed_light_variance=guessed.light_variance,
+        guessed_lights=priors.lights_patch,
+        guessed_light_variance=priors.light_variance,
     )
 
 
 def _prior_mean(
-    field: Float[Tensor, "patch view 4"], known: Sequence[PriorTerms]
+    field: Float[Tensor, "patch view 4"], terms: Sequence[PriorTerms]
 ) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch view"]]:
-    """Return the mean of the lights that priors know, by weight, and the sum of the weights."""
-    told = [
-        (each.lights, each.light_weight)
-        for each in known
-        if each.lights is not None and each.light_weight is not None
+    """Return the weighted mean of the priors' lights, and the sum of the weights."""
+    priors = [
+        (term.lights, term.light_weight)
+        for term in terms
+        if term.lights is not None and term.light_weight is not None
     ]
-    if len(told) == 1:
-        return told[0]
+    if len(priors) == 1:
+        return priors[0]
     total = torch.zeros_like(field[..., 0])
     mean = torch.zeros_like(field)
-    for lights, weight in told:
+    for lights, weight in priors:
         total, mean = total + weight, mean + weight[..., None] * lights
-    some = (total > 0)[..., None]
-    return torch.where(some, mean / torch.where(some, total[..., None], 1), field), total
+    weighted = (total > 0)[..., None]
+    return torch.where(weighted, mean / torch.where(weighted, total[..., None], 1), field), total
 
 
 def _with_albedo(
     problem: Bilinear,
     albedo: Float[Tensor, "patch sample"],
     weight: Float[Tensor, "patch sample"],
-    level: Float[Tensor, " patch"],
+    light_power: Float[Tensor, " patch"],
 ) -> Bilinear:
-    """Add a view under ambient light of mean strength, which shows albedo itself."""
-    strength = level.sqrt()[:, None]
+    """Return the problem with a view added: albedo under ambient light of mean strength."""
+    strength = light_power.sqrt()[:, None]
     light = pad(strength[..., None], (0, 3))
     fixed = 1e6 * problem.regularization.amax(dim=1, keepdim=True)
     return problem.replace(
@@ -431,7 +432,7 @@ def _with_albedo(
 def _illuminated(
     bucket: _Bucket, field: LightField, caster: RayCaster | None
 ) -> tuple[PatchMasks, PatchMasks]:
-    """Find observed samples that are not in cast shadows, and those that are; no edges of them."""
+    """Return the valid samples outside and inside cast shadows, except near shadow edges."""
     registered, templates = bucket.registered, bucket.templates
     if caster is None:
         return registered.valid, torch.zeros_like(registered.valid)
@@ -445,7 +446,7 @@ def _illuminated(
         rotate(world_from_patch, bucket.normals.flatten(1, 2)).reshape(raster),
         templates.spacing,
         registered.valid,
-        # The surface that casts them is taken to be off by two samples.
+        # The assumed error of the surface that casts the shadows is two samples.
         tolerance=2 * templates.spacing.detach(),
         guard=2 * float(templates.spacing[0].detach()),
     )
@@ -456,7 +457,7 @@ def _illuminated(
 def _exposed(
     rows: FlatSamples, lights: Float[Tensor, "patch view 4"]
 ) -> Float[Tensor, "patch view 4"]:
-    """Scale each view's light to its radiance, coarse normals given and albedo the same in all."""
+    """Return lights scaled to the radiance of each view, for coarse normals and a common albedo."""
     gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
     predicted = lights @ initial_shading(gray, rows.seen, lights, basis) * rows.seen
     square = predicted.square().sum(dim=2)

@@ -1,4 +1,4 @@
-"""The light of every view, which all patches share, fitted to the surface."""
+"""The light of every view, common to all patches, fitted to the surface."""
 
 import math
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ from pimper_torch.method.photometry.sample_estimates import gather_samples, init
 from pimper_torch.records import PatchPriors, PatchViews, Record
 from pimper_torch.runtime.stage import Stage
 
-# Guessed normals suit the photographs better if residuals fall below this fraction: a choice. True
-# ones with smooth errors of 10 degrees lower them to 0.63 on a jar's first pass, and normals that
-# all face the camera to 0.98.
+# The views' prior normals are used for the light if they reduce residuals below this fraction: a
+# choice. True normals with smooth errors of 10 degrees reduce them to 0.63 in a jar's first pass,
+# and normals that all face the camera to 0.98.
 _GUESS_GAIN = 0.95
 
-# Information of the surface's normals where there are guesses, too: a choice, 5.4 degrees, as
-# much as the weight of their prior says.
+# Information of the surface's normals where prior normals exist as well: a choice, 5.4 degrees, as
+# the weight of their prior in the factorization.
 _SURFACE_INFORMATION = 0.1 / RELATIVE_NOISE**2
 
 
@@ -40,8 +40,8 @@ class Illumination(Record):
 
     Attributes:
         shadows: Whether the surface casts shadows.
-        guess_variance: Of the difference of guessed normals from the surface's beyond what both
-            claim, squared radians; 0 where they suit the photographs better.
+        guess_variance: Variance of the difference between prior normals and the surface's, in
+            excess of the stated variances, squared radians; 0 if prior normals fit better.
     """
 
     field: LightField
@@ -50,10 +50,10 @@ class Illumination(Record):
 
 
 class FitLight(Stage):
-    """Fit the light of every view to the normals of the surface that the templates carry.
+    """Fit the light of every view to the normals of the templates' surface.
 
-    Soft light, or a near point light, in a lit room where there is one; its colour and exposure
-    are those that the factorization divides out. Few samples of all patches are enough, see
+    It is soft light, or a near point light, possibly in a lit room. The factorization divides out
+    its colour and exposure. A few samples of all patches are enough, see
     :func:`~pimper_torch.method.photometry.lights.thinned`.
 
     Differentiable in the radiance and the normals, by the implicit function theorem; the model,
@@ -65,21 +65,21 @@ class FitLight(Stage):
         self.config = config or FitLightConfig()
 
     def forward(self, seen: PatchViews) -> Illumination:
-        """Fit it.
+        """Return the light of all views.
 
         Args:
-            seen: Of all patches, whose templates may be thinned.
+            seen: Samples of all patches; templates may be thinned.
         """
         coarse = [transferred_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
         field = self._field(seen, coarse)
         variance = field.soft.new_zeros(())
         guesses = [bucket.priors for bucket in seen.buckets]
         if any(each is not None and bool(each.normal_information.any()) for each in guesses):
-            led = [_beside_guesses(*pair) for pair in zip(coarse, guesses, strict=True)]
-            under = self._field(seen, led)
-            # The photographs decide whether the surface or the guess is nearer to the truth.
-            if _misfit(seen, under, led) < _GUESS_GAIN * _misfit(seen, field, coarse):
-                field = under
+            normals = [_with_priors(*pair) for pair in zip(coarse, guesses, strict=True)]
+            refitted = self._field(seen, normals)
+            # The residuals decide whether the surface or the prior normals are more accurate.
+            if _misfit(seen, refitted, normals) < _GUESS_GAIN * _misfit(seen, field, coarse):
+                field = refitted
             else:
                 variance = _excess_variance(coarse, guesses)
         shadows = self.config.shadows and bool(field.point_light.any())
@@ -95,46 +95,46 @@ def lights_in_patches(
 ) -> tuple[
     Float[Tensor, "patch view 4"], Float[Tensor, "patch view 4"], Float[Tensor, "patch view 3"]
 ]:
-    """Return first-order light at the centres of patches, soft light alone, and the point light."""
+    """Return first-order light at the centres of patches, soft light only, and point light."""
     centre, outward = invert_rigid(patch_from_world)[:, :3, 3], -patch_from_world[:, 2, :3]
-    both, soft = field.lights_at(centre, outward), linearized(field.soft, outward)
+    full, soft = field.lights_at(centre, outward), linearized(field.soft, outward)
     point_light = rotate(patch_from_world, field.point_light_at(centre))
-    return rotate_lights(patch_from_world, both), rotate_lights(patch_from_world, soft), point_light
+    return rotate_lights(patch_from_world, full), rotate_lights(patch_from_world, soft), point_light
 
 
 def _misfit(seen: PatchViews, field: LightField, normals: list[Float[Tensor, "_ _ _ 3"]]) -> float:
-    """Return the median residual of normals under a light field, over what it predicts."""
-    found = []
-    for templates, registered, own in zip(seen.patches.buckets, seen.buckets, normals, strict=True):
-        rows = gather_samples(templates, registered, own)
-        lights, _, _ = lights_in_patches(templates.own(field), templates.patch_from_world.to(own))
+    """Return the median residual over the predicted radiance, for a light field and normals."""
+    residuals = []
+    for templates, samples, normal in zip(seen.patches.buckets, seen.buckets, normals, strict=True):
+        rows = gather_samples(templates, samples, normal)
+        lights = lights_in_patches(templates.own(field), templates.patch_from_world.to(normal))[0]
         gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
         predicted = lights @ initial_shading(gray, rows.seen, lights, basis)
-        some = rows.seen & (predicted > 0)
-        found.append(((gray - predicted).abs() / predicted.clamp_min(1e-12))[some])
-    return float(torch.cat(found).detach().median()) if sum(map(len, found)) else math.inf
+        valid = rows.seen & (predicted > 0)
+        residuals.append(((gray - predicted).abs() / predicted.clamp_min(1e-12))[valid])
+    return float(torch.cat(residuals).detach().median()) if sum(map(len, residuals)) else math.inf
 
 
 def _excess_variance(
     normals: list[Float[Tensor, "_ _ _ 3"]], guesses: list[PatchPriors | None]
 ) -> Scalar:
-    """Return the variance of guessed normals about the surface's, beyond what both claim."""
-    square, claimed = [], []
-    for own, guess in zip(normals, guesses, strict=True):
+    """Return the variance of prior normals about the surface's, in excess of the stated ones."""
+    square, stated = [], []
+    for bucket_normals, guess in zip(normals, guesses, strict=True):
         if guess is not None:
-            some = guess.normal_information > 0
-            square.append((guess.normals_patch - own)[some].square().sum(dim=-1))
-            claimed.append(1 / guess.normal_information[some])
-    # Half of the squares of two Gaussian components lie below 2 log 2 times their variance.
-    found = torch.cat(square).median() / math.log(2)
-    claims = torch.cat(claimed).median() + 1 / _SURFACE_INFORMATION
-    return (found - claims).clamp_min(0)
+            valid = guess.normal_information > 0
+            square.append((guess.normals_patch - bucket_normals)[valid].square().sum(dim=-1))
+            stated.append(1 / guess.normal_information[valid])
+    # The median of the sum of two squared Gaussian components is 2 log 2 times their variance.
+    variance = torch.cat(square).median() / math.log(2)
+    stated = torch.cat(stated).median() + 1 / _SURFACE_INFORMATION
+    return (variance - stated).clamp_min(0)
 
 
-def _beside_guesses(normals: PatchVectors, guessed: PatchPriors | None) -> PatchVectors:
-    """Average the surface's normals with those that were guessed, where there are any."""
-    if guessed is None:
+def _with_priors(normals: PatchVectors, priors: PatchPriors | None) -> PatchVectors:
+    """Return the surface's normals, averaged with prior normals where they exist."""
+    if priors is None:
         return normals
-    information = guessed.normal_information[..., None]
-    both = _SURFACE_INFORMATION * normals + information * guessed.normals_patch
-    return torch.where(information > 0, normalize(both, dim=-1), normals)
+    information = priors.normal_information[..., None]
+    total = _SURFACE_INFORMATION * normals + information * priors.normals_patch
+    return torch.where(information > 0, normalize(total, dim=-1), normals)

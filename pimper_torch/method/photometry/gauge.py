@@ -1,4 +1,4 @@
-"""The factor that albedo and lights of the whole scene share."""
+"""The scale between albedo and lights, one factor for the scene."""
 
 import math
 
@@ -14,11 +14,11 @@ from pimper_torch.runtime.stage import Stage
 class FixGauge(Stage):
     """Set the 99th percentile of gray albedo to 1, over all patches.
 
-    Of the samples whose normals light determines, where there are any. Warns of patches whose light
-    determines no normals. Differentiable.
+    It is the percentile of the samples with photometric normals, or of all observed samples if
+    there are none. Warns of patches without photometric normals. Differentiable.
 
     Args:
-        config: Of the factorization, whose limits the warning names.
+        config: Settings of the factorization; the warning names its limits.
     """
 
     def __init__(self, config: FactorizeConfig | None = None) -> None:
@@ -26,17 +26,17 @@ class FixGauge(Stage):
         self.config = config or FactorizeConfig()
 
     def forward(self, solved: PhotometricPatches) -> PhotometricPatches:
-        """Divide albedo by it, and multiply lights.
+        """Return patches with albedo divided by the percentile, and lights multiplied by it.
 
         Args:
-            solved: Of all patches.
+            solved: All patches.
         """
         config = self.config
         status = torch.cat([bucket.status for bucket in solved.buckets])
-        mesh, facet = solved.patches.coarse.mesh, [one.facet for one in solved.patches.buckets]
+        mesh, facets = solved.patches.coarse.mesh, [x.facet for x in solved.patches.buckets]
         undetermined = status != int(PatchStatus.DETERMINED)
-        at = mesh.vertices_world, mesh.faces[torch.cat(facet)]
-        leave_out("photometry.undetermined", undetermined, at=at)
+        triangles = mesh.vertices_world, mesh.faces[torch.cat(facets)]
+        leave_out("photometry.undetermined", undetermined, at=triangles)
         warn_of_undetermined(solved.buckets, config.min_views, config.min_light_variation)
         determined = any(bool(bucket.valid.any()) for bucket in solved.buckets)
         gray = [

@@ -1,8 +1,8 @@
-r"""The colour and the strength of each view's light, relative to those of all of them.
+r"""The colour and strength of each view's light, relative to all views.
 
 Chromaticity is that of the albedo times that of the light, whatever the shading: the logarithm of
-each channel over the channels' mean is a sum of one term a sample and one a view. So is that of
-the brightness, but for the shading.
+each channel over the channels' geometric mean is a sum of a term per sample and a term per view.
+So is the logarithm of brightness, except for shading.
 """
 
 import torch
@@ -13,9 +13,9 @@ from pimper_torch.ground.kernels.twin_constants import MIN_DEVIATION
 from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.method.photometry.light_models import left_out, predicts_better
 
-# Stops that a photograph is brightened by at most: below an eighth of the others' brightness the
-# sensor's noise is most of its residuals. Views that near to the median are of one exposure, as
-# lamps move and fall off. Choices.
+# Stops by which a photograph is brightened at most: below an eighth of the others' brightness,
+# residuals are mostly sensor noise. Views within this many stops of the median count as equally
+# exposed, since lamps move and their irradiance falls off. Choices.
 _MOST_STOPS, _SAME_STOPS = 3.0, 1.5
 
 
@@ -23,7 +23,7 @@ _MOST_STOPS, _SAME_STOPS = 3.0, 1.5
 def light_colours(
     radiance: Float[Tensor, "sample view channel"], seen: Bool[Tensor, "sample view"]
 ) -> Float[Tensor, "view channel"]:
-    """Fit the colour of each view's light; white where colours do not predict better.
+    """Fit the colour of each view's light; white if colours do not predict better.
 
     Args:
         radiance: Linear. Entries that are not seen are ignored.
@@ -33,7 +33,7 @@ def light_colours(
         Factors of the channels. Their geometric mean over the views is nearly the same for all
         channels, and the samples' mean albedo is as bright under each as under white.
 
-    A constant to autograd.
+    Not differentiable.
     """
     seen = seen & (radiance > 0).all(dim=2)
     white = radiance.new_ones(radiance.shape[1:])
@@ -45,8 +45,8 @@ def light_colours(
     misfits = []
     for free in (False, True):
         colour, albedo = _fit(chroma, seen & ~test, free)
-        off = (chroma - albedo[:, None] - colour).norm(dim=2).clamp_min(MIN_DEVIATION)
-        misfits.append(torch.where(test, off, torch.nan).nanmedian(dim=0).values)
+        distance = (chroma - albedo[:, None] - colour).norm(dim=2).clamp_min(MIN_DEVIATION)
+        misfits.append(torch.where(test, distance, torch.nan).nanmedian(dim=0).values)
     if not predicts_better(misfits[1], misfits[0]):
         return white
     colour, albedo = _fit(chroma, seen, True)
@@ -58,24 +58,24 @@ def light_colours(
 def exposures(
     radiance: Float[Tensor, "sample view"], seen: Bool[Tensor, "sample view"]
 ) -> Float[Tensor, " view"]:
-    """Find how bright each view is, in powers of two, relative to the median of them.
+    """Return the brightness of each view, as a power of two, relative to the median view.
 
-    Radiance over it has residuals of like size in all views, so that an under-exposed photograph
-    counts as much as others. All are 1 where lights are of like strength.
+    Radiance over it has residuals of similar size in all views, so an under-exposed photograph
+    counts as much as others. All are 1 if the strengths of lights are similar.
 
     Args:
         radiance: Gray, linear. Entries that are not seen are ignored.
         seen: False where missing.
 
-    A constant to autograd.
+    Not differentiable.
     """
     seen = seen & (radiance > 0)
     if not seen.any():
         return radiance.new_ones(radiance.shape[1])
     brightness = radiance.double().where(seen, 1).log2()[..., None]
     stops = _fit(brightness, seen, True)[0][:, 0]
-    shown = seen.any(dim=0)
-    stops = torch.where(shown, stops - stops[shown].median(), 0)
+    observed = seen.any(dim=0)
+    stops = torch.where(observed, stops - stops[observed].median(), 0)
     if bool((stops.abs() < _SAME_STOPS).all()):
         return radiance.new_ones(radiance.shape[1])
     return stops.round().clamp_min(-_MOST_STOPS).exp2().to(radiance)
@@ -84,7 +84,7 @@ def exposures(
 def _fit(
     chroma: Float[Tensor, "sample view channel"], seen: Bool[Tensor, "sample view"], free: bool
 ) -> tuple[Float[Tensor, "view channel"], Float[Tensor, "sample channel"]]:
-    """Fit the terms of views, of zero mean, and of samples by robust least squares.
+    """Fit a term per view, with zero mean, and a term per sample, by robust least squares.
 
     Args:
         chroma: Logarithms, of any number of channels.
@@ -100,7 +100,7 @@ def _fit(
             colour = torch.linalg.pinv(matrix, hermitian=True) @ side
             colour = colour - colour.mean(dim=0)
         albedo = torch.einsum("sv,svc->sc", weight, chroma - colour) / total
-        off = (chroma - albedo[:, None] - colour).norm(dim=2) * seen
-        scale = CAUCHY_TUNING * robust_deviation(off.mT, seen.mT).clamp_min(MIN_DEVIATION)
-        weight = seen * cauchy_weights(off, scale)
+        distance = (chroma - albedo[:, None] - colour).norm(dim=2) * seen
+        scale = CAUCHY_TUNING * robust_deviation(distance.mT, seen.mT).clamp_min(MIN_DEVIATION)
+        weight = seen * cauchy_weights(distance, scale)
     return colour, albedo

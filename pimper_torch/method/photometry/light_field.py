@@ -1,9 +1,9 @@
 r"""Light that varies over the scene: a point light and spherical harmonics in every view.
 
-Under distant light of any distribution the radiance of a convex Lambertian surface is, to
-first order, :math:`x = \rho\, l^\top (1, n)`: albedo, four coefficients of the light, the normal.
-The constants of the real harmonics are folded into ``l``. Second order adds five coefficients, and
-is 99 % of the energy in place of 88 %.
+Under distant light of any distribution the radiance of a convex Lambertian surface is, to first
+order, :math:`x = \rho\, l^\top (1, n)`, with albedo, four coefficients of the light, and normal.
+``l`` includes the constants of the real harmonics. Second order adds five coefficients, and has
+99 % of the energy instead of 88 %.
 
 Source: Basri & Jacobs, PAMI 25(2), 2003; Ramamoorthi & Hanrahan, JOSA A 18(10), 2001.
 """
@@ -29,13 +29,13 @@ def harmonics(normals: Vectors) -> Float[Tensor, "*batch 4"]:
 
 
 def second_harmonics(normals: Vectors) -> Float[Tensor, "*batch 5"]:
-    """Return the harmonics of second order, ``(xy, yz, xz, x^2 - y^2, 3 z^2 - 1)``."""
+    """Return the second-order harmonics ``(xy, yz, xz, x^2 - y^2, 3 z^2 - 1)``."""
     x, y, z = normals.unbind(dim=-1)
     return torch.stack([x * y, y * z, x * z, x**2 - y**2, 3 * z**2 - 1], dim=-1)
 
 
 def linearized(lights: Float[Tensor, "view 9"], normals: Points) -> Float[Tensor, "point view 4"]:
-    r"""Return first-order lights that shade as second-order ones do near given normals.
+    r"""Return first-order lights with the same shading as second-order ones near given normals.
 
     The harmonics of second order are quadratic forms: :math:`n^\top Q n` is
     :math:`2 (Q n_0)^\top n - n_0^\top Q n_0` up to the square of :math:`n - n_0`.
@@ -51,10 +51,10 @@ def linearized(lights: Float[Tensor, "view 9"], normals: Points) -> Float[Tensor
 def rotate_lights(
     target_from_source: Float[Tensor, "*#batch 4 4"], lights: Float[Tensor, "*#batch view 4"]
 ) -> Float[Tensor, "*batch view 4"]:
-    """Transform lights to another frame: ``l_0`` stays, the vector part rotates as normals do.
+    """Return lights in the target frame: ``l_0`` is unchanged, the vector part rotates.
 
-    Shading is the same in every frame: ``l . (1, n)`` with both in the source frame equals
-    it with both in the target frame. Only the rotation of the rigid transform matters.
+    Shading ``l . (1, n)`` is the same in both frames. Only the rotation of the rigid transform
+    matters.
     """
     rotated = lights[..., 1:] @ target_from_source[..., :3, :3].mT
     return torch.cat([lights[..., :1].expand_as(rotated[..., :1]), rotated], dim=-1)
@@ -70,23 +70,23 @@ _MIN_COSINE = 0.05
 class LightField(Record):
     r"""The light at every point of the scene, in every view.
 
-    A surface at ``x`` with normal ``n`` and albedo 1 shows
+    The radiance of a surface at ``x`` with normal ``n`` and albedo 1 is
 
     .. math:: s \cdot h(n) + \max(0, E(x) \cdot n), \qquad
               E(x) = |e| \frac{e/|e| - c (x - o)}{|e/|e| - c (x - o)|^3}:
 
-    soft light ``s`` (harmonics ``h`` to second order), and a point light in direction ``e`` at
-    distance ``1 / c`` from the origin ``o``, whose irradiance there is ``|e|`` and falls off with
-    the square of the distance.
+    with soft light ``s`` (harmonics ``h`` to second order) and a point light in direction ``e``, at
+    distance ``1 / c`` from the origin ``o``. Its irradiance is ``|e|`` at the origin, and falls off
+    with the square of the distance.
 
     Attributes:
-        soft: Harmonics ``(1, n)`` and those of second order, world.
-        point_light: ``e``; zero for none.
-        closeness: ``c``, the inverse distance; zero for a distant light.
-        origin: World.
-        gain: Of all light: colour times exposure. Radiance over it is gray, and of like strength in
-            all views. 1 if ``None``.
-        exposure: Factor of the lights here that makes them those of the photographs.
+        soft: ``s``: harmonics ``(1, n)`` and those of second order, world.
+        point_light: ``e``, world; zero for none.
+        inverse_distance: ``c``; zero for a distant light.
+        origin: ``o``, world.
+        gain: Colour times exposure of all light. Radiance over it is gray and of similar strength
+            in all views. 1 if ``None``.
+        exposure: Factor from the lights of this record to those of the photographs.
     """
 
     soft: Float[Tensor, "view 9"]
@@ -97,7 +97,7 @@ class LightField(Record):
     exposure: Float[Tensor, " view"] | None = None
 
     def point_light_at(self, points: Points) -> Float[Tensor, "point view 3"]:
-        """Return ``E``, the direction to the point light times its irradiance."""
+        """Return ``E``, the direction to the point light times its irradiance; world."""
         strength = self.point_light.norm(dim=1)
         direction = self.point_light / torch.where(strength > 0, strength, 1)[:, None]
         away = direction - self.inverse_distance[:, None] * (points - self.origin)[:, None]
@@ -105,7 +105,7 @@ class LightField(Record):
         return strength[:, None] * away / torch.where(strength[:, None] > 0, distance, 1) ** 3
 
     def lights_at(self, points: Points, normals: Points) -> Float[Tensor, "point view 4"]:
-        """Return first-order light near normals that face the point light; world frame."""
+        """Return first-order light near normals that face the point light; world."""
         point_light, soft = self.point_light_at(points), linearized(self.soft, normals)
         return torch.cat([soft[..., :1], soft[..., 1:] + point_light], dim=-1)
 
@@ -113,8 +113,8 @@ class LightField(Record):
 def faces_light(
     point_light: Float[Tensor, "patch view 3"], normals: Float[Tensor, "patch sample 3"]
 ) -> Bool[Tensor, "patch view sample"]:
-    """Find where the surface faces the point light; true everywhere in a view without one.
+    """Return whether samples face the point light; true in views without one.
 
-    Elsewhere it is in attached shadow, where shading is not linear in ``(1, n)``.
+    Other samples are in attached shadow, where shading is not linear in ``(1, n)``.
     """
     return point_light @ normals.mT >= _MIN_COSINE * point_light.norm(dim=2, keepdim=True)

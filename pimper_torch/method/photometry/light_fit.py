@@ -1,7 +1,7 @@
 """Lights and albedo fitted jointly to radiance under known normals.
 
-By damped Gauss-Newton (Levenberg-Marquardt) on both, albedos eliminated by the Schur complement,
-with Cauchy's loss; gradients by the implicit function theorem at the optimum.
+The solver is damped Gauss-Newton (Levenberg-Marquardt) with Cauchy's loss, and eliminates albedos
+by the Schur complement. Gradients are by the implicit function theorem at the optimum.
 """
 
 import math
@@ -19,13 +19,13 @@ from pimper_torch.method.photometry import light_models
 from pimper_torch.method.photometry.light_models import ImageSamples, LightModel, Unknowns
 
 # A fit has converged when a step lowers its cost by less than this fraction: a choice. The second
-# is the limit of iterations and the fraction where gradients are required, from which Newton's
-# method converges to rounding (`tests/photometry/test_factor_gradients.py`).
+# constant is the limit of iterations and the fraction if gradients are required, from which
+# Newton's method converges to rounding (`tests/photometry/test_factor_gradients.py`).
 _MIN_GAIN, _TO_CONVERGENCE = 1e-7, (300, 1e-13)
 
-# Newton's steps at most, the smallest fraction of one in the line search, and the step, over the
-# unknowns, that ends them: choices; near the solution every step doubles the correct digits.
-_NEWTON_STEPS, _MIN_STEP, _CLOSE = 12, 0.05, 1e-12
+# Maximum number of Newton steps, smallest fraction of a step in the line search, and relative step
+# at which they end: choices; near the solution every step doubles the correct digits.
+_NEWTON_STEPS, _MIN_STEP, _CONVERGED = 12, 0.05, 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,27 +36,24 @@ class LightFit:
     lights: light_models.Parameters
     albedo: light_models.Albedo
 
-    def misfit(self, samples: ImageSamples, some: light_models.Seen) -> Float[Tensor, " view"]:
-        """Return the median residual of some samples, in brightnesses of their views.
-
-        NaN in views that have none of them.
-        """
+    def misfit(self, samples: ImageSamples, mask: light_models.Seen) -> Float[Tensor, " view"]:
+        """Return each view's median residual in the mask over its mean radiance; NaN if empty."""
         residual = samples.radiance - self.albedo[:, None] * self.model.shade(self.lights)
-        relative = residual.abs() / samples.level.clamp_min(1e-300)
-        missing = torch.where(some, relative.clamp_min(MIN_DEVIATION), torch.nan)
-        return missing.nanmedian(dim=0).values
+        relative = residual.abs() / samples.mean_radiance.clamp_min(1e-300)
+        masked = torch.where(mask, relative.clamp_min(MIN_DEVIATION), torch.nan)
+        return masked.nanmedian(dim=0).values
 
 
 def fit_lights(
     model: LightModel, samples: ImageSamples, iterations: int, start: Unknowns | None = None
 ) -> LightFit:
-    """Fit a model's lights and the samples' albedo; a constant to autograd.
+    """Return the fit of a model's lights and the samples' albedo. Not differentiable.
 
-    Where gradients are required, it iterates to convergence: see :func:`with_gradients`.
+    If gradients are required, it iterates to convergence, for :func:`with_gradients`.
 
     Args:
-        iterations: At most, where no gradients are required.
-        start: Lights and albedo; by default, see :meth:`LightModel.initialize`.
+        iterations: Maximum number if gradients are not required.
+        start: Initial lights and albedo; by default those of :meth:`LightModel.initialize`.
     """
     from pimper_torch.ground.kernels.lights_and_albedo import TILE, fit
 
@@ -65,37 +62,38 @@ def fit_lights(
         lights, albedo = start or model.initialize(samples)
         count, device, padding = len(albedo), albedo.device, (0, -len(albedo) % TILE)
         lights = model.clamp(lights).cpu().clone(memory_format=torch.contiguous_format)
-        known, radiance, seen = (
+        inputs, radiance, seen = (
             pad(each.detach().mT.to(lights), padding).contiguous().numpy()
             for each in (torch.cat(model.geometry(), dim=1), samples.radiance, samples.seen)
         )
-        albedo, level = pad(albedo.cpu(), padding), samples.level.detach().cpu().numpy()
+        albedo, mean = pad(albedo.cpu(), padding), samples.mean_radiance.detach().cpu().numpy()
         closest = 1 / light_models.MIN_DISTANCE
-        # Jointly: alternation converges slowly along the valley of lights and albedo.
-        fit(known, radiance, seen, level, closest, limit, min_gain, lights.numpy(), albedo.numpy())
+        # A joint fit: alternation converges slowly along the valley of lights and albedo.
+        fit(inputs, radiance, seen, mean, closest, limit, min_gain, lights.numpy(), albedo.numpy())
     return LightFit(model=model, lights=lights.to(device), albedo=albedo[:count].to(device))
 
 
 def _requires_grad(model: LightModel, samples: ImageSamples) -> bool:
-    parts = (samples.radiance, *model.geometry())
-    return torch.is_grad_enabled() and any(part.requires_grad for part in parts)
+    tensors = (samples.radiance, *model.geometry())
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
-def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
-    """Make the fit differentiable in photographs and geometry, if gradients are required.
+def with_gradients(fit: LightFit, samples: ImageSamples) -> LightFit:
+    """Return the fit, differentiable in photographs and geometry if gradients are required.
 
-    By the implicit function theorem, at the nearest stationary point: a Newton step from there, of
-    constant derivatives, has length zero and the gradient. Light and albedo share a free factor:
-    the largest parameter of the lights is fixed, and so are parameters at a bound or without data.
+    Gradients are by the implicit function theorem at the nearest stationary point: a Newton step
+    from there, with constant derivatives, has length zero and the gradient. Light and albedo share
+    a free factor, so the largest parameter of the lights is fixed. Parameters at a bound or without
+    data are fixed as well.
     """
-    if not _requires_grad(found.model, samples):
-        return found
-    model = found.model
+    if not _requires_grad(fit.model, samples):
+        return fit
+    model = fit.model
     with torch.no_grad():
-        fixed = ~model.inside_bounds(found.lights)
-        largest = torch.where(fixed, 0, found.lights.abs()).argmax()
+        fixed = ~model.inside_bounds(fit.lights)
+        largest = torch.where(fixed, 0, fit.lights.abs()).argmax()
         fixed = fixed.flatten().index_fill(0, largest, value=True).reshape(fixed.shape)
-        lights, albedo, solve = found.lights, found.albedo, None
+        lights, albedo, solve = fit.lights, fit.albedo, None
         on_lights, on_albedo = _descent(model, samples, lights, albedo)
         fraction = 1.0
         for _ in range(_NEWTON_STEPS):
@@ -103,11 +101,11 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
             by_lights, by_albedo = solve(on_lights, on_albedo)
             trial = lights + fraction * by_lights, albedo + fraction * by_albedo
             after = _descent(model, samples, *trial)
-            # In units of the unknowns, as bounds and missing data leave some of the gradient.
+            # Compared in units of the unknowns, as bounds and missing data leave a gradient.
             if _length(solve(*after)) < _length((by_lights, by_albedo)):
                 (lights, albedo), (on_lights, on_albedo) = trial, after
                 solve, fraction = None, min(1.0, 2 * fraction)
-                if _length((by_lights, by_albedo)) <= _CLOSE * _length((lights, albedo)):
+                if _length((by_lights, by_albedo)) <= _CONVERGED * _length((lights, albedo)):
                     break
             elif (fraction := fraction / 2) < _MIN_STEP:
                 break
@@ -121,7 +119,7 @@ def with_gradients(found: LightFit, samples: ImageSamples) -> LightFit:
 
 
 def _length(step: Unknowns) -> float:
-    return math.hypot(*(float(part.norm()) for part in step))
+    return math.hypot(*(float(unknowns.norm()) for unknowns in step))
 
 
 def _descent(
@@ -145,16 +143,17 @@ def _newton_matrix(
     albedo: light_models.Albedo,
     fixed: Bool[Tensor, "view parameter"],
 ) -> Callable[[Tensor, Tensor], Unknowns]:
-    """Factor the exact derivative of :func:`_descent`, negative; albedos are eliminated (Schur).
+    """Factor the exact negative derivative of :func:`_descent`; albedos are eliminated (Schur).
 
-    Each view's scale depends on its residuals, which adds a matrix of a rank of one a view
+    The scale of a view depends on its residuals, which adds a matrix of rank one per view
     (Woodbury's formula).
 
     Args:
         fixed: Parameters that do not move.
 
     Returns:
-        Newton's step by right-hand sides of lights and albedos, differentiable in these.
+        Function from right-hand sides of lights and albedos to the Newton step, differentiable in
+        these.
     """
     num_views, size = lights.shape
     shading, jacobian = model.shade(lights), model.jacobian(lights)
@@ -165,23 +164,23 @@ def _newton_matrix(
     slope = albedo[:, None, None] * jacobian
     blocks = (bend[..., None] * slope).permute(1, 2, 0) @ slope.transpose(0, 1)
     blocks = blocks - _second_derivatives(model, lights, weighted * albedo[:, None])
-    own = (bend * shading**2).sum(dim=1)
+    diagonal = (bend * shading**2).sum(dim=1)
     cross = ((bend * shading)[..., None] * slope - weighted[..., None] * jacobian).flatten(1)
-    # A weight depends on the residual over the scale alone.
+    # A weight depends on the residual over the scale only.
     by_scale = (weighted - bend * residual) / torch.where(scale > 0, scale, 1)
     sides = []
     for field in (by_scale, by_residual):
         on_view = torch.einsum("sv,svp->vp", field, slope)
         by_view = torch.diag_embed(on_view.mT).movedim(0, 1)
         sides.append((by_view.flatten(0, 1), field * shading))
-    known = (bend * shading.square()).abs().sum(dim=1)
+    magnitude = (bend * shading.square()).abs().sum(dim=1)
     free = ~fixed & (blocks.diagonal(dim1=1, dim2=2).abs() > 0)
-    moves, samples_move = free.flatten()[:, None], (own > 1e-9 * known)[:, None]
+    moves, samples_move = free.flatten()[:, None], (diagonal > 1e-9 * magnitude)[:, None]
     cross = torch.where(samples_move & moves.mT, cross, 0)
-    inverse = torch.where(samples_move[:, 0], 1 / torch.where(samples_move[:, 0], own, 1), 0)
-    whole = blocks.new_zeros(num_views, size, num_views, size)
-    whole[torch.arange(num_views), :, torch.arange(num_views)] = blocks
-    schur = whole.flatten(2).flatten(0, 1) - cross.mT @ (inverse[:, None] * cross)
+    inverse = torch.where(samples_move[:, 0], 1 / torch.where(samples_move[:, 0], diagonal, 1), 0)
+    dense = blocks.new_zeros(num_views, size, num_views, size)
+    dense[torch.arange(num_views), :, torch.arange(num_views)] = blocks
+    schur = dense.flatten(2).flatten(0, 1) - cross.mT @ (inverse[:, None] * cross)
     ridge = 1e-12 * torch.diag(schur.diagonal().abs())
     schur = torch.where(moves & moves.mT, schur + ridge, torch.eye(len(schur)).to(schur))
     factor = torch.linalg.lu_factor(schur)
@@ -211,7 +210,7 @@ def _second_derivatives(
     if model.normals is None:
         return lights.new_zeros(*lights.shape, lights.shape[1])
     with torch.enable_grad():
-        at = lights.detach().requires_grad_()
-        summed = torch.einsum("sv,svp->pv", weight, model.jacobian(at)).sum(dim=1)
-        rows = [torch.autograd.grad(each, at, retain_graph=True)[0] for each in summed]
+        point = lights.detach().requires_grad_()
+        summed = torch.einsum("sv,svp->pv", weight, model.jacobian(point)).sum(dim=1)
+        rows = [torch.autograd.grad(parameter, point, retain_graph=True)[0] for parameter in summed]
     return torch.stack(rows, dim=1)

@@ -1,11 +1,11 @@
 """Parametric models of each view's light, and the samples that they are fitted to.
 
-Light is spherical harmonics and a near point light. Its parameters are paid for by radiance that
-was left out of the fit.
+Light is spherical harmonics and a near point light. More parameters must reduce residuals of
+radiance that was held out of the fit.
 
-Attached shadows give the fit of a point light's direction many local minima: started along the
-mean normal, it ended 30 to 70 degrees from the point light in six of nine views of a potato on a
-table, with twice the residuals. So it starts from the best of all directions.
+Because of attached shadows, the fit of a point light's direction has many local minima: started
+along the mean normal, it ended 30 to 70 degrees from the point light in six of nine views of a
+potato on a table, with twice the residuals. It therefore starts from the best of all directions.
 """
 
 import math
@@ -21,31 +21,31 @@ from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIAT
 from pimper_torch.ground.linalg.robust import cauchy_weights, robust_deviation
 
 Parameters = Float[Tensor, "view parameter"]
-"""Of a model of each view's light, see :class:`LightModel`."""
+"""Parameters of each view's light, see :class:`LightModel`."""
 Entries = Float[Tensor, "sample view"]
-"""A value for each sample in each view."""
+"""A value of each sample in each view."""
 Seen = Bool[Tensor, "sample view"]
 Albedo = Float[Tensor, " sample"]
 SampleVectors = Float[Tensor, "sample 3"]
 Unknowns = tuple[Parameters, Albedo]
 
-# Residuals have to fall by so many standard errors over the views, 99.7 % confidence, and by this
-# fraction at least, a choice: what won less on glossy scenes was no light.
+# Logarithms of residuals must fall by this number of standard errors over the views, 99.7 %
+# confidence, and by at least this much, a choice: smaller gains on glossy scenes were not light.
 _CONFIDENCE, _LEAST = 3.0, 0.05
 
 
 def left_out(seen: Seen) -> Seen:
-    """Choose what to leave out: of each sample and each view a fifth."""
+    """Return the entries to hold out: a fifth of each sample and of each view."""
     sample, view = (torch.arange(size, device=seen.device) for size in seen.shape)
     return seen & ((sample[:, None] + view) % 5 == 0)
 
 
 def predicts_better(misfit: Float[Tensor, " view"], simpler: Float[Tensor, " view"]) -> bool:
-    """Decide whether a model predicts better than a simpler one, significantly.
+    """Return whether a model predicts significantly better than a simpler one.
 
     Args:
-        misfit: Residuals of what was left out, one a view; NaN where there is none.
-        simpler: Those of the simpler model.
+        misfit: Held-out residual of each view; NaN without data.
+        simpler: The same of the simpler model.
     """
     gain = (simpler / misfit).log()
     gain = gain[gain.isfinite()]
@@ -68,12 +68,12 @@ class ImageSamples:
     seen: Seen
 
     def at(self, index: slice | tuple[slice, slice]) -> "ImageSamples":
-        """Take some samples, or some samples in some views."""
+        """Return a subset of samples, or of samples and views."""
         return ImageSamples(radiance=self.radiance[index], seen=self.seen[index])
 
     @cached_property
-    def level(self) -> Float[Tensor, " view"]:
-        """Mean brightness of each view."""
+    def mean_radiance(self) -> Float[Tensor, " view"]:
+        """Mean radiance of each view."""
         return (self.radiance.sum(dim=0) / self.seen.sum(dim=0).clamp_min(1)).abs()
 
     def residual(self, albedo: Albedo, shading: Entries) -> Entries:
@@ -82,7 +82,7 @@ class ImageSamples:
 
     def scale(self, residual: Entries) -> Float[Tensor, " view"]:
         """Return the scale of Cauchy's loss for each view."""
-        least = MIN_DEVIATION * self.level
+        least = MIN_DEVIATION * self.mean_radiance
         return CAUCHY_TUNING * robust_deviation(residual.mT, self.seen.mT).maximum(least)
 
     def weights(self, residual: Entries, scale: Float[Tensor, " view"]) -> Entries:
@@ -90,13 +90,13 @@ class ImageSamples:
         return self.seen * cauchy_weights(residual, scale)
 
     def brightness(self) -> tuple[Float[Tensor, " view"], Albedo]:
-        """Return median radiance of each view, and of each sample relative to its views."""
+        """Return the median radiance of each view, and of each sample relative to its views."""
         missing = torch.where(self.seen, self.radiance, torch.nan)
         gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
-        known = self.seen & (gain > 0)
-        ratio = torch.where(known, self.radiance / gain.clamp_min(1e-300), torch.nan)
+        valid = self.seen & (gain > 0)
+        ratio = torch.where(valid, self.radiance / gain.clamp_min(1e-300), torch.nan)
         albedo = ratio.nanmedian(dim=1).values.nan_to_num(nan=0.0)
-        return gain, torch.where(known.any(dim=1), albedo, 0)
+        return gain, torch.where(valid.any(dim=1), albedo, 0)
 
     def albedo_under(self, shading: Entries, weight: Entries) -> Albedo:
         """Return the weighted least-squares albedo under a shading; NaN without weight."""
@@ -105,33 +105,32 @@ class ImageSamples:
         return torch.where(square > 0, product / torch.where(square > 0, square, 1), torch.nan)
 
 
-# Directions, 10 degrees apart; samples at most; and iterations of the weights, which samples in
-# cast shadow lose, and of albedo: no direction changed after the third.
+# Number of directions, 10 degrees apart; maximum number of samples; iterations of albedo and of the
+# weights, which are low in cast shadow: no direction changed after the third.
 _DIRECTIONS, _SAMPLES, _ITERATIONS = 400, 2000, 3
 
-# Among directions whose costs differ by less than this fraction of the radiance's energy, the one
-# nearest to the mean normal is taken, as where the samples lie in a plane. A point light weaker
-# than this fraction of the ambient light counts as none: albedo alone explains the radiance. A
-# choice.
+# Of directions whose costs differ by less than this fraction of the radiance's energy, as for
+# coplanar samples, the one nearest to the mean normal is selected. A point light weaker than this
+# fraction of the ambient light counts as absent, as albedo alone explains the radiance. A choice.
 _TIE = 1e-3
 
 
 def search_point_lights(
     samples: ImageSamples, normals: SampleVectors
 ) -> tuple[Float[Tensor, "view 4"], Albedo]:
-    r"""Search the direction of each view's point light, taken to be distant.
+    r"""Return each view's point light, assumed to be distant, by a search over directions.
 
     For albedo initialized by the samples' brightest views, ambient light :math:`a` and the point
     light's strength :math:`s` minimize
     :math:`\sum_i w_i (x_i - \rho_i (a + s \max(0, n_i \cdot d)))^2` in closed form for every
-    direction :math:`d`. The best direction is taken; then weights and albedo are updated.
+    direction :math:`d`. The best direction is selected; then weights and albedo are updated.
 
     Args:
         normals: Unit, world.
 
     Returns:
         Ambient light, not negative, and the point light's irradiance vector, for each view; and
-        the samples' albedo. A constant to autograd.
+        the samples' albedo. Not differentiable.
     """
     stride = -(-len(normals) // _SAMPLES)
     subset = samples.at(slice(None, None, stride))
@@ -141,7 +140,7 @@ def search_point_lights(
     mean_direction = mean / mean.norm().clamp_min(1e-12)
     off_mean = _TIE * (1 - directions @ mean_direction)
     missing = torch.where(subset.seen, subset.radiance, torch.nan)
-    # A sample is taken to be lit in more than a fifth of the views.
+    # Assumes that a sample is lit in more than a fifth of the views.
     albedo = missing.nanquantile(0.8, dim=1).nan_to_num(nan=0.0)
     weight = subset.seen.to(normals)
     for _ in range(_ITERATIONS):
@@ -175,40 +174,40 @@ def _fit_directions(
     """Return ambient light, strength and sum of squared residuals for every direction."""
     J = samples.radiance
     lit = albedo[:, None] * facing
-    own = (weight * albedo[:, None] ** 2).sum(dim=0)[:, None]
+    ambient_square = (weight * albedo[:, None] ** 2).sum(dim=0)[:, None]
     cross = (weight * albedo[:, None]).mT @ lit
     square = weight.mT @ lit**2
     on_ambient = (weight * J * albedo[:, None]).sum(dim=0)[:, None]
     on_light = (weight * J).mT @ lit
     tiny = torch.finfo(J.dtype).tiny
-    determinant = own * square - cross**2
-    known = determinant > 1e-9 * own * square
+    determinant = ambient_square * square - cross**2
+    independent = determinant > 1e-9 * ambient_square * square
     ambient = (on_ambient * square - on_light * cross) / determinant.clamp_min(tiny)
-    # One of them alone where they are collinear, or where the other would be negative.
-    ambient = torch.where(known, ambient, 0).clamp_min(0)
+    # Only one of the two if they are collinear, or if the other would be negative.
+    ambient = torch.where(independent, ambient, 0).clamp_min(0)
     strength = ((on_light - ambient * cross) / square.clamp_min(tiny)).clamp_min(0)
     dark = (strength == 0) | (square <= tiny)
     strength = torch.where(dark, 0, strength)
-    ambient = torch.where(dark, on_ambient / own.clamp_min(tiny), ambient)
-    explained = 2 * (ambient * on_ambient + strength * on_light)
-    used = ambient**2 * own + 2 * ambient * strength * cross + strength**2 * square
-    return ambient, strength, (weight * J**2).sum(dim=0)[:, None] - explained + used
+    ambient = torch.where(dark, on_ambient / ambient_square.clamp_min(tiny), ambient)
+    linear = 2 * (ambient * on_ambient + strength * on_light)
+    quadratic = ambient**2 * ambient_square + 2 * ambient * strength * cross + strength**2 * square
+    return ambient, strength, (weight * J**2).sum(dim=0)[:, None] - linear + quadratic
 
 
 # Initial and minimum distance of a point light, in mean distances of the samples from their
-# centroid: choices; inside the scene its irradiance has a pole.
+# centroid: choices; its irradiance has a pole, which must be outside the scene.
 _FIRST_DISTANCE, MIN_DISTANCE = 10.0, 1.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightModel:
-    """Soft light, constant over the scene, and a point light or none.
+    """Soft light, constant over the scene, with or without a point light.
 
-    Parameters of a view: coefficients of the soft light; then, of the point light, irradiance
-    vector and inverse distance at the centroid.
+    Parameters of a view: coefficients of the soft light; then irradiance vector and inverse
+    distance of the point light at the centroid.
 
     Attributes:
-        basis: Spherical harmonics of the normals, or a mixture of them.
+        basis: Spherical harmonics of the normals, or linear combinations of these.
         normals: Unit; ``None`` without point light.
         points: Relative to the centroid, in units of the scene's size.
     """
@@ -218,12 +217,12 @@ class LightModel:
     points: SampleVectors | None = None
 
     def geometry(self) -> tuple[Tensor, ...]:
-        """List the tensors that the model is a function of."""
-        parts = self.basis, self.normals, self.points
-        return tuple(part for part in parts if part is not None)
+        """Return the tensors that the model is a function of."""
+        tensors = self.basis, self.normals, self.points
+        return tuple(tensor for tensor in tensors if tensor is not None)
 
     def inside_bounds(self, lights: Parameters) -> Bool[Tensor, "view parameter"]:
-        """Find parameters that are not at a bound."""
+        """Return whether parameters are not at a bound."""
         inside = torch.ones_like(lights) > 0
         inside[:, 0] = lights[:, 0] > 0
         if self.points is not None:
@@ -233,8 +232,8 @@ class LightModel:
     def initialize(self, samples: ImageSamples) -> Unknowns:
         """Return initial lights and albedo.
 
-        Soft light is along the mean normal with the views' median brightness. Of ambient and a
-        point light see :func:`search_point_lights`.
+        Soft light is along the mean normal, with the median radiance of each view. Ambient and
+        point light are those of :func:`search_point_lights`.
         """
         if self.normals is None:
             gain, albedo = samples.brightness()
@@ -254,27 +253,27 @@ class LightModel:
         return soft + strength * facing.clamp_min(0) / distance**3
 
     def jacobian(self, lights: Parameters) -> Float[Tensor, "sample view parameter"]:
-        """Return the derivatives of :meth:`shade` by the view's parameters."""
+        """Return the derivatives of :meth:`shade` by the parameters of the view."""
         by_soft = self.basis[:, None].expand(-1, len(lights), -1)
         if self.normals is None or self.points is None:
             return by_soft
         strength, direction, away, distance = self._geometry(lights)
         facing = (self.normals[:, None] * away).sum(dim=-1)
         fall = distance**-3
-        # Of n.v / |v|^3 by v; v = d - c x, and d rotates with the part of e across it.
+        # Derivative of n.v / |v|^3 by v; v = d - c x, and changes of e across d rotate d.
         by_away = fall[..., None] * (
             self.normals[:, None] - 3 * (facing / distance**2)[..., None] * away
         )
         along = (by_away * direction).sum(dim=-1, keepdim=True)
         by_point_light = (facing * fall)[..., None] * direction + by_away - along * direction
-        by_closeness = -strength * (by_away * self.points[:, None]).sum(dim=-1)
+        by_inverse = -strength * (by_away * self.points[:, None]).sum(dim=-1)
         lit = (facing > 0).to(facing)
         return torch.cat(
-            [by_soft, lit[..., None] * by_point_light, (lit * by_closeness)[..., None]], dim=-1
+            [by_soft, lit[..., None] * by_point_light, (lit * by_inverse)[..., None]], dim=-1
         )
 
     def clamp(self, lights: Parameters) -> Parameters:
-        """Project on the bounds: no negative ambient light, no point light inside the scene."""
+        """Return lights within bounds: ambient not negative, no point light inside the scene."""
         ambient = lights[:, :1].clamp_min(0)
         if self.points is None:
             return torch.cat([ambient, lights[:, 1:]], dim=1)

@@ -18,14 +18,14 @@ class FitLightConfig:
     Attributes:
         model: ``"soft"``, first-order harmonics per view, constant over the scene;
             ``"point_light"``, ambient light and a near point light with attached shadows;
-            ``"room"``, a near point light in a room that is lit, whose light is second-order
-            harmonics shared by the views up to exposure; ``"auto"``, the simplest that predicts
-            radiance left out of the fit.
-        colours: Whether views may have light of unlike colour, where that predicts radiance left
-            out of the fit, and be exposed unlike by 1.5 stops or more.
-        shadows: Whether the surface casts shadows, whose samples the factorization leaves out.
-            Needs a surface that is nearly right.
-        min_views: Views a sample must be seen in.
+            ``"room"``, a near point light in a lit room, whose light is second-order harmonics
+            shared by the views up to exposure; ``"auto"``, the simplest model that predicts
+            held-out radiance.
+        colours: Whether views may differ in the colour of their light, if that predicts held-out
+            radiance better, and in exposure by 1.5 stops or more.
+        shadows: Whether the surface casts shadows, whose samples the factorization excludes.
+            Requires a nearly correct surface.
+        min_views: Number of views a sample must be seen in.
     """
 
     model: _Model = "auto"
@@ -50,21 +50,21 @@ class FactorizeConfig:
         solver: ``"variable-projection"``, damped Gauss-Newton on the lights with shading
             eliminated; ``"balm"``, augmented Lagrangian.
         light_prior: Weight of the prior of each patch's lights, whose mean is the light field, in
-            units of the patch's own data; 0 leaves them free, 1e6 fixes them.
-        geometry_weight: Weight of the prior of normals, whose mean is the coarse ones, in units
+            units of the patch's data; 0 leaves them free, 1e6 fixes them.
+        geometry_weight: Weight of the prior of normals, whose mean is the coarse normals, in units
             of one view.
-        loss: ``"cauchy"``, by which highlights and shadows lose weight; ``"geman-mcclure"``, by
-            which they lose it faster; ``"huber"``, more slowly; ``"squares"``; or another name in
+        loss: ``"cauchy"`` downweights highlights and shadows, ``"geman-mcclure"`` more strongly,
+            ``"huber"`` less; ``"squares"`` does not. Other names can be added to
             :data:`~pimper_torch.method.photometry.factorize.LOSSES`.
-        loss_scale: Of the loss, in standard deviations of the patch's residuals; 0 for that at
-            which it is 95 % efficient on Gaussian noise.
-        min_views: Views a sample must be lit in; its unknowns are albedo and two angles,
-            and the lights take their share.
+        loss_scale: Scale of the loss, in standard deviations of the patch's residuals; 0 for the
+            scale of 95 % efficiency on Gaussian noise.
+        min_views: Number of views a sample must be lit in. Its unknowns are albedo and two angles,
+            and the lights use up further degrees of freedom.
         min_light_variation: Minimum third singular value of a patch's lights, over the first;
             about the smaller extent, in radians, of the light's directions.
-        max_iterations: Of the solver.
-        tolerance: Relative change at which a patch has converged: of its objective with variable
-            projection, of its shading vectors with BALM.
+        max_iterations: Maximum number of iterations of the solver.
+        tolerance: Relative change at which a patch has converged: of its objective for variable
+            projection, of its shading vectors for BALM.
     """
 
     solver: _Solver = "variable-projection"

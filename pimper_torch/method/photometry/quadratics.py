@@ -1,8 +1,8 @@
-"""Batched small symmetric systems in packed form: weighted least squares, sample by sample.
+"""Batched small symmetric systems in packed form: weighted least squares per sample.
 
-A symmetric n x n matrix is stored as its upper triangle, row by row, in the last axis but
-one: 10 entries for n = 4. Millions of them are assembled by one matrix product, and solved by
-elementwise arithmetic, without a library call each.
+A symmetric n x n matrix is stored as its upper triangle, row by row, in the second to last axis:
+10 entries for n = 4. One matrix product assembles millions of them, and elementwise arithmetic
+solves them, without a library call for each.
 """
 
 from collections.abc import Sequence
@@ -44,19 +44,19 @@ def unpacked(packed: Packed, size: int) -> Float[Tensor, "*batch item size size"
 
 
 def apply_packed(packed: Packed, vectors: Columns) -> Columns:
-    """Multiply each packed matrix with its vector."""
-    entries, parts = packed.unbind(dim=-2), vectors.unbind(dim=-2)
-    rows, columns = _triangle(len(parts))
-    total = [torch.zeros_like(parts[0] * entries[0])] * len(parts)
+    """Return the product of each packed matrix with its vector."""
+    entries, components = packed.unbind(dim=-2), vectors.unbind(dim=-2)
+    rows, columns = _triangle(len(components))
+    total = [torch.zeros_like(components[0] * entries[0])] * len(components)
     for entry, row, column in zip(entries, rows, columns, strict=True):
-        total[row] = torch.addcmul(total[row], entry, parts[column])
+        total[row] = torch.addcmul(total[row], entry, components[column])
         if row != column:
-            total[column] = torch.addcmul(total[column], entry, parts[row])
+            total[column] = torch.addcmul(total[column], entry, components[row])
     return torch.stack(total, dim=-2)
 
 
 def dot(first: Columns, second: Columns) -> Float[Tensor, "*batch item"]:
-    """Return inner products; several times as fast as a sum over the axis."""
+    """Return inner products, several times faster than a sum over the axis."""
     total = torch.zeros_like(second[..., 0, :])
     for a, b in zip(first.unbind(dim=-2), second.unbind(dim=-2), strict=True):
         total = torch.addcmul(total, a, b)
@@ -87,16 +87,16 @@ def congruence(packed: Packed, columns: list[Columns]) -> Components:
 
 
 def solve_packed(packed: Packed, rhs: Columns) -> Columns:
-    """Solve symmetric positive systems by Cholesky, in float64; see :class:`PackedCholesky`."""
+    """Return solutions of symmetric positive systems; see :class:`PackedCholesky`."""
     return PackedCholesky(packed, rhs.shape[-2]).solve(rhs)
 
 
 class PackedCholesky:
     """Factors ``A = C C^T`` of many small symmetric positive matrices, in float64.
 
-    Pivots below rounding of the matrix's trace are raised to that, 1e-12 of it in float64, so that
-    solutions of singular systems stay finite. A zero matrix, or one whose trace underflows, is
-    taken for the identity. Differentiable.
+    Pivots are at least the rounding error of the matrix's trace, 1e-12 of it in float64, so
+    solutions of singular systems are finite. A zero matrix, or one whose trace underflows, is
+    treated as the identity. Differentiable.
     """
 
     def __init__(self, packed: Packed, size: int) -> None:
@@ -128,7 +128,7 @@ class PackedCholesky:
         return torch.stack(solution, dim=-2).to(rhs.dtype)
 
     def whiten(self, rows: Sequence[Float[Tensor, "*batch item"]]) -> list[Tensor]:
-        """Return ``C^-1 b`` row by row in float64; inner products of these are ``b^T A^-1 b'``."""
+        """Return the rows of ``C^-1 b``, float64; their inner products are ``b^T A^-1 b'``."""
         forward: list[Tensor] = []
         for i, row in enumerate(rows):
             value = row.double()

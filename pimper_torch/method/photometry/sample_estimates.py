@@ -1,4 +1,4 @@
-"""Samples in rows, from rasters and back; their albedo, normal and variance, lights given."""
+"""Flattened samples of rasters; their albedo, normal and variance for given lights."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class FlatSamples(Record):
     """The samples inside each patch's template, flattened and padded to the longest.
 
     Attributes:
-        index: Of each sample in the flattened raster; padding indexes samples outside
+        index: Index of each sample in the flattened raster; padding indexes samples outside
             the template.
         radiance: Linear; zero where missing.
         seen: ``D``; false where radiance is not finite.
@@ -30,25 +30,25 @@ class FlatSamples(Record):
     seen: Bool[Tensor, "patch view sample"]
     normals: Float[Tensor, "patch sample 3"]
 
-    def only(self, some: Bool[Tensor, "patch view sample"]) -> "FlatSamples":
-        """Take all others as missing."""
-        seen = self.seen & some
+    def only(self, mask: Bool[Tensor, "patch view sample"]) -> "FlatSamples":
+        """Return the samples with those outside the mask missing."""
+        seen = self.seen & mask
         return self.replace(seen=seen, radiance=torch.where(seen[:, :, None], self.radiance, 0))
 
 
 def gather_samples(
     templates: Templates, registered: Observations, normals: PatchVectors
 ) -> FlatSamples:
-    """Gather the samples inside each template."""
+    """Return the samples inside each template, flattened."""
     inside = templates.inside.flatten(1)
     longest = max(int(inside.sum(dim=1).max()), 1) if len(inside) else 1
     index = torch.argsort((~inside).to(torch.uint8), dim=1, stable=True)[:, :longest]
-    within = inside.gather(1, index)
+    not_padding = inside.gather(1, index)
     num_views, num_channels = registered.radiance.shape[1:3]
     by_channel = index[:, None, None].expand(-1, num_views, num_channels, -1)
     radiance = registered.radiance.flatten(3).gather(3, by_channel)
-    seen = flatten_samples(registered.valid, index) & within[:, None]
-    # A sum is finite where all its terms are, but for overflow.
+    seen = flatten_samples(registered.valid, index) & not_padding[:, None]
+    # Except for overflow, a sum is finite if all its terms are.
     seen = seen & radiance.sum(dim=2).isfinite()
     return FlatSamples(
         index=index,
@@ -61,23 +61,23 @@ def gather_samples(
 def flatten_samples(
     raster: Shaped[Tensor, "patch view height width"], index: Int[Tensor, "patch sample"]
 ) -> Shaped[Tensor, "patch view sample"]:
-    """Take the samples of a row from their rasters."""
+    """Return the samples at flat indices of their rasters."""
     flat = raster.flatten(2)
     return flat.gather(2, index[:, None].expand(-1, flat.shape[1], -1))
 
 
 def scatter_samples(
-    row: Float[Tensor, "patch sample *channel"] | Bool[Tensor, "patch sample"],
+    samples: Float[Tensor, "patch sample *channel"] | Bool[Tensor, "patch sample"],
     index: Int[Tensor, "patch sample"],
     background: Float[Tensor, "patch height width *channel"] | PatchMask,
 ) -> Float[Tensor, "patch height width *channel"] | PatchMask:
-    """Scatter a row to its raster, over a background."""
-    expanded = index if row.ndim == 2 else index[..., None].expand_as(row)
-    return background.flatten(1, 2).scatter(1, expanded, row).reshape(background.shape)
+    """Return the raster of flattened samples, with the background elsewhere."""
+    expanded = index if samples.ndim == 2 else index[..., None].expand_as(samples)
+    return background.flatten(1, 2).scatter(1, expanded, samples).reshape(background.shape)
 
 
-# Weight, in views, of the patch's residual variance in that of a sample, whose own residuals are
-# few. A choice: with it the mean estimated variance is right to 2 % (`test_sample_estimates.py`).
+# Weight, in views, of the patch's residual variance in that of a sample, which has few residuals. A
+# choice: with it the error of the mean estimated variance is 2 % (`test_sample_estimates.py`).
 BORROWED_VIEWS = 4.0
 
 
@@ -86,14 +86,14 @@ def refine_on_manifold(
 ) -> tuple[
     Float[Tensor, "patch sample"], Float[Tensor, "patch sample 3"], Float[Tensor, "patch sample"]
 ]:
-    r"""Take a last Gauss-Newton step of each sample, and give its normal's inverse variance.
+    r"""Return samples after a last Gauss-Newton step, with the inverse variance of their normals.
 
     With ``A`` and ``b`` the sample's normal equations and ``B`` the manifold's tangents,
     :math:`\delta = (B^\top A B)^{-1} B^\top (b - A n)`. At a converged solution the step is
     close to zero, and so is its derivative if the factors carry gradients by the implicit
     function (:mod:`~pimper_torch.method.photometry.factor_gradients`).
 
-    The same matrix gives the variance of the normal, the mean square of its angular error:
+    The same matrix determines the variance of the normal, the mean square of its angular error:
     :math:`\sigma^2 = s^2 (C_{11} + C_{22}) / \rho^2` with ``C`` the inverse of
     :math:`B^\top A B` for the tangents that rotate the normal and :math:`s^2` the variance of the
     residuals, the sample's and the patch's pooled. Differentiable in factors and radiance.
@@ -116,22 +116,22 @@ def fit_albedo(
     lights: Lights,
     basis: Shading,
 ) -> Float[Tensor, "patch channel sample"]:
-    """Return every channel's least-squares albedo, lights and normals given.
+    """Return every channel's least-squares albedo for given lights and normals.
 
     Args:
         radiance: Linear.
-        weight: Of each entry, the same for all channels.
+        weight: Weight of each entry, the same for all channels.
         lights: The same for all channels.
         basis: Harmonics of the normals.
 
-    Not negative; zero where no view is lit. Differentiable.
+    It is not negative, and zero where no view is lit. Differentiable.
     """
     shading = lights @ basis
     weighted = weight * shading
     square = (weighted * shading).sum(dim=1)[:, None]
     product = (weighted[:, :, None] * radiance).sum(dim=1)
-    some = square > torch.finfo(square.dtype).tiny ** 0.5
-    return torch.where(some, product / torch.where(some, square, 1), 0).clamp_min(0)
+    lit = square > torch.finfo(square.dtype).tiny ** 0.5
+    return torch.where(lit, product / torch.where(lit, square, 1), 0).clamp_min(0)
 
 
 def initial_shading(
@@ -149,22 +149,22 @@ def _information(
     residual = problem.radiance - factors.lights @ factors.shading
     square = (factors.weight * residual**2).sum(dim=1)
     count = factors.weight.sum(dim=1)
-    # A sample with m views has spent 3 of them on its own albedo and normal.
-    left = (count - 3).clamp_min(0)
-    pooled = square.sum(dim=1) / left.sum(dim=1).clamp_min(1)
-    variance = (square + BORROWED_VIEWS * pooled[:, None]) / (left + BORROWED_VIEWS)
-    robust_deviation = torch.zeros_like(square)
+    # Albedo and normal use 3 degrees of freedom of a sample's views.
+    redundancy = (count - 3).clamp_min(0)
+    pooled = square.sum(dim=1) / redundancy.sum(dim=1).clamp_min(1)
+    variance = (square + BORROWED_VIEWS * pooled[:, None]) / (redundancy + BORROWED_VIEWS)
+    angular = torch.zeros_like(square)
     for angle in (1, 2):
         unit = torch.zeros_like(factors.shading[:, :3])
         unit[:, angle] = 1
-        robust_deviation = robust_deviation + solve_packed(curvature, unit)[:, angle]
+        angular = angular + solve_packed(curvature, unit)[:, angle]
     albedo, _ = problem.manifold.split(factors.shading.mT)
     square = albedo**2
-    # Beyond these the derivative is not in the dtype's range.
+    # Beyond these limits the derivative exceeds the dtype's range.
     kind = torch.finfo(square.dtype)
-    error = variance * robust_deviation / square
-    determined = (robust_deviation > 0) & (square > kind.tiny**0.5) & (error < kind.max**0.5)
-    error = torch.where(determined, variance * robust_deviation, 1)
+    error = variance * angular / square
+    determined = (angular > 0) & (square > kind.tiny**0.5) & (error < kind.max**0.5)
+    error = torch.where(determined, variance * angular, 1)
     error = error / torch.where(determined, square, 1)
-    # Without residuals a normal is known to single precision.
+    # Without residuals the standard error of a normal is single precision.
     return torch.where(determined, 1 / error.clamp_min(1e-7**2), 0)

@@ -16,12 +16,12 @@ from pimper_torch.records import Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Shadows(Record):
-    """Where point lights reach the surface.
+    """Visibility of point lights from the surface.
 
     Attributes:
-        lit: True where the surface faces the point light and nothing occludes it;
+        lit: True where the surface faces the point light and is not occluded;
             true everywhere in a view without a point light.
-        sure: True where no edge of a cast shadow is nearer than the guard.
+        sure: True where every edge of a cast shadow is farther away than the guard.
     """
 
     lit: Bool[Tensor, "*batch view"]
@@ -37,24 +37,24 @@ def cast_shadows(
     guard: float | Float[Tensor, "*#batch"] = 0.0,
     mask: Bool[Tensor, "*batch view"] | None = None,
 ) -> Shadows:
-    """Cast a ray from every sample to the point light of every view.
+    """Return shadows by a ray from every sample to the point light of every view.
 
     Args:
         points: World; on the surface that casts the shadows, or near it.
         normals: Unit, outward.
-        tolerance: Maximum distance of the points from the surface, scene units: rays start so far
-            along the normal, and as far again towards the point light. An object thinner than
-            that casts no shadow on what it touches.
+        tolerance: Maximum distance of the points from the surface, scene units: rays start at this
+            distance along the normal, and the same again towards the point light. An object thinner
+            than that does not cast a shadow on surfaces that it touches.
         guard: Maximum error, along the surface, of the predicted edge of a cast shadow; scene
             units. Above 0, six more rays are cast around each sample that faces the point light,
-            and one that disagrees makes it unsure: no straight edge that near is missed.
-        mask: Where rays are cast; elsewhere everything is lit and sure.
+            and the sample is unsure if one disagrees: this detects every straight edge that near.
+        mask: Where rays are cast; samples elsewhere are lit and sure.
 
     Returns:
-        A sample that is reliably lit is ``lit & sure``. One that faces away from the point
+        A sample that is reliably lit is ``lit & sure``. A sample that faces away from the point
         light is in attached shadow: not lit, and sure.
 
-    A constant to autograd. Ray casting is float32 on the CPU.
+    Not differentiable. Ray casting is float32 on the CPU.
     """
     shape, like = points.shape[:-1], points
     flat, up = points.detach().reshape(-1, 3), normals.detach().reshape(-1, 3)
@@ -94,19 +94,19 @@ def cast_shadows_on_rasters(
     guard: float,
     stride: int = 4,
 ) -> Shadows:
-    """Predict shadows on templates from a sparse raster of rays.
+    """Return shadows on templates, predicted from a sparse raster of rays.
 
-    See :func:`cast_shadows`. A sample without a ray takes the result of the nearest ray; the
-    guard grows by the distance between the two.
+    See :func:`cast_shadows`. A sample without a ray has the result of the nearest ray, and the
+    distance between the two is added to the guard.
 
     Args:
         points: World.
         normals: World, unit, outward.
-        spacing: Of the samples, scene units, as tolerance and guard.
-        seen: In which views rays are cast; elsewhere everything is lit and sure.
+        spacing: Sample spacing, scene units, as tolerance and guard.
+        seen: Where rays are cast; samples elsewhere are lit and sure.
 
     Returns:
-        Of shape ``patch height width view``.
+        Masks of shape ``patch height width view``.
     """
     height, width = points.shape[1:3]
     rows, columns = (
@@ -134,7 +134,7 @@ def cast_shadows_on_rasters(
 def _direction_to_light(
     field: LightField, view: Int[Tensor, "*#batch"], points: Vectors
 ) -> tuple[Vectors, Scalars]:
-    """Return the unit direction to the point light, and its distance, infinite if distant."""
+    """Return the unit direction to the point light, and its distance, which may be infinite."""
     direction = normalize(field.point_light, dim=1).to(points)[view]
     inverse_distance = field.inverse_distance.to(points)[view]
     away = direction - inverse_distance[..., None] * (points - field.origin.to(points))
@@ -160,7 +160,7 @@ def _hexagon(
     normals: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"]
 ) -> Float[Tensor, "sample ring 3"]:
     """Return offsets in the tangent plane: the corners of a hexagon around a circle."""
-    # The axis least aligned with the normal: their cross product does not vanish.
+    # The cross product of the normal with the axis least aligned to it does not vanish.
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
     first_axis = normalize(torch.linalg.cross(axis, normals), dim=1)
     second_axis = torch.linalg.cross(normals, first_axis)

@@ -1,4 +1,4 @@
-"""The status of patches: whether their light determines normals, and the cause if not."""
+"""The status of patches: whether light determines their normals, and the cause if not."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -10,12 +10,12 @@ from torch import Tensor
 from pimper_torch.records import PatchStatus, Photometry
 from pimper_torch.runtime.errors import caution
 
-# Plain sets have up to 0.48: jar 0.48, balls 0.43 and potatoes 0.40 (12 views along the arc,
-# 320x240, fast), the demo 0.28. Half of these facets are at the back, where no view sees them.
-_MOST_UNDETERMINED = 0.6
-_DOUBT = (
-    " If the light did move between the photographs, cameras or silhouettes are wrong: look at "
-    "`overview.png`, and give masks or put a plain cloth behind the object."
+# Fractions of plain sets are up to 0.48: jar 0.48, balls 0.43 and potatoes 0.40 (12 views along the
+# arc, 320x240, fast), the demo 0.28. Half of these facets are at the back, where no view sees them.
+_MAX_UNDETERMINED = 0.6
+_IF_LIGHT_MOVED = (
+    " If the light did move between photographs, cameras or silhouettes are wrong: check "
+    "`overview.png`, and provide masks or put a plain cloth behind the object."
 )
 
 
@@ -31,10 +31,10 @@ def patch_status(
 
     Args:
         observed: Whether any view has a valid sample.
-        finite: Whether any of them is finite.
-        seen: Samples that are finite and face the point light.
+        finite: Whether any valid sample is finite.
+        seen: Samples that are finite and lit.
         lights: First-order light in each view, from the light field.
-        min_views: Views a sample must be lit in.
+        min_views: Number of views a sample must be lit in.
         min_light_variation: See :func:`light_varies`.
     """
     count = seen.sum(dim=2)
@@ -52,11 +52,11 @@ def light_varies(
     weight: Float[Tensor, "patch view"] | Int[Tensor, "patch view"],
     min_ratio: float,
 ) -> Bool[Tensor, " patch"]:
-    r"""Report in which patches the light changes enough between the views.
+    """Return the patches in which the light varies enough between views.
 
     A shading vector has three degrees of freedom: the third singular value of the matrix of
-    lights, over the first, must reach ``min_ratio``. Lights are normalized, so that exposure does
-    not matter, and weighted, as by the samples that their view sees; a common factor cancels.
+    lights, over the first, must be at least ``min_ratio``. Lights are normalized, so exposure does
+    not matter, and weighted, such as by the samples that their view sees; a common factor cancels.
     """
     unit = (lights / lights.norm(dim=2, keepdim=True).clamp_min(1e-30)).double()
     moment = unit.mT @ (weight.double()[..., None] * unit)
@@ -67,14 +67,14 @@ def light_varies(
 def warn_of_undetermined(
     buckets: Sequence[Photometry], min_views: int, min_light_variation: float
 ) -> None:
-    """Warn once, with counts by cause, where light does not determine the normals of most patches.
+    """Warn, with counts by cause, if light does not determine the normals of most patches.
 
-    :mod:`pimper_torch.runtime.failures` reports those that failed.
+    :mod:`pimper_torch.runtime.failures` reports failed patches.
     """
     statuses = Counter(code for bucket in buckets for code in bucket.status.tolist())
     total = sum(statuses.values())
     undetermined = total - statuses[PatchStatus.DETERMINED] - statuses[PatchStatus.FAILED]
-    if undetermined <= _MOST_UNDETERMINED * total:
+    if undetermined <= _MAX_UNDETERMINED * total:
         return
     causes = {
         PatchStatus.UNSEEN: "{} have no valid sample in any view",
@@ -85,12 +85,12 @@ def warn_of_undetermined(
             f"(variation below {min_light_variation})"
         ),
     }
-    parts = [text.format(statuses[code]) for code, text in causes.items() if statuses[code]]
+    counts = [text.format(statuses[code]) for code, text in causes.items() if statuses[code]]
     caution(
         f"Factorization: {undetermined} of {total} patches keep the normals of the coarse mesh: "
-        f"{'; '.join(parts)}. Their shape is the coarse mesh's, and what swept heights tell. "
+        f"{'; '.join(counts)}. Their shape comes from the coarse mesh and swept heights only. "
         "Photograph these sides under more positions of the light, or lower "
         "`factorize.min_views` or `factorize.min_light_variation`."
-        f"{_DOUBT if 2 * statuses[PatchStatus.CONSTANT_LIGHT] > total else ''}",
+        f"{_IF_LIGHT_MOVED if 2 * statuses[PatchStatus.CONSTANT_LIGHT] > total else ''}",
         stacklevel=4,
     )

@@ -8,8 +8,8 @@ Gauss-Newton matrix, in Ruhe and Wedin's second approximation, is
           (W_k - W_k L B_k (B_k^\top L^\top W_k L B_k)^{-1} B_k^\top L^\top W_k)
 
 for samples k, with ``B`` the tangents of their manifold: all directions in low-rank
-factorization, three on the photometric cone. The ambiguity of the factorization (an invertible
-matrix, a Lorentz transformation) is its null space, which the damping regularizes.
+factorization, three on the photometric cone. Its null space is the ambiguity of the factorization
+(an invertible matrix, or a Lorentz transformation), which damping regularizes.
 
 Source: Ruhe & Wedin, SIAM Review 22(3), 1980; Okatani, Yoshida & Deguchi, ICCV 2011; Hong &
 Fitzgibbon, ICCV 2015. Its use on the tangents of the cone is ours.
@@ -55,25 +55,25 @@ def solve_variable_projection(
     small_steps: int = 3,
     curvature_samples: int | None = None,
 ) -> Factors:
-    """Factorize a batch of patches by damped variable projection.
+    """Return the factors of a batch of patches by damped variable projection.
 
     Args:
-        problem: With its initial values. Low-rank factorization uses the lights only, which must
-            be of full rank.
+        problem: Problem with initial values. Low-rank factorization uses only the lights, which
+            must have full rank.
         tolerance: A step that lowers a patch's objective by less than this fraction is small.
-        small_steps: A patch has converged after so many small steps in a row: one alone may be
-            followed by longer ones.
-        curvature_samples: The Gauss-Newton matrix, most of the work, is summed over about so
-            many samples of a patch, or over all if ``None``. It changes the steps, but not the
-            minimum.
+        small_steps: Number of consecutive small steps after which a patch has converged: longer
+            steps may follow a single small one.
+        curvature_samples: Approximate number of samples of a patch over which the Gauss-Newton
+            matrix, most of the work, is summed; all if ``None``. This changes the steps, but not
+            the minimum.
 
     Returns:
         A local minimum: initialize well, or restart. Low-rank lights without regularization are
         orthonormal, and others keep their initial norm.
 
-    Constant to autograd. Patches are independent. First-order light in float32 is
-    solved by a compiled kernel (:mod:`pimper_torch.ground.kernels.factorization`), with the same
-    result up to rounding; there, samples without weight keep their initial values.
+    Not differentiable. Patches are independent. A compiled kernel solves first-order light in
+    float32 (:mod:`pimper_torch.ground.kernels.factorization`), with the same result up to
+    rounding; there, samples without weight keep their initial values.
     """
     kernel = problem.has_kernel and problem.radiance.dtype == torch.float32
     if kernel and compiled_for(problem.radiance):
@@ -90,11 +90,11 @@ def solve_variable_projection(
 def curvature_of_lights(
     problem: Bilinear, lights: Lights, shading: Shading, weight: Entries, samples: int | None = None
 ) -> Float[Tensor, "patch unknown unknown"]:
-    """Return the Gauss-Newton matrices ``H``, unknowns view by view, regularization included.
+    """Return the Gauss-Newton matrices ``H``, unknowns ordered by view, with regularization.
 
     Args:
-        problem: Gives manifold, regularization and prior.
-        samples: Sum over about so many, evenly spaced, in place of all.
+        problem: Problem with manifold, regularization and prior.
+        samples: Approximate number of evenly spaced samples to sum over; all if ``None``.
     """
     rank = lights.shape[2]
     stride = max(1, shading.shape[2] // samples) if samples else 1
@@ -148,8 +148,8 @@ def _step(
             weight = bilinear.robust_weights(problem, state.lights, state.shading)
             cost, slope = bilinear.evaluate(problem, state.lights, state.shading, weight)
             state = state.replace(weight=weight, cost=cost, slope=slope)
-        at = state.lights, state.shading, state.weight
-        curvature = curvature_of_lights(problem, *at, curvature_samples)
+        point = state.lights, state.shading, state.weight
+        curvature = curvature_of_lights(problem, *point, curvature_samples)
         state = state.replace(curvature=curvature)
     cause = torch.where(stalled, int(StopCause.STALLED), bilinear.RUNNING)
     return state, torch.where(exact | (small >= small_steps), int(StopCause.CONVERGED), cause)
@@ -161,12 +161,12 @@ def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
     equations = bilinear.equations_of_samples(problem, lights, weight)
     shading = bilinear.update_shading(problem, *equations, problem.shading, SHADING_STEPS)
     cost, slope = bilinear.evaluate(problem, lights, shading, weight)
-    seen = (weight * problem.radiance).flatten(1)
+    weighted = (weight * problem.radiance).flatten(1)
     return _State(
         lights=lights,
         shading=shading,
         weight=weight,
-        energy=torch.linalg.vecdot(seen, problem.radiance.flatten(1)),
+        energy=torch.linalg.vecdot(weighted, problem.radiance.flatten(1)),
         cost=cost,
         slope=slope,
         curvature=curvature_of_lights(problem, lights, shading, weight, curvature_samples),
@@ -178,7 +178,7 @@ def _start(problem: Bilinear, curvature_samples: int | None) -> _State:
 def _whitened(
     problem: Bilinear, lights: Lights, shading: Shading, weight: Entries
 ) -> list[Entries]:
-    """Return ``C_k^-1 B_k^T l_f w_fk`` by tangents, ``C C^T`` the sample's normal equations."""
+    """Return ``C_k^-1 B_k^T l_f w_fk`` by tangents; ``C C^T`` is the sample's normal matrix."""
     packed, _ = bilinear.equations_of_samples(problem, lights, weight)
     if problem.manifold.flat:
         slopes = [light[..., None] * weight for light in lights.unbind(dim=2)]
@@ -191,9 +191,9 @@ def _whitened(
 
 
 def _eliminated(white: list[Entries], shading: Shading) -> Float[Tensor, "patch unknown unknown"]:
-    """Sum the samples' Schur terms ``(n n^T) (x) (white^T white)``.
+    """Return the sum of the samples' Schur terms ``(n n^T) (x) (white^T white)``.
 
-    Products of views come first, then the matrix product with ``n n^T``: several times less
+    Products of views first, and then a matrix product with ``n n^T``, need several times less
     arithmetic than Kronecker products.
     """
     batch, views, samples = white[0].shape
@@ -202,13 +202,13 @@ def _eliminated(white: list[Entries], shading: Shading) -> Float[Tensor, "patch 
     blocks = shading.new_zeros(batch, views, views, pairs.shape[1])
     group = max(1, 100_000 // (views * samples))
     for view in range(0, views, group):
-        some = slice(view, view + group)
-        factors = [(rows[:, some, None], rows[:, None, view:]) for rows in white]
+        chunk = slice(view, view + group)
+        factors = [(rows[:, chunk, None], rows[:, None, view:]) for rows in white]
         shared = torch.mul(*factors[0])
         for factor in factors[1:]:
             shared.addcmul_(*factor)
         summed = shared.flatten(1, 2) @ pairs.mT
-        blocks[:, some, view:] = summed.reshape(*shared.shape[:3], -1)
+        blocks[:, chunk, view:] = summed.reshape(*shared.shape[:3], -1)
     upper = unpacked(blocks.flatten(1, 2).mT, rank).reshape(batch, views, views, rank, rank)
     upper = upper.transpose(2, 3).reshape(batch, views * rank, views * rank)
     view_of = torch.arange(views * rank, device=shading.device) // rank
@@ -239,23 +239,23 @@ def _solve_by_kernel(
     from pimper_torch.ground.kernels import factorization
 
     J, code = problem.radiance, problem.loss.code
-    assert code is not None  # the caller asks
+    assert code is not None  # has_kernel
     lights, shading = (
-        each.detach().clone(memory_format=torch.contiguous_format)
-        for each in (problem.lights, problem.shading)
+        tensor.detach().clone(memory_format=torch.contiguous_format)
+        for tensor in (problem.lights, problem.shading)
     )
     weight, residual = torch.zeros_like(J), J.new_zeros(len(J))
-    taken = torch.zeros(len(J), dtype=torch.int64)
-    cause = torch.zeros_like(taken)
+    iterations = torch.zeros(len(J), dtype=torch.int64)
+    cause = torch.zeros_like(iterations)
     data = J, problem.weight, problem.prior_mean, problem.regularization, problem.dense_prior
-    results = lights, shading, weight, taken, residual, cause
+    results = lights, shading, weight, iterations, residual, cause
     factorization.solve_on_cone(
         factorization.ConeProblem(*map(as_array, data)),
         code,
         problem.loss.scale,
         problem.stride,
         factorization.Limits(max_iterations, tolerance, small_steps, curvature_samples or 0),
-        factorization.ConeSolution(*(each.numpy() for each in results)),
+        factorization.ConeSolution(*(tensor.numpy() for tensor in results)),
     )
-    convergence = Convergence(iterations=taken, residual=residual, cause=cause)
+    convergence = Convergence(iterations=iterations, residual=residual, cause=cause)
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
