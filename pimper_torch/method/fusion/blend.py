@@ -1,9 +1,9 @@
-"""The union of the patches, sampled on the subdivided mesh of the coarse mesh.
+"""The union of the patches, sampled on the subdivision of the coarse mesh.
 
-A subdivided mesh vertex has one ray: from its position on the flat facet along the coarse mesh's
-smoothed normal, interpolated as Phong does, so that rays are continuous across facets. The
-vertex's own patch and the neighbours whose enlarged triangle the ray passes give the height
-of the surface along it.
+Each vertex of the subdivision has a ray, from its position on the flat facet along the smoothed
+normal of the coarse mesh. Normals are interpolated linearly (Phong), so rays are continuous across
+facets. The patch of the facet, and neighbours whose enlarged triangle the ray intersects, determine
+the height of the surface along the ray.
 """
 
 import math
@@ -36,20 +36,20 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.parallel import side_by_side
 
-# An outlier twice as far away as allowed counts an eleventh: a choice.
-_DISTRUST = 10.0
+# An outlier at twice the allowed distance has an eleventh of its weight: a choice.
+_OUTLIER_PENALTY = 10.0
 
-# Standard deviation of normals that patches do not know from the known ones beside them: a choice,
-# as unknown ones lie in shadows and at contours, where the surface bends.
+# Standard deviation of unknown normals from adjacent known ones: a choice, as unknown ones are in
+# shadows and at contours, where the surface bends.
 _UNKNOWN_NORMAL_DEG = 8.0
 
-# Less weight than this is a border that tapered out: a choice.
+# A smaller weight is the tapered border of a patch: a choice.
 _MIN_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Blend(Record):
-    """The patches' weighted means at every vertex of the subdivided mesh.
+    """Weighted means of the patches at every vertex of the subdivision.
 
     Attributes:
         heights: Along the vertex's ray, scene units; 0 where no patch supports the vertex.
@@ -60,11 +60,11 @@ class Blend(Record):
         observed: True where a patch has albedo.
         normal_information: Inverse variance of the normals, one over squared radians; 0 where not
             supported or not determined by the photographs.
-        offsets: How far outside the height fields the sweep has the surface, along their normals;
+        offsets: Outward distance of the swept surface from the height fields, along their normals;
             0 where not swept.
         offset_information: Inverse variance of the offsets; 0 where not swept.
-        prior_normals_world: That were guessed, unit; zero where none was.
-        prior_offsets: Like ``offsets``, that were guessed.
+        prior_normals_world: Normals of the views' priors, unit; zero where there are none.
+        prior_offsets: ``offsets`` by the views' priors.
     """
 
     heights: PerVertex
@@ -83,7 +83,7 @@ class Blend(Record):
 
 
 def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Vertices:
-    """Return the vertices' rays: smoothed normals of the coarse mesh, interpolated."""
+    """Return unit ray directions: interpolated smooth normals of the coarse mesh, world."""
     mesh = coarse.mesh
     normals = mesh.normals_world
     if normals is None:
@@ -92,7 +92,7 @@ def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Vertices:
 
 
 def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
-    """Return each facet's wanted distance between neighbouring vertices, scene units."""
+    """Return each facet's desired distance between neighbouring vertices, scene units."""
     facet = torch.cat([bucket.facet for bucket in patches.buckets])
     spacing = torch.cat([bucket.spacing for bucket in patches.buckets])
     return torch.empty_like(spacing).index_put((facet,), spacing * samples_per_vertex)
@@ -105,36 +105,36 @@ def blend_patches(
     outlier_samples: float,
     swept: Sequence[Heights] | None = None,
 ) -> Blend:
-    r"""Blend the patches on the subdivided mesh.
+    r"""Return the blend of the patches on the subdivision.
 
-    Each patch counts with :math:`\prod_c s(b_c)` over its barycentric coordinates, where
-    ``s`` climbs smoothly from 0 at the border of the enlarged triangle through 1/2 on the
-    facet's edge to 1 as far inside: the union is continuous across seams, and on the centre
-    of a seam both patches count alike. Where three or more patches meet, one that lies
-    ``d > outlier_samples`` samples from the weighted median has its weight divided by
-    ``1 + 10 (d / outlier_samples - 1)^2``: a wild patch is outvoted.
+    The weight of a patch is :math:`\prod_c s(b_c)` over its barycentric coordinates, where ``s``
+    increases smoothly from 0 at the border of the enlarged triangle to 1/2 on the edge of the facet
+    and 1 at the same distance inside. The union is continuous across seams, and at the centre of a
+    seam both patches have equal weight. If three or more patches overlap, the weight of one that is
+    ``d > outlier_samples`` samples from the weighted median is divided by
+    ``1 + 10 (d / outlier_samples - 1)^2``, so an outlier is outvoted.
 
-    Normals and swept offsets ``x`` of inverse variance ``I`` are averaged by it besides,
-    :math:`\sum w I x / \sum w I`, and the mean has the inverse variance
-    :math:`\sum w I / \sum w`: patches see the same photographs, so that their errors are
-    correlated and a second one adds nothing. It is never too large, whatever the correlation, as
-    :math:`(\sum w I^{1/2})^2 \le \sum w \sum w I`. A patch that does not know has ``I = 0``. The
-    fraction ``1 - f`` of the weight that is without normals differs from the others by 8 degrees,
-    which adds :math:`(1 - f) / f` times their square to the variance of the mean normal.
+    Normals and swept offsets ``x`` are also weighted by their inverse variance ``I``,
+    :math:`\sum w I x / \sum w I`, and the mean has the inverse variance :math:`\sum w I / \sum w`:
+    patches share photographs, so their errors are correlated and a second patch adds no
+    information. It is never too large, for any correlation, as
+    :math:`(\sum w I^{1/2})^2 \le \sum w \sum w I`. Without information ``I = 0``. The fraction
+    ``1 - f`` of the weight without normals is assumed to differ from the rest by 8 degrees, which
+    adds :math:`(1 - f) / f` times their square to the variance of the mean normal.
 
-    Differentiable in templates, depth, normals, albedo, information and swept heights; which
-    patches and samples are blended is constant.
+    Differentiable in templates, depth, normals, albedo, information and swept heights; the choice
+    of patches and samples is constant.
     """
     coarse = depths.patches.coarse
     faces = coarse.mesh.faces
     vertices = _Lists.of(
         subdivision.facet, torch.arange(len(subdivision.points)).to(faces), len(faces)
     )
-    # Of each facet itself and the facets that share a corner with it, in order.
-    own = torch.arange(len(faces), device=faces.device)[:, None].expand_as(faces).flatten()
+    # Pairs of facets that share a corner, including each facet with itself, in order.
+    owner = torch.arange(len(faces), device=faces.device)[:, None].expand_as(faces).flatten()
     corner = faces.flatten()
-    taken, facet = _Lists.of(corner, own, int(corner.max()) + 1).take(corner)
-    pairs = torch.unique(torch.stack([own[taken], facet], dim=1), dim=0)
+    entry, facet = _Lists.of(corner, owner, int(corner.max()) + 1).take(corner)
+    pairs = torch.unique(torch.stack([owner[entry], facet], dim=1), dim=0)
     around = _Lists.of(pairs[:, 0], pairs[:, 1], len(faces))
     heights = swept if swept is not None else [None] * len(depths.buckets)
     buckets = zip(
@@ -152,9 +152,9 @@ def blend_patches(
 class _Estimates(Record):
     """Heights, normals, albedo and offsets of single patches at single vertices.
 
-    ``normal`` counts where ``known``, and begins with the information that the rest is multiplied
-    by, as ``offset`` and the two priors do. ``albedo`` begins with the fraction that it is known
-    of.
+    The first layer of ``normal``, ``offset`` and the two priors is their information, by which the
+    other layers are multiplied; that of ``albedo`` is the fraction of known albedo. ``known`` is
+    the fraction of known normals.
     """
 
     vertex: Int[Tensor, " estimate"]
@@ -180,7 +180,7 @@ def _estimates(
     around: "_Lists",
     vertices: "_Lists",
 ) -> _Estimates:
-    """Intersect the rays near each patch of a bucket with its height field."""
+    """Return estimates where rays intersect the height fields of a bucket's patches."""
     corners, bands = _bands(coarse, templates)
     vertex, present = _rays_near(
         templates, corners, bands, subdivision, directions, around, vertices
@@ -192,19 +192,19 @@ def _estimates(
     )
     from_patch = _barycentric_map(corners)
     barycentric = points[..., :2] @ from_patch[..., :2].mT + from_patch[:, None, :, 2]
-    # Weight 0 at the end of the band, 1/2 on the facet's edge, 1 as far inside.
+    # Weight 0 at the end of the band, 1/2 on the edge of the facet, 1 at its width inside.
     fraction = ((barycentric / bands[:, None] + 1) / 2).clamp(0, 1)
     weight = (fraction * fraction * (3 - 2 * fraction)).prod(dim=-1)
-    found = present & hit & (weight > 0)
+    hits = present & hit & (weight > 0)
     xy = points[..., :2]
     raster = templates.origin, templates.spacing
     valid, observed = photometry.valid, photometry.observed
     normals_world = photometry.normals_patch @ templates.patch_from_world[:, None, :3, :3]
-    certain = photometry.information[..., None]
-    layers = torch.cat([certain, certain * normals_world], dim=-1)
+    information = photometry.information[..., None]
+    layers = torch.cat([information, information * normals_world], dim=-1)
     normal = sample_raster(layers.movedim(-1, 1), xy, *raster, valid=valid)
-    where = torch.stack([valid, observed], dim=-1).to(layers)
-    layers = torch.cat([where, photometry.albedo], dim=-1)
+    masks = torch.stack([valid, observed], dim=-1).to(layers)
+    layers = torch.cat([masks, photometry.albedo], dim=-1)
     known, albedo = sample_raster(layers.movedim(-1, 1), xy, *raster).tensor_split([1], dim=1)
     offset = normal.new_zeros(normal.shape[0], 2, normal.shape[2])
     if swept is not None:
@@ -213,32 +213,32 @@ def _estimates(
     prior_normal, prior_offset = torch.zeros_like(normal), torch.zeros_like(offset)
     if swept is not None and swept.priors is not None:
         priors = swept.priors
-        certain, sure = priors.normal_information, priors.offset_information
-        guessed = priors.normals_patch @ templates.patch_from_world[:, None, :3, :3]
-        layers = torch.cat([certain[..., None], certain[..., None] * guessed], dim=-1)
+        information, offset_information = priors.normal_information, priors.offset_information
+        prior_normals = priors.normals_patch @ templates.patch_from_world[:, None, :3, :3]
+        layers = torch.cat([information[..., None], information[..., None] * prior_normals], dim=-1)
         prior_normal = sample_raster(layers.movedim(-1, 1), xy, *raster)
-        layers = torch.stack([sure, sure * priors.offset], dim=1)
+        layers = torch.stack([offset_information, offset_information * priors.offset], dim=1)
         prior_offset = sample_raster(layers, xy, *raster)
     return _Estimates(
-        vertex=vertex[found],
-        height=((points - origins) * along).sum(dim=-1)[found],
-        weight=weight[found],
-        scale=templates.spacing[:, None].expand_as(weight)[found],
-        known=known[:, 0][found],
-        normal=normal.movedim(1, -1)[found],
-        albedo=albedo.movedim(1, -1)[found],
-        offset=offset.movedim(1, -1)[found],
-        prior_normal=prior_normal.movedim(1, -1)[found],
-        prior_offset=prior_offset.movedim(1, -1)[found],
+        vertex=vertex[hits],
+        height=((points - origins) * along).sum(dim=-1)[hits],
+        weight=weight[hits],
+        scale=templates.spacing[:, None].expand_as(weight)[hits],
+        known=known[:, 0][hits],
+        normal=normal.movedim(1, -1)[hits],
+        albedo=albedo.movedim(1, -1)[hits],
+        offset=offset.movedim(1, -1)[hits],
+        prior_normal=prior_normal.movedim(1, -1)[hits],
+        prior_offset=prior_offset.movedim(1, -1)[hits],
     )
 
 
 def _bands(
     coarse: CoarseMesh, templates: Templates
 ) -> tuple[Float[Tensor, "patch 3 2"], Float[Tensor, "patch 3"]]:
-    """Return corners in the patch frame, and how far outside the facet weights reach.
+    """Return corners in the patch frame, and the width of the blended band outside the facet.
 
-    The band is in barycentric coordinates and ends a little inside the enlarged triangle.
+    The band is in barycentric coordinates, and ends slightly inside the enlarged triangle.
     """
     vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces[templates.facet]
     corners = transform(templates.patch_from_world, vertices[faces])[..., :2]
@@ -247,7 +247,7 @@ def _bands(
     step = templates.spacing[:, None] * opposite / twice_area  # barycentric, for one sample
     inside = templates.inside[..., None]
     reach = torch.where(inside, -templates.barycentric, 0).amax(dim=(1, 2))
-    # At a template's border cells are not whole, so that no ray meets them.
+    # Incomplete cells at a template's border are not hit by rays.
     return corners, torch.maximum(reach - 1.5 * step, step / 2)
 
 
@@ -260,10 +260,10 @@ def _rays_near(
     around: "_Lists",
     vertices: "_Lists",
 ) -> tuple[Int[Tensor, "patch ray"], Bool[Tensor, "patch ray"]]:
-    """List, for each patch, the vertices around it whose rays its height field may meet.
+    """Return, for each patch, the nearby vertices whose rays may hit its height field.
 
     Returns:
-        Vertices, padded with 0, and which entries are no padding.
+        Vertices, padded with 0, and the mask of entries that are not padding.
     """
     patch, facet = around.take(templates.facet)
     index, vertex = vertices.take(facet)
@@ -271,12 +271,11 @@ def _rays_near(
     frame, from_patch = templates.patch_from_world, _barycentric_map(corners)
     start = transform(frame[patch], subdivision.points[vertex, None])[:, 0]
     along = rotate(frame[patch], directions[vertex, None])[:, 0]
-    # At 78 degrees from its normal and more.
-    facing = along[:, 2] < -0.2
+    facing = along[:, 2] < -0.2  # within 78 degrees of the patch's normal
     distance = -start[:, 2] / torch.where(facing, along[:, 2], 1)
     crossing = start[:, :2] + distance[:, None] * along[:, :2]
     barycentric = (from_patch[patch, :, :2] @ crossing[..., None])[..., 0] + from_patch[patch, :, 2]
-    # A ray may cross the facet's plane further outside and still meet its height field.
+    # A ray may cross the facet's plane further outside and still hit its height field.
     close = (barycentric > -3 * bands[patch]).all(dim=-1)
     near = facing & close
     counts = torch.bincount(patch[near], minlength=len(templates.facet))
@@ -286,7 +285,7 @@ def _rays_near(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Lists:
-    """Indices in lists of different lengths, one after the other."""
+    """Concatenated lists of indices, of different lengths."""
 
     start: Int[Tensor, " list"]
     count: Int[Tensor, " list"]
@@ -294,7 +293,7 @@ class _Lists:
 
     @staticmethod
     def of(which: Int[Tensor, " entry"], index: Int[Tensor, " entry"], size: int) -> "_Lists":
-        """Put each index into the list that it belongs to."""
+        """Return lists that contain each index in the list of the given number."""
         order = which.argsort(stable=True)
         count = torch.bincount(which, minlength=size)
         return _Lists(start=count.cumsum(0) - count, count=count, index=index[order])
@@ -302,17 +301,17 @@ class _Lists:
     def take(
         self, which: Int[Tensor, " taken"]
     ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"]]:
-        """Return the indices in some lists, and which of these lists each is of."""
+        """Return for each entry of the chosen lists its position among them, and its index."""
         count = self.count[which]
-        taken = torch.arange(len(which), device=which.device).repeat_interleave(count)
-        within = torch.arange(len(taken), device=which.device) - (count.cumsum(0) - count)[taken]
-        return taken, self.index[self.start[which][taken] + within]
+        slot = torch.arange(len(which), device=which.device).repeat_interleave(count)
+        within = torch.arange(len(slot), device=which.device) - (count.cumsum(0) - count)[slot]
+        return slot, self.index[self.start[which][slot] + within]
 
 
 def _barycentric_map(corners: Float[Tensor, "patch 3 2"]) -> Float[Tensor, "patch 3 3"]:
     """Return the affine map from (x, y, 1) in the patch frame to barycentric coordinates.
 
-    Of a facet without area it is not finite, so that no ray counts as near.
+    It is not finite for a facet without area, so no ray counts as near.
     """
     ones = torch.ones_like(corners[..., :1])
     return torch.linalg.inv_ex(torch.cat([corners, ones], dim=-1).mT).inverse
@@ -325,17 +324,16 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     total, seen = sum_at(vertex, weight, count), sum_at(vertex, seen_weight, count)
     supported = total > _MIN_WEIGHT
     per_support = torch.where(supported, 1 / total.clamp_min(_MIN_WEIGHT), 0)
-    by = weight[:, None]
-    certain, normals = _split(sum_at(vertex, seen_weight[:, None] * estimates.normal, count))
-    swept, offsets = _split(sum_at(vertex, by * estimates.offset, count))
-    guessed, prior_normals = _split(sum_at(vertex, by * estimates.prior_normal, count))
-    told, prior_offsets = _split(sum_at(vertex, by * estimates.prior_offset, count))
-    photometric = (seen > _MIN_WEIGHT) & (certain > 0)
+    normal_information, normals = _mean(vertex, seen_weight, estimates.normal, count)
+    offset_information, offsets = _mean(vertex, weight, estimates.offset, count)
+    prior_normal_information, prior_normals = _mean(vertex, weight, estimates.prior_normal, count)
+    prior_offset_information, prior_offsets = _mean(vertex, weight, estimates.prior_offset, count)
+    photometric = (seen > _MIN_WEIGHT) & (normal_information > 0)
     colours = sum_at(vertex, weight[:, None] * estimates.albedo, count)
     observed = colours[:, 0] > _MIN_WEIGHT
     albedo = colours[:, 1:] / torch.where(observed, colours[:, 0], 1)[:, None]
-    # Less is known of mean normals where patches know them for a fraction of the weight.
-    information, known = certain * per_support, seen * per_support
+    # Mean normals are less certain where normals are known for a fraction of the weight only.
+    information, known = normal_information * per_support, seen * per_support
     unknown = (1 - known).clamp_min(0) / known.clamp_min(_MIN_WEIGHT)
     variance = math.radians(_UNKNOWN_NORMAL_DEG) ** 2
     return Blend(
@@ -347,26 +345,32 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
         observed=observed,
         normal_information=information / (1 + information * variance * unknown) * photometric,
         offsets=offsets[:, 0],
-        offset_information=swept * per_support,
+        offset_information=offset_information * per_support,
         prior_normals_world=normalize(prior_normals, dim=-1),
-        prior_normal_information=guessed * per_support,
+        prior_normal_information=prior_normal_information * per_support,
         prior_offsets=prior_offsets[:, 0],
-        prior_offset_information=told * per_support,
+        prior_offset_information=prior_offset_information * per_support,
     )
 
 
-def _split(sums: Float[Tensor, "vertex layer"]) -> tuple[PerVertex, Float[Tensor, "vertex value"]]:
-    """Return the summed information and the mean by it of what follows; 0 where there is none."""
+def _mean(
+    vertex: Int[Tensor, " estimate"],
+    weight: Float[Tensor, " estimate"],
+    layers: Float[Tensor, "estimate layer"],
+    count: int,
+) -> tuple[PerVertex, Float[Tensor, "vertex value"]]:
+    """Return summed information, and the mean of values weighted by it; 0 without any."""
+    sums = sum_at(vertex, weight[:, None] * layers, count)
     information = sums[:, 0]
-    some = information > 0
-    mean = sums[:, 1:] / torch.where(some, information, 1)[:, None]
-    return information, torch.where(some[:, None], mean, 0)
+    informed = information > 0
+    mean = sums[:, 1:] / torch.where(informed, information, 1)[:, None]
+    return information, torch.where(informed[:, None], mean, 0)
 
 
 def _agreement(
     estimates: _Estimates, count: int, outlier_samples: float
 ) -> Float[Tensor, " estimate"]:
-    """Lower the weight of an estimate far from the weighted median of three or more."""
+    """Return factors of weights, below 1 far from the weighted median of three or more."""
     with torch.no_grad():
         by_height = estimates.height.argsort(stable=True)
         order = by_height[estimates.vertex[by_height].argsort(stable=True)]
@@ -381,7 +385,7 @@ def _agreement(
         nearest[order] = order[centre]
     median = estimates.height[nearest]
     away = (estimates.height - median) / (outlier_samples * estimates.scale)
-    many = patches[estimates.vertex] >= 3
+    several = patches[estimates.vertex] >= 3
     beyond = (away.abs() - 1).clamp_min(0)
-    leave_out("fuse.outvoted", many & (_DISTRUST * beyond.square() > 1))
-    return torch.where(many, 1 / (1 + _DISTRUST * beyond.square()), 1)
+    leave_out("fuse.outvoted", several & (_OUTLIER_PENALTY * beyond.square() > 1))
+    return torch.where(several, 1 / (1 + _OUTLIER_PENALTY * beyond.square()), 1)

@@ -1,6 +1,6 @@
-"""Overlapping blocks of facets, solved one at a time where memory does not hold the whole.
+"""Overlapping blocks of facets, solved one at a time if memory does not suffice for all.
 
-Vertices on the border of a block are held where a coarser mesh, solved whole, has them, and the
+Vertices on the border of a block are fixed at the solution of a coarser mesh of all facets, and the
 heights of blocks are blended by a partition of unity.
 
 Source: Smith, Bjørstad & Gropp, Domain Decomposition, 1996, for overlapping Schwarz methods of two
@@ -20,25 +20,25 @@ from pimper_torch.ground.geometry.topology import corners_of, dilated
 from pimper_torch.ground.shapes import PerVertex, Scalar, VertexMask
 from pimper_torch.records import Mesh, Record
 
-# Rings of facets round those of a block: the first is blended with its neighbours.
+# Rings of facets around those of a block: the first is blended with its neighbours.
 _RINGS = 2
 
-# Values that all blocks have in common, by name: the factor of a kind of terms by the number of
-# the term and that of the kind among the term's.
+# Values that all blocks share, by name; noise factors by the indices of term and kind.
 Key = str | tuple[int, int]
 Typical = Mapping[Key, Scalar]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Coarse(Record):
-    """A coarser subdivided mesh that is solved whole.
+    """The solution on a coarser subdivision of all facets.
 
     Attributes:
-        expected: Expected errors of the heights; ``None`` if they are not asked for.
-        detail: How far heights rise, with independent errors; ``None`` if not solved for.
-        shape: The same, with the errors that facets have in common.
-        exposed: 1 where normals are not known, nor enclosed by known ones, else 0.
-        noise: Factors of the variances of all kinds of terms.
+        expected: Expected errors of the heights; ``None`` if they are not requested.
+        detail: Change of the heights for independent errors; ``None`` if not solved for.
+        shape: Change of the heights for errors that facets share.
+        exposed: 1 where normals are neither known nor enclosed by known ones, else 0.
+        noise: Noise factors of all kinds of terms.
+        typical: Further values that blocks have in common.
     """
 
     subdivision: Subdivision
@@ -52,18 +52,18 @@ class Coarse(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Block(Record):
-    """A subdivided mesh, or some facets of it and a few rings of others round them.
+    """A subdivision, or a subset of its facets with a few rings of facets around them.
 
     Attributes:
-        subdivision: Facets keep their numbers.
-        facets: Of the coarse mesh: those of the block, with the rings.
-        vertex: Of the whole subdivided mesh, ascending.
-        own: Whether no other block has the vertex for its own.
-        weight: Of the block's heights; all blocks' add up to 1.
-        held: On the border of the block, where the surface goes on.
-        detail: How far heights of these rise on a coarser mesh, else 0.
-        shape: The same, with the errors that facets have in common.
-        exposed: Those beyond which no known normals enclose the surface.
+        subdivision: Facets keep their indices.
+        facets: Mask of the coarse mesh's facets in the block, including the rings.
+        vertex: Index of each vertex in the full subdivision, ascending.
+        own: Whether the vertex belongs to this block; each belongs to one block.
+        weight: Weight of the block's heights; the weights of all blocks sum to 1.
+        held: Vertices on the border of the block, where the surface continues; they are fixed.
+        detail: Change of the heights of these on a coarser mesh, else 0.
+        shape: The same for errors that facets share.
+        exposed: Held vertices beyond which known normals do not enclose the surface.
     """
 
     subdivision: Subdivision
@@ -79,56 +79,56 @@ class Block(Record):
     @classmethod
     def whole(cls, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> "Block":
         """Return the block of all facets."""
-        number = torch.arange(len(subdivision.points), device=facets.device)
-        every = torch.ones((), dtype=torch.float64, device=facets.device).expand(len(number))
+        index = torch.arange(len(subdivision.points), device=facets.device)
+        ones = torch.ones((), dtype=torch.float64, device=facets.device).expand(len(index))
         return cls(
             subdivision=subdivision,
             facets=torch.ones_like(facets[:, 0], dtype=torch.bool),
-            vertex=number,
-            own=every > 0,
-            weight=every,
-            held=every < 0,
-            detail=every - every,
-            shape=every - every,
-            exposed=every < 0,
+            vertex=index,
+            own=ones > 0,
+            weight=ones,
+            held=ones < 0,
+            detail=ones - ones,
+            shape=ones - ones,
+            exposed=ones < 0,
         )
 
 
 def block_of(
-    whole: Subdivision, facets: Int[Tensor, "facet 3"], mine: Bool[Tensor, " facet"], coarse: Coarse
+    whole: Subdivision, facets: Int[Tensor, "facet 3"], mask: Bool[Tensor, " facet"], coarse: Coarse
 ) -> Block:
-    """Return the block of some facets.
+    """Return the block of a subset of facets.
 
     Args:
-        coarse: If it is not solved, vertices that are held do not rise.
+        coarse: If it is not solved, held vertices keep their heights.
     """
-    if bool(mine.all()):
+    if bool(mask.all()):
         return Block.whole(whole, facets)
     size = int(facets.max()) + 1
-    grown = dilated(facets, mine, _RINGS, size)
-    chosen, own = grown[whole.face_facet], mine[whole.facet]
-    vertex = (corners_of(whole.faces, chosen, len(own)) | own).nonzero()[:, 0]
-    number = torch.zeros_like(whole.facet)
-    number[vertex] = torch.arange(len(vertex), device=vertex.device)
+    grown = dilated(facets, mask, _RINGS, size)
+    faces, own = grown[whole.face_facet], mask[whole.facet]
+    vertex = (corners_of(whole.faces, faces, len(own)) | own).nonzero()[:, 0]
+    new_index = torch.zeros_like(whole.facet)
+    new_index[vertex] = torch.arange(len(vertex), device=vertex.device)
     subdivision = Subdivision(
         points=whole.points[vertex],
         facet=whole.facet[vertex],
         barycentric=whole.barycentric[vertex],
-        faces=number[whole.faces[chosen]],
-        face_facet=whole.face_facet[chosen],
+        faces=new_index[whole.faces[faces]],
+        face_facet=whole.face_facet[faces],
         spacing=whole.spacing,
     )
-    held = corners_of(whole.faces, ~chosen, len(own))[vertex]
+    held = corners_of(whole.faces, ~faces, len(own))[vertex]
 
     def on_border(values: Float[Tensor, " _"] | None) -> Float[Tensor, " _"]:
-        found = torch.zeros(len(held), dtype=torch.float64, device=held.device)
+        zeros = torch.zeros(len(held), dtype=torch.float64, device=held.device)
         if values is None:
-            return found
-        at = subdivision.points[held]
-        return found.masked_scatter(held, transferred(values, coarse.subdivision, at))
+            return zeros
+        points = subdivision.points[held]
+        return zeros.masked_scatter(held, transferred(values, coarse.subdivision, points))
 
     corners = torch.bincount(facets.flatten(), minlength=size).clamp_min(1)
-    share = torch.bincount(facets[mine].flatten(), minlength=size).double() / corners
+    share = torch.bincount(facets[mask].flatten(), minlength=size).double() / corners
     return Block(
         subdivision=subdivision,
         facets=grown,
@@ -143,12 +143,12 @@ def block_of(
 
 
 def pooled(samples: Iterable[Mapping[Key, tuple[int, Scalar]]]) -> Typical:
-    """Return the means of values that blocks have found, by the number each was found from."""
+    """Return means of the blocks' values, weighted by the number of equations of each."""
     count: Counter[Key] = Counter()
     total: dict[Key, Tensor] = {}
     for sample in samples:
         for key, (number, value) in sample.items():
-            # So many tell the noise of their kind to a tenth of a standard deviation.
+            # 200 equations determine a standard deviation to a tenth.
             if number >= 200:
                 count[key] += number
                 total[key] = total.get(key, torch.zeros_like(value)) + number * value
@@ -156,25 +156,26 @@ def pooled(samples: Iterable[Mapping[Key, tuple[int, Scalar]]]) -> Typical:
 
 
 def parts_of(whole: Subdivision, mesh: Mesh, most: float) -> list[Bool[Tensor, " facet"]]:
-    """Halve the facets across their longest side until each part, grown, has few vertices.
+    """Return parts of the facets, halved across their longest side until blocks are small enough.
 
     Args:
-        most: Vertices of a block, about; a block of one facet may have more.
+        most: Approximate maximum number of vertices of a block; one of a single facet may have
+            more.
     """
     count = torch.bincount(whole.facet, minlength=len(mesh.faces))
     centre = mesh.vertices_world.detach()[mesh.faces].mean(dim=1)
     pending, parts = [torch.arange(len(count), device=count.device)], []
     while pending:
-        some = pending.pop()
-        mine = torch.zeros_like(count, dtype=torch.bool).index_fill(0, some, True)
-        grown = dilated(mesh.faces, mine, _RINGS, len(mesh.vertices_world))
-        if len(some) == 1 or int(count[grown].sum()) <= most:
-            parts.append(mine)
+        facets = pending.pop()
+        mask = torch.zeros_like(count, dtype=torch.bool).index_fill(0, facets, True)
+        grown = dilated(mesh.faces, mask, _RINGS, len(mesh.vertices_world))
+        if len(facets) == 1 or int(count[grown].sum()) <= most:
+            parts.append(mask)
             continue
-        at = centre[some]
-        longest = int((at.amax(dim=0) - at.amin(dim=0)).argmax())
-        some = some[at[:, longest].argsort(stable=True)]
-        running = count[some].cumsum(0)
-        half = min(int((2 * running < running[-1]).sum()) + 1, len(some) - 1)
-        pending += [some[half:], some[:half]]
+        points = centre[facets]
+        longest = int((points.amax(dim=0) - points.amin(dim=0)).argmax())
+        facets = facets[points[:, longest].argsort(stable=True)]
+        running = count[facets].cumsum(0)
+        half = min(int((2 * running < running[-1]).sum()) + 1, len(facets) - 1)
+        pending += [facets[half:], facets[:half]]
     return parts

@@ -1,8 +1,8 @@
-"""The distance between a facet's vertices: larger where its patch shows no detail between them.
+"""The vertex spacing of each facet: larger if its patch has no finer detail.
 
-A grid of twice the spacing loses, at the samples that it leaves out, their difference from the mean
-of their neighbours. Where that is small compared with the errors of the patch's values, the facet
-does without them. Spacings are powers of two.
+A grid of twice the spacing loses, at the samples that it skips, their difference from the mean of
+their neighbours. If this is small compared with the errors of the patch's values, the facet gets
+that grid. Spacings are powers of two.
 """
 
 import math
@@ -14,42 +14,42 @@ from torch import Tensor
 from pimper_torch.ground.shapes import PatchMask, PatchRaster, PerFacet
 from pimper_torch.records import Heights, Photometry, SweptPatches, Templates
 
-# Root mean square of albedo that a coarser grid may lose, relative: 4 of 255 sRGB levels of a
-# bright surface, half of the change that simplification may make.
+# Relative root mean square of albedo that a coarser grid may lose: 4 of 255 sRGB levels of a
+# bright surface, half of the change allowed in simplification.
 _MAX_ALBEDO = 0.05
 
-# The same of the height that templates carry, in finest spacings: twice the distance that
-# simplification may move a vertex.
+# Root mean square of the templates' height that a coarser grid may lose, in finest spacings: twice
+# the distance that simplification may move a vertex.
 _MAX_HEIGHT = 0.1
 
 
 @torch.no_grad()
 def spacing_of(swept: SweptPatches, samples_per_vertex: float, max_lost: float) -> PerFacet:
-    """Return each facet's distance between neighbouring vertices, scene units; a constant.
+    """Return each facet's distance between neighbouring vertices, scene units. Not differentiable.
 
     Args:
-        samples_per_vertex: Template samples between neighbouring vertices, where they lie closest.
-        max_lost: Part of the mean variance of the normals, or of the swept heights, that a facet's
-            grid may lose; 0 spaces all vertices alike.
+        samples_per_vertex: Template samples between neighbouring vertices at the finest spacing.
+        max_lost: Fraction of the mean variance of the normals, or of the swept heights, that a
+            facet's grid may lose; 0 gives all facets the finest spacing.
     """
     buckets = zip(swept.patches.buckets, swept.photometric.buckets, swept.buckets, strict=True)
-    found = swept.patches.buckets[0].spacing.new_empty(len(swept))
+    spacing = swept.patches.buckets[0].spacing.new_empty(len(swept))
     for templates, photometry, heights in buckets:
-        apart = _apart(templates, photometry, heights, max_lost) if max_lost > 0 else 1.0
-        found[templates.facet] = samples_per_vertex * apart * templates.spacing
-    return found
+        factor = _apart(templates, photometry, heights, max_lost) if max_lost > 0 else 1.0
+        spacing[templates.facet] = samples_per_vertex * factor * templates.spacing
+    return spacing
 
 
 def _apart(
     templates: Templates, photometry: Photometry, heights: Heights, max_lost: float
 ) -> Float[Tensor, " patch"]:
-    """Return the distance between the vertices of each facet, in finest spacings."""
+    """Return the vertex spacing of each facet, in finest spacings."""
     own = (templates.barycentric >= 0).all(dim=-1)
-    shown, albedo = photometry.observed, photometry.albedo
-    bright = _MAX_ALBEDO * _mean(albedo.mean(dim=-1), own & shown)
+    observed, albedo = photometry.observed, photometry.albedo
+    bright = _MAX_ALBEDO * _mean(albedo.mean(dim=-1), own & observed)
     flat = (_MAX_HEIGHT * templates.spacing).square()
     limits = [
-        (albedo, shown, albedo.shape[-1] * bright.square()),
+        (albedo, observed, albedo.shape[-1] * bright.square()),
         (templates.depth[..., None], templates.inside, flat),
     ]
     normals, offset = photometry.normals_patch, heights.offset[..., None]
@@ -57,40 +57,40 @@ def _apart(
         known = information > 0
         variance = _mean(1 / torch.where(known, information, 1), own & known)
         limits.append((values, known, max_lost * variance))
-    apart = torch.ones_like(bright)
-    smooth = apart > 0
-    # Eight pieces a side stay: a small facet of a cap, curved as a whole, was too stiff with four.
+    factor = torch.ones_like(bright)
+    smooth = factor > 0
+    # At least eight pieces a side: a small curved facet of a cap was too stiff with four.
     enough = own.sum(dim=(1, 2)) / (math.sqrt(3) / 4 * 16**2)
-    for step in (1, 2):  # a choice: a sixteenth of the vertices is few
+    for step in (1, 2):  # a choice: at least a sixteenth of the vertices
         for values, known, limit in limits:
             smooth &= _lost(values, known, own, step) <= limit
         smooth &= enough >= step**2
-        apart = torch.where(smooth, 2 * step, apart)
-    return apart
+        factor = torch.where(smooth, 2 * step, factor)
+    return factor
 
 
 def _mean(values: PatchRaster, where: PatchMask) -> Float[Tensor, " patch"]:
-    """Average over samples; 0 where there are none."""
+    """Return the mean over samples; 0 if the mask is empty."""
     return torch.where(where, values, 0).sum(dim=(1, 2)) / where.sum(dim=(1, 2)).clamp_min(1)
 
 
 def _lost(
     values: Float[Tensor, "patch height width channel"], known: PatchMask, own: PatchMask, step: int
 ) -> Float[Tensor, " patch"]:
-    """Return the mean square that samples differ by from the mean of those a step before and after.
+    """Return the mean squared difference of samples from the mean of neighbours at a step.
 
-    Both ways over the raster; 0 where no sample has such neighbours.
+    Neighbours are along rows and columns; 0 if no sample has such neighbours.
     """
     total, count = values.new_zeros(2, len(values))
     for dim in (1, 2):
         length = values.shape[dim] - 2 * step
         if length <= 0:
             continue
-        before, at, after = (values.narrow(dim, start * step, length) for start in range(3))
-        some = own.narrow(dim, step, length)
+        before, centre, after = (values.narrow(dim, start * step, length) for start in range(3))
+        mask = own.narrow(dim, step, length)
         for start in range(3):
-            some = some & known.narrow(dim, start * step, length)
-        square = ((before + after) / 2 - at).square().sum(dim=-1)
-        total += torch.where(some, square, 0).sum(dim=(1, 2))
-        count += some.sum(dim=(1, 2))
+            mask = mask & known.narrow(dim, start * step, length)
+        square = ((before + after) / 2 - centre).square().sum(dim=-1)
+        total += torch.where(mask, square, 0).sum(dim=(1, 2))
+        count += mask.sum(dim=(1, 2))
     return total / count.clamp_min(1)

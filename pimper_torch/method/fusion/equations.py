@@ -1,8 +1,8 @@
-r"""Linear equations in the heights of vertices, of every kind that the fusion knows.
+r"""Linear equations in the heights of vertices, of every kind of the fusion.
 
-A vertex lies at ``x_v = q_v + h_v d_v``: its position on the flat facet, and the height along its
-direction. Every kind is a set of equations :math:`\sum_k c_k h_{u_k} = t`, each with
-the variance that its source claims.
+A vertex has the position ``x_v = q_v + h_v d_v``: its point on the flat facet, and its height along
+its direction. Every kind is a set of equations :math:`\sum_k c_k h_{u_k} = t`, with the variances
+stated by its source.
 """
 
 from dataclasses import dataclass
@@ -17,20 +17,20 @@ from pimper_torch.ground.geometry.visibility import Hits, RayCaster
 from pimper_torch.ground.shapes import Edges, Faces, PerVertex, Points, Scalar, VertexMask, Vertices
 from pimper_torch.records import ContourPoints, FacetPoints, Record
 
-# A direction that leaves the surface at a flatter angle than this (cosine) tells no height.
+# Least cosine between a direction and the normal for data to determine a height.
 MIN_FACING = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SharedError(Record):
-    """An error that neighbours have in common, as their light and albedo were found together.
+    """An error that neighbours have in common, as their light and albedo were fitted together.
 
-    It does not average out. Neighbours that have it agree with each other, and would outvote
-    what is right; ``count`` times its variance, added to that of each, makes all of them
-    together count for what they know.
+    It does not average out: neighbours with this error agree with each other, and would outvote
+    correct data. ``count`` times its variance is added to the variance of each, so that together
+    they have the weight of their joint information.
 
     Attributes:
-        count: Of the neighbours that have it, for each vertex.
+        count: Number of neighbours that share the error, for each vertex.
     """
 
     variance: Scalar
@@ -42,11 +42,11 @@ class Equations(Record):
     """Equations of one kind.
 
     Attributes:
-        unknowns: Vertices that each equation ties together.
-        targets: What these should add up to.
-        information: Inverse variance of the target, as its source claims, or what is left of it
-            where neighbours have a common error: together they must not count for more.
-        correlated: How many times less than the variance so enlarged each target errs by.
+        unknowns: Vertices of the heights in each equation.
+        targets: Right-hand sides.
+        information: Inverse variance of the target, as its source states. If neighbours share an
+            error, the variance is enlarged, so that their weight together is not too large.
+        correlated: Ratio of the enlarged variance to the variance of a single target.
         evaluated: Whether the noise factor is estimated from residuals.
     """
 
@@ -58,7 +58,7 @@ class Equations(Record):
     evaluated: bool = True
 
     def residual(self, heights: PerVertex) -> Float[Tensor, " equation"]:
-        """Return the residual: target less sum."""
+        """Return the residuals, targets minus sums."""
         return self.targets - (self.coefficients * heights[self.unknowns]).sum(dim=1)
 
 
@@ -70,44 +70,44 @@ def slopes(
     variance: PerVertex,
     common: SharedError | None = None,
 ) -> Equations:
-    r"""State that edges are at right angles to the normals at their ends.
+    r"""Return equations by which edges are perpendicular to the normals at their ends.
 
     :math:`(n_a + n_b) \cdot (x_b - x_a) = 0`, which is exact on a parabola. An error of the
-    angle moves one end by the edge's length times it.
+    angle moves an end by the length of the edge times the error.
 
     Args:
-        edges: Those whose ends have normals.
+        edges: Edges with normals at both ends.
         flat: ``q``.
         directions: ``d``, unit.
         normals: Unit, outward.
-        variance: Of the normals, squared radians.
-        common: Tilt that neighbours' normals have in common.
+        variance: Variance of the normals, squared radians.
+        common: Tilt that neighbours' normals share.
     """
-    one, other = edges.unbind(dim=1)
-    centre = normalize(normals[one] + normals[other], dim=-1)
-    step = flat[other] - flat[one]
-    own = (variance[one] + variance[other]) / 2
-    each, together = own, own
+    start, end = edges.unbind(dim=1)
+    centre = normalize(normals[start] + normals[end], dim=-1)
+    step = flat[end] - flat[start]
+    independent = (variance[start] + variance[end]) / 2
+    single, enlarged = independent, independent
     if common is not None:
-        each = own + common.variance
-        together = own + common.variance * (common.count[one] + common.count[other]) / 2
+        single = independent + common.variance
+        enlarged = independent + common.variance * (common.count[start] + common.count[end]) / 2
     leaning = torch.stack(
-        [-(centre * directions[one]).sum(dim=-1), (centre * directions[other]).sum(dim=-1)], dim=1
+        [-(centre * directions[start]).sum(dim=-1), (centre * directions[end]).sum(dim=-1)], dim=1
     )
     return Equations(
         unknowns=edges,
         coefficients=leaning,
         targets=-(centre * step).sum(dim=-1),
-        information=1 / (together * step.square().sum(dim=-1)),
-        correlated=together / each,
+        information=1 / (enlarged * step.square().sum(dim=-1)),
+        correlated=enlarged / single,
     )
 
 
 def upright(edges: Edges, directions: Vertices, normals: Vertices) -> Bool[Tensor, " edge"]:
-    """Find edges whose slope heights can follow.
+    """Return the edges whose slope can follow from heights.
 
-    Others lie across a contour or a fold as seen along the directions: raising both ends by the
-    same height would rotate the edge. Constant.
+    Other edges cross a contour or a fold as seen along the directions: an equal change of height at
+    both ends would rotate them. Not differentiable.
     """
     centre = normalize(normals[edges].detach().sum(dim=1), dim=-1)
     return ((centre[:, None] * directions[edges].detach()).sum(dim=-1) > 0.1).all(dim=1)
@@ -121,33 +121,34 @@ def kept_slopes(
     transferred: PerVertex,
     variance: PerVertex,
 ) -> Equations:
-    """State that edges keep the slopes of the present surface, where light determines none.
+    """Return equations by which edges keep the slopes of the current surface.
 
     Args:
-        edges: Those without normals at both ends.
-        variance: Of its slopes, squared radians; no residual shows it, for they start at 0.
+        edges: Edges without normals at both ends.
+        variance: Variance of its slopes, squared radians; residuals do not determine it, as they
+            start at 0.
     """
-    found = slopes(edges, flat, directions, shape, variance)
-    return found.replace(
-        targets=(found.coefficients * transferred[edges]).sum(dim=1), evaluated=False
+    kept = slopes(edges, flat, directions, shape, variance)
+    return kept.replace(
+        targets=(kept.coefficients * transferred[edges]).sum(dim=1), evaluated=False
     )
 
 
 def kept_steps(
     edges: Edges, flat: Vertices, transferred: PerVertex, variance: float | Scalar
 ) -> Equations:
-    """State that heights go on differing as they do, where edges are not upright.
+    """Return equations by which edges that are not upright keep their height difference.
 
     Args:
-        transferred: Heights of the surface that there is.
-        variance: Of its slopes, squared radians.
+        transferred: Heights of the current surface.
+        variance: Variance of its slopes, squared radians.
     """
-    one, other = edges.unbind(dim=1)
-    square = (flat[other] - flat[one]).square().sum(dim=-1)
+    start, end = edges.unbind(dim=1)
+    square = (flat[end] - flat[start]).square().sum(dim=-1)
     return Equations(
         unknowns=edges,
         coefficients=flat.new_tensor([-1.0, 1.0]).expand(len(edges), 2),
-        targets=transferred[other] - transferred[one],
+        targets=transferred[end] - transferred[start],
         information=1 / (variance * square),
         correlated=torch.ones_like(square),
         evaluated=False,
@@ -162,33 +163,33 @@ def swept_heights(
     correlated: PerVertex,
     common: SharedError | None = None,
 ) -> Equations:
-    """State where the sweep has the surface.
+    """Return equations by which heights are those of the sweep.
 
     Args:
-        transferred: Heights of the surface that was swept.
-        information: Of the offsets, each vertex's own share; one without says nothing.
+        transferred: Heights of the swept surface.
+        information: Share of each vertex in the offsets' information; 0 for no equation.
         facing: Cosine between normals and directions.
-        correlated: Vertices in a window, which have one offset.
-        common: Error that neighbours have in common, beyond their windows.
+        correlated: Number of vertices in a window, which share an offset.
+        common: Error that neighbours share beyond their windows.
     """
-    known = upright_heights(information, facing).nonzero()[:, 0]
-    steep = facing[known]
-    together = 1 / (information[known] * steep.square())
-    each = together / correlated[known]
+    vertex = upright_heights(information, facing).nonzero()[:, 0]
+    cosine = facing[vertex]
+    enlarged = 1 / (information[vertex] * cosine.square())
+    single = enlarged / correlated[vertex]
     if common is not None:
-        each = each + common.variance
-        together = together + common.variance * common.count[known]
+        single = single + common.variance
+        enlarged = enlarged + common.variance * common.count[vertex]
     return Equations(
-        unknowns=known[:, None],
-        coefficients=torch.ones_like(steep)[:, None],
-        targets=transferred[known] + offsets[known] / steep,
-        information=1 / together,
-        correlated=together / each,
+        unknowns=vertex[:, None],
+        coefficients=torch.ones_like(cosine)[:, None],
+        targets=transferred[vertex] + offsets[vertex] / cosine,
+        information=1 / enlarged,
+        correlated=enlarged / single,
     )
 
 
 def upright_heights(information: PerVertex, facing: PerVertex) -> VertexMask:
-    """Find vertices whose swept offsets determine heights."""
+    """Return the vertices whose swept offsets determine heights."""
     return (information > 0) & (facing > MIN_FACING)
 
 
@@ -197,8 +198,8 @@ class Contacts(Record):
     """Points that the surface passes through.
 
     Attributes:
-        lines: Along which they are known, unit.
-        variance: Of where they are along these; scene units squared.
+        lines: Unit direction of the line along which each point is known.
+        variance: Variance of the position along the line, squared scene units.
     """
 
     points: Points
@@ -209,11 +210,11 @@ class Contacts(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class BaseSurface(Record):
-    """The surface that heights are counted from.
+    """The current surface, relative to which contacts become heights.
 
     Attributes:
-        points: Of the subdivided mesh's vertices now.
-        reach: Points further off are not of this surface.
+        points: Current positions of the subdivision's vertices.
+        reach: Maximum distance of points that belong to the surface.
         finest: Least standard error of a point, as the surface is flat between its vertices.
     """
 
@@ -226,16 +227,16 @@ class BaseSurface(Record):
     finest: float | Scalar
 
     def nearest(self, points: Points) -> Int[Tensor, " point"]:
-        """Return the vertex nearest to each point; a constant."""
+        """Return the vertex nearest to each point. Not differentiable."""
         tree = cKDTree(self.points.detach().cpu().numpy())
         _, nearest = tree.query(points.detach().cpu().numpy())
         return torch.as_tensor(nearest, device=self.faces.device)
 
 
 def cloud_points(points: FacetPoints, surface: BaseSurface) -> Contacts:
-    """Let the surface pass through points of the cloud; lines are the directions nearest to them.
+    """Return contacts with points of the cloud, along the directions of the nearest vertices.
 
-    Differentiable; which vertex is nearest is constant.
+    Differentiable; the nearest vertex is constant.
     """
     vertex = surface.nearest(points.points_world)
     line = surface.directions[vertex]
@@ -250,12 +251,13 @@ def cloud_points(points: FacetPoints, surface: BaseSurface) -> Contacts:
 
 
 def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
-    """Let the surface touch the rays through the silhouettes.
+    """Return contacts with the rays through the silhouettes.
 
-    A ray lies in the plane that touches the surface there, so that its position on the ray
-    matters little. Where directions run along that plane, heights cannot bring the surface to it.
+    A ray is in the tangent plane of its contact, so the position along the ray matters little.
+    Contacts where directions are almost parallel to that plane are excluded, as heights cannot move
+    the surface to it.
 
-    Differentiable; where the rays touch, and which vertex is nearest, is constant.
+    Differentiable; the position of the contacts on rays, and the nearest vertex, are constant.
     """
     vertex = surface.nearest(contours.points_world)
     line = surface.directions[vertex]
@@ -270,12 +272,12 @@ def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
 
 
 def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equations:
-    """State that the surface passes through points.
+    """Return equations by which the surface passes through points.
 
-    Differentiable; which face is nearest is constant.
+    Differentiable; the nearest face is constant.
     """
     points, line = contacts.points, contacts.lines
-    # Where the line through each point meets the nearer of the faces on both sides.
+    # Intersection of the line through each point with the nearer of the faces on both sides.
     ahead, behind = caster.cast(points, line), caster.cast(points, -line)
     first = ahead.distance <= behind.distance
     hits = Hits(
@@ -284,15 +286,15 @@ def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equa
         barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
     ).refined(surface.points, surface.faces, points, line)
     lift = -hits.distance
-    met = (hits.face >= 0) & (lift.abs() <= surface.reach)
-    corners, fraction, line = surface.faces[hits.face[met]], hits.barycentric[met], line[met]
+    hit = (hits.face >= 0) & (lift.abs() <= surface.reach)
+    corners, fraction, line = surface.faces[hits.face[hit]], hits.barycentric[hit], line[hit]
     vertex = corners.gather(1, fraction.argmax(dim=1, keepdim=True))
     facing = (surface.directions[vertex[:, 0]] * line).sum(dim=-1).clamp_min(MIN_FACING)
-    variance = contacts.variance[met]
+    variance = contacts.variance[hit]
     return Equations(
         unknowns=vertex,
         coefficients=torch.ones_like(facing)[:, None],
-        targets=surface.heights[vertex[:, 0]] + lift[met] / facing,
+        targets=surface.heights[vertex[:, 0]] + lift[hit] / facing,
         information=1 / variance.clamp_min(surface.finest**2),
         correlated=torch.ones_like(variance),
     )

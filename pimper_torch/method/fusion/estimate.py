@@ -1,9 +1,9 @@
-r"""Least squares over terms of several kinds, whose noise is estimated along with the solution.
+r"""Least squares over terms of several kinds, whose noise is estimated with the solution.
 
-Every kind claims variances that are right up to one factor. The factor is what its squared
-residuals show, robustly, over what they should show: of ``m`` equations,
-their redundancy :math:`m - \mathrm{tr}(A_k A^{-1})` remains, with :math:`A_k` what the kind adds to
-the matrix of the solution. Outliers lose weight by Cauchy's function as the factors settle.
+The stated variances of a kind are correct up to one factor. It is the robust ratio of its squared
+residuals to their expectation: ``m`` equations have the redundancy
+:math:`m - \mathrm{tr}(A_k A^{-1})`, with :math:`A_k` the contribution of the kind to the matrix of
+the system. Outliers lose weight by Cauchy's function as the factors converge.
 
 Source: Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten, 1979, for
 the factors; Hutchinson, A stochastic estimator of the trace, 1989, for the trace.
@@ -29,12 +29,13 @@ from pimper_torch.method.fusion.equations import Equations
 from pimper_torch.records import Record
 from pimper_torch.runtime.failures import skipped_solver
 
-# Of the heights, in the energy norm, relative. With 1e-5 vertices of the demo move by 5e-5 of a
-# spacing, with 1e-3 by 1.6e-3; to estimate noise, that is enough. Gradients ask for more.
+# Relative tolerances of the heights in the energy norm: of results, for noise estimates, and for
+# gradients. With 1e-5 vertices of the demo move by 5e-5 of a spacing, with 1e-3 by 1.6e-3, which is
+# enough for noise estimates.
 _ACCURATE, _ESTIMATING, _EXACT = 1e-6, 1e-4, 1e-8
 
-# No source claims more than twice its true standard error: residuals of a kind that outweighs all
-# others vanish, which would raise its weight without bound.
+# Stated standard errors are assumed to be at most twice the true ones: residuals of a kind that
+# outweighs all others vanish, which would increase its weight without bound.
 _MIN_FACTOR = 0.25
 
 
@@ -43,9 +44,9 @@ class Fused(Record):
     """The heights, the noise factor of each kind of terms, and the last system.
 
     Attributes:
-        factors: What the variances that each kind claims were multiplied by.
-        weights: Of every equation of each kind; outliers have less than 1.
-        damping: Information of the heights that vertices start at.
+        factors: Noise factor by which the stated variances of each kind were multiplied.
+        weights: Robust weights of every kind's equations; outliers have less than 1.
+        damping: Information of the initial heights.
     """
 
     heights: PerVertex
@@ -57,7 +58,7 @@ class Fused(Record):
     def matrix(
         self,
     ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
-        """Return rows, columns and values of the matrix that was solved last."""
+        """Return rows, columns and values of the last system's matrix."""
         start = torch.zeros_like(self.damping)
         return _system(self.kinds, self.weights, self.factors, start, self.damping)[0]
 
@@ -69,51 +70,51 @@ def fuse_terms(
     iterations: int,
     factors: Sequence[Scalar] | None = None,
 ) -> Fused:
-    """Solve, estimate the noise, and solve again.
+    """Return the solution; solves and estimates of the noise alternate.
 
     Args:
-        kinds: Of terms; those without equations are skipped.
+        kinds: Equations of every kind; kinds without equations are skipped.
         start: Heights that vertices keep without other terms.
-        factors: Of the noise, where they are known.
+        factors: Noise factors, if known.
 
-    Differentiable in targets, coefficients, information, damping and start, through the weights and
-    the factors too: every solve answers by the implicit function. That takes as many more solves
-    as there were, once gradients are asked for.
+    Differentiable in targets, coefficients, information, damping and start, also through weights
+    and factors: every solve is differentiated by the implicit function theorem, so gradients take
+    as many solves again.
 
-    Where the equations have no solution, heights are those of the solve before, or ``start``, and
-    that is told (:func:`~pimper_torch.runtime.failures.skipped`).
+    If the equations have no solution, heights are those of the previous solve, or ``start``, and
+    this is reported (:func:`~pimper_torch.runtime.failures.skipped`).
     """
-    one = torch.ones((), dtype=torch.float64, device=start.device)
-    found = [one for _ in kinds] if factors is None else list(factors)
+    unit = torch.ones((), dtype=torch.float64, device=start.device)
+    noise = [unit for _ in kinds] if factors is None else list(factors)
     weights = [torch.ones_like(kind.information).double() for kind in kinds]
-    generator = torch.Generator().manual_seed(0)  # of signs: any will do
+    generator = torch.Generator().manual_seed(0)  # random signs for the trace; any seed
     probe = 2.0 * torch.randint(0, 2, (len(start),), generator=generator) - 1
     probe = probe.double().to(start.device)
     heights: Tensor | None = None
     try:
         for _ in range(iterations - 1):
             heights, answer = _solved(
-                kinds, weights, found, start, damping, probe, guess=heights, tolerance=_ESTIMATING
+                kinds, weights, noise, start, damping, probe, guess=heights, tolerance=_ESTIMATING
             )
             for index, kind in enumerate(kinds):
                 if not kind.evaluated or len(kind.targets) == 0:
                     continue
                 square, used = _evaluated(kind, weights[index], heights, probe, answer)
-                redundancy = 1 - used / found[index] / total(weights[index])
-                # Its estimate by random signs may be negative.
+                redundancy = 1 - used / noise[index] / total(weights[index])
+                # The estimate by random signs may be negative.
                 square = square / redundancy.clamp_min(0.05)
                 if factors is None:
                     # The factor's standard error is then below 0.2 %.
-                    found[index] = noise_factor(square[:: max(1, len(square) // 500_000)])
-                weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * found[index]))
+                    noise[index] = noise_factor(square[:: max(1, len(square) // 500_000)])
+                weights[index] = 1 / (1 + square / (CAUCHY_TUNING**2 * noise[index]))
         (heights,) = _solved(
-            kinds, weights, found, start, damping, guess=heights, tolerance=_ACCURATE
+            kinds, weights, noise, start, damping, guess=heights, tolerance=_ACCURATE
         )
     except SingularSystemError as error:
         _kept(error)
     return Fused(
         heights=start.double() if heights is None else heights,
-        factors=tuple(found),
+        factors=tuple(noise),
         kinds=tuple(kinds),
         weights=tuple(weights),
         damping=damping,
@@ -121,18 +122,18 @@ def fuse_terms(
 
 
 def fuse_like(fused: Fused, kinds: Sequence[Equations], start: PerVertex) -> Fused:
-    """Solve once more, for terms with common errors, with the weights that a solve has found.
+    """Return the solution for terms with common errors, with the weights of a previous one.
 
-    Residuals from vertex to vertex do not show what normals err by together: slopes seem to have
-    less noise than they claim, and the points that contradict them more. So slopes have a factor of
-    1 at least here, and all others of 1 at most.
+    Residuals between vertices do not contain the common error of normals: slopes seem to have less
+    noise than stated, and points that contradict them more. Therefore the factors of slopes are at
+    least 1 here, and all others at most 1.
 
     Args:
         kinds: The same terms, in order; only information and correlation may differ.
         start: Heights that vertices keep without other terms.
 
-    Differentiable as :func:`fuse_terms`, through the weights and factors too. Where the equations
-    have no solution, the heights are those of the solve before.
+    Differentiable like :func:`fuse_terms`, also through weights and factors. If the equations have
+    no solution, the heights are those of the previous solve.
     """
     factors = tuple(
         factor.clamp_max(1) if kind.unknowns.shape[1] == 1 else factor.clamp_min(1)
@@ -149,7 +150,7 @@ def fuse_like(fused: Fused, kinds: Sequence[Equations], start: PerVertex) -> Fus
 
 
 def _kept(error: SingularSystemError) -> None:
-    done = "The surface is the one before that solve: of the solve before, or of the patches"
+    done = "The surface before that solve is kept: of an earlier solve, or of the patches"
     skipped_solver("fuse", "the fusion", error, done)
 
 
@@ -159,26 +160,26 @@ def _solved(
     factors: Sequence[Scalar],
     start: PerVertex,
     damping: PerVertex,
-    *more: PerVertex,
+    *further: PerVertex,
     guess: PerVertex | None,
     tolerance: float,
 ) -> tuple[PerVertex, ...]:
-    """Solve for the heights, and for more right-hand sides of the same matrix."""
-    parts = [part for kind in kinds for part in (kind.coefficients, kind.targets, kind.information)]
-    if not compiled_for(start, damping, *parts, *weights, *factors):
+    """Return the heights, and the solutions for more right-hand sides of the same matrix."""
+    tensors = [x for kind in kinds for x in (kind.coefficients, kind.targets, kind.information)]
+    if not compiled_for(start, damping, *tensors, *weights, *factors):
         entries, rhs = _system(kinds, weights, factors, start, damping)
-        return solutions(*entries, rhs, *more, what="the fusion", tolerance=_EXACT)
+        return solutions(*entries, rhs, *further, what="the fusion", tolerance=_EXACT)
     terms = [
         (kind.unknowns, kind.coefficients, kind.targets, weight * kind.information / factor)
         for kind, weight, factor in zip(kinds, weights, factors, strict=True)
     ]
     matrix, rhs = compressed_equations(terms, damping, start)
-    near = None
+    initial = None
     if guess is not None:
-        near = torch.stack([guess, *(torch.zeros_like(guess) for _ in more)], dim=1)
-    sides = torch.stack([rhs, *more], dim=1)
-    found = solve_compressed(matrix, sides, what="the fusion", tolerance=tolerance, start=near)
-    return found.unbind(dim=1)
+        initial = torch.stack([guess, *(torch.zeros_like(guess) for _ in further)], dim=1)
+    sides = torch.stack([rhs, *further], dim=1)
+    result = solve_compressed(matrix, sides, what="the fusion", tolerance=tolerance, start=initial)
+    return result.unbind(dim=1)
 
 
 def _evaluated(
@@ -188,15 +189,15 @@ def _evaluated(
     probe: PerVertex,
     answer: PerVertex,
 ) -> tuple[Float[Tensor, " equation"], Scalar]:
-    """Return squared residuals over the claimed variance, and the number of equations used up."""
-    parts = kind.coefficients, kind.targets, kind.information, kind.correlated
-    if compiled_for(*parts, weight, heights, answer):
+    """Return squared residuals over the stated variance, and the used degrees of freedom."""
+    tensors = kind.coefficients, kind.targets, kind.information, kind.correlated
+    if compiled_for(*tensors, weight, heights, answer):
         from pimper_torch.ground.kernels import normal_equations as kernels
 
         square = torch.empty_like(weight)
         real = torch.promote_types(kind.coefficients.dtype, kind.targets.dtype)
-        arrays = [as_array(kind.unknowns), *(as_array(part, real) for part in parts)]
-        arrays += [as_array(each) for each in (weight, heights, probe, answer, square)]
+        arrays = [as_array(kind.unknowns), *(as_array(tensor, real) for tensor in tensors)]
+        arrays += [as_array(tensor) for tensor in (weight, heights, probe, answer, square)]
         evaluate: Any = kernels.judge
         return square, torch.tensor(evaluate(*arrays), dtype=torch.float64)
     square = kind.information.double() * kind.residual(heights).square() * kind.correlated
@@ -205,11 +206,10 @@ def _evaluated(
 
 
 def noise_factor(square: Float[Tensor, " equation"]) -> Scalar:
-    """Estimate the variance of Gaussian noise from its squares, robustly. Differentiable.
+    """Return a robust variance of Gaussian noise from its squares. Differentiable.
 
     Args:
-        square: Of residuals, in units of the variance that is claimed, over the fraction of the
-            equations that the solution leaves over.
+        square: Squared residuals over the stated variance and over the redundancy per equation.
 
     >>> noise = torch.randn(10000, generator=torch.Generator().manual_seed(1))
     >>> bool(abs(noise_factor(4 * noise.double().square()) - 4) < 0.2)
@@ -231,11 +231,11 @@ def _system(
     damping: PerVertex,
 ) -> tuple[tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]], PerVertex]:
     """Return rows, columns and values of the matrix, and the right-hand side."""
-    everything = torch.arange(len(start), device=start.device)
-    rows, cols, values = [everything], [everything], [damping.double()]
+    diagonal = torch.arange(len(start), device=start.device)
+    rows, cols, values = [diagonal], [diagonal], [damping.double()]
     rhs = damping.double() * start.double()
     for kind, weight, factor in zip(kinds, weights, factors, strict=True):
-        row, col, value, right = normal_equations(
+        row, col, value, side = normal_equations(
             kind.unknowns,
             kind.coefficients.double(),
             kind.targets.double(),
@@ -245,5 +245,5 @@ def _system(
         rows.append(row)
         cols.append(col)
         values.append(value)
-        rhs = rhs + right
+        rhs = rhs + side
     return (torch.cat(rows), torch.cat(cols), torch.cat(values)), rhs

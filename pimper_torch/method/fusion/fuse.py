@@ -1,7 +1,7 @@
-"""The stage that makes one surface of slopes, swept heights and the cloud's points.
+"""The stage that fuses slopes, swept heights and points of the cloud into one surface.
 
-It reads in the order of its ``forward``: the errors that facets have in common are estimated on a
-coarser subdivided mesh, and its expected error drawn there; then it is solved for at full size.
+Read it in the order of ``forward``: the errors that facets share, and the expected error, are
+estimated on a coarser subdivision; then the heights are solved for at full size.
 """
 
 import math
@@ -47,19 +47,19 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.stage import Stage
 
-# Errors that facets share are estimated on a subdivided mesh so many times as coarse. The noise
-# factors of the demo's last pass are found within 15 % on one four times as coarse, too.
+# Ratio of vertex spacings of the subdivision on which errors that facets share are estimated. Noise
+# factors of the demo's last pass are within 15 % even at a ratio of four.
 _COARSER = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Shared(Record):
-    """Errors that the terms of a facet have in common, and the solution that allows for them.
+    """Errors that the terms of a facet share, and the solution that includes them.
 
     Attributes:
-        tilt: Of the normals of each facet; ``None`` if no position tells it.
-        tilt_variance: Of what remains of it in the normals that it was added to.
-        terms: With the variance of the errors that a facet's positions have in common.
+        tilt: Tilt of the normals of each facet; ``None`` if positions do not determine it.
+        tilt_variance: Variance of the remaining tilt of corrected normals.
+        terms: Terms with the variance of the errors that a facet's positions share.
     """
 
     tilt: NormalBias | None
@@ -69,26 +69,25 @@ class _Shared(Record):
 
 
 class Fuse(Stage):
-    """Solve for the surface that agrees best with all terms, over all facets at once.
+    """Solve for the surface that agrees best with all terms, over all facets simultaneously.
 
-    Unknown is the height of every vertex of the subdivided mesh along the coarse mesh's smoothed
-    normal. Terms are linear in it: edges are at right angles to photometric normals, the sweep
-    knows heights, the cloud's points lie on the surface, rays through the silhouettes touch it, and
-    where there is no photometric normal the surface keeps its slopes, or continues those of lit
-    surface that encloses it (:mod:`~pimper_torch.ground.linalg.continuation`). Across contours and
-    folds, as seen along the directions, heights cannot follow normals, and keep their differences.
-    Each kind comes with the variances that its source claims; the factor that corrects these is
-    estimated from the residuals (:mod:`~pimper_torch.method.fusion.estimate`). Normals of one facet
-    have a common error, as they were found under one light: their tilt is estimated from the
-    positions and taken out. So have swept heights: the variance of their common error is estimated
-    from the other kinds, and limits their weight (:mod:`~pimper_torch.method.fusion.normal_bias`).
-    Detail comes from a solve with independent errors, the coarse shape from one with common errors
-    (:mod:`~pimper_torch.method.fusion.normal_bias`).
+    The unknowns are the heights of the vertices of the subdivision along smoothed normals of the
+    coarse mesh. Terms are linear in them: edges are perpendicular to photometric normals, heights
+    are those of the sweep, points of the cloud are on the surface, and rays through silhouettes are
+    tangent to it. Without photometric normals the surface keeps its slopes, or continues those of
+    lit surface that encloses it (:mod:`~pimper_torch.ground.linalg.continuation`). Across contours
+    and folds, as seen along the directions, heights cannot follow normals, and their differences
+    are kept. Each kind has the variances stated by its source, and residuals determine a factor
+    for these (:mod:`~pimper_torch.method.fusion.estimate`). Normals of a facet share an error,
+    since they were fitted under one light: their tilt is estimated from the positions and
+    subtracted. Swept heights share one as well: its variance is estimated from the other kinds, and
+    limits their weight. Detail is from a solve with independent errors, the coarse shape from one
+    with common errors (:mod:`~pimper_torch.method.fusion.normal_bias`).
 
-    The surface's normals are its own; its albedo is continued where it is not known, with
-    information 0. Differentiable in templates, normals, albedo, information, swept heights and the
-    cloud, through every solve; where vertices lie on their facets, and which patches, samples,
-    edges and faces take part, is constant.
+    The normals are vertex normals of the surface; unknown albedo is continued from known albedo,
+    with information 0. Differentiable in templates, normals, albedo, information, swept heights and
+    the cloud, through every solve. Positions of vertices on facets, and the selection of patches, samples, edges and
+    faces, are constant.
     """
 
     def __init__(
@@ -105,16 +104,15 @@ class Fuse(Stage):
     def forward(
         self, swept: SweptPatches, contours: Contours, expected: bool = True, most: float = math.inf
     ) -> Surface:
-        """Fuse what is known of all patches.
+        """Return the fused surface of all patches.
 
         Args:
             swept: Photometry and swept heights of all patches.
-            expected: Whether the expected error of every vertex is found.
-            most: Vertices of the subdivided mesh that are solved for at once, about. A surface of
-                more is solved for by overlapping blocks
-                (:mod:`~pimper_torch.method.fusion.blocks`).
+            expected: Whether to compute the expected error of every vertex.
+            most: Approximate maximum number of vertices in a solve. A larger surface is solved in
+                overlapping blocks (:mod:`~pimper_torch.method.fusion.blocks`).
 
-        The convergence's residual is the root mean square distance that the surface moved, in
+        The residual of the convergence is the root mean square distance that the surface moved, in
         scene units; its iterations are the solves at full size for the detail.
 
         Raises:
@@ -166,43 +164,43 @@ class Fuse(Stage):
     def _blended(
         self, swept: SweptPatches, whole: Subdivision, shared: _Shared, most: float
     ) -> tuple[Blend, PerVertex, Float[Tensor, "vertex channel"]]:
-        """Return all vertices' patches, heights and albedo, block by block where memory asks."""
+        """Return patches, heights and albedo of all vertices, by blocks if memory requires it."""
         mesh, coarse = swept.patches.coarse.mesh, shared.coarse
         parts = [torch.ones_like(mesh.faces[:, 0], dtype=torch.bool)]
         typical: blocks.Typical = {}
         if coarse.detail is not None:
             parts = blocks.parts_of(whole, mesh, most)
-            two = parts[:: math.ceil(len(parts) / 2)]  # enough to estimate the noise from
-            some = (self._noise(swept, whole, mine, shared) for mine in two)
-            typical = {**coarse.typical, **coarse.noise, **blocks.pooled(some)}
+            two = parts[:: math.ceil(len(parts) / 2)]  # enough for estimates of the noise
+            noise = (self._noise(swept, whole, mask, shared) for mask in two)
+            typical = {**coarse.typical, **coarse.noise, **blocks.pooled(noise)}
         channels = swept.photometric.buckets[0].albedo.shape[-1]
         values = whole.points.new_zeros(len(whole.points), 1 + channels, dtype=torch.float64)
         blends, owned = [], []
-        for mine in parts:
-            problem = self._posed(swept, whole, mine, shared, typical)
+        for mask in parts:
+            problem = self._build(swept, whole, mask, shared, typical)
             heights = self._solve(problem, shared)
             release_memory()
             blend, block = problem.blend, problem.block
             albedo = about_mean(blend.albedo, blend.observed, problem.edges)
-            found = block.weight[:, None] * torch.cat([heights[:, None], albedo], dim=1)
-            values = values.index_add(0, block.vertex, found)
+            weighted = block.weight[:, None] * torch.cat([heights[:, None], albedo], dim=1)
+            values = values.index_add(0, block.vertex, weighted)
             blends.append(blend.take(block.own))
             owned.append(block.vertex[block.own])
-            del problem, blend, block, found
+            del problem, blend, block, weighted
             release_memory()
         joined = Blend.cat(blends).take(torch.cat(owned).argsort())
         return joined, values[:, 0].to(joined.heights), values[:, 1:].to(joined.albedo)
 
-    def _posed(
+    def _build(
         self,
         swept: SweptPatches,
         whole: Subdivision,
-        mine: Bool[Tensor, " facet"],
+        mask: Bool[Tensor, " facet"],
         shared: _Shared,
         typical: blocks.Typical,
     ) -> Problem:
-        """Pose the problem of some facets, without the tilt that the normals of each share."""
-        block = blocks.block_of(whole, swept.patches.coarse.mesh.faces, mine, shared.coarse)
+        """Return the problem of a block of facets, with corrected normals."""
+        block = blocks.block_of(whole, swept.patches.coarse.mesh.faces, mask, shared.coarse)
         problem = build_problem(swept, block, self._lit)
         problem = _sloped(problem.replace(typical=typical), shared.terms)
         release_memory()
@@ -212,14 +210,14 @@ class Fuse(Stage):
         return problem.replace(photometric=normalize(problem.photometric + tilt, dim=-1))
 
     def _noise(
-        self, swept: SweptPatches, whole: Subdivision, mine: Bool[Tensor, " facet"], shared: _Shared
+        self, swept: SweptPatches, whole: Subdivision, mask: Bool[Tensor, " facet"], shared: _Shared
     ) -> dict[blocks.Key, tuple[int, Scalar]]:
-        """Return the noise factors of a block, each with the number of equations that show it."""
-        problem = self._posed(swept, whole, mine, shared, shared.coarse.typical)
-        made = _AssembledTerms.of(shared.terms, problem)
-        fused = self._fused(problem, made)
-        numbers = [len(kind.targets) for kind in fused.kinds]
-        return dict(zip(made.keys, zip(numbers, fused.factors, strict=True), strict=True))
+        """Return the noise factors of a block, each with its number of equations."""
+        problem = self._build(swept, whole, mask, shared, shared.coarse.typical)
+        assembled = _AssembledTerms.of(shared.terms, problem)
+        fused = self._fused(problem, assembled)
+        counts = [len(kind.targets) for kind in fused.kinds]
+        return dict(zip(assembled.keys, zip(counts, fused.factors, strict=True), strict=True))
 
     @property
     def _lit(self) -> bool:
@@ -232,17 +230,17 @@ class Fuse(Stage):
     def _shared(
         self, problem: Problem, terms: tuple[Term, ...], expected: bool, several: bool
     ) -> _Shared:
-        """Estimate the errors that a facet has in common, and the expected error of the heights.
+        """Return the errors that a facet shares, and the expected error of the heights.
 
-        Normals and positions are estimated from each other, in turns.
+        Normals and positions are estimated from each other, alternately.
 
         Args:
-            several: Whether the heights are needed, for several blocks.
+            several: Whether there are several blocks, which need the heights.
         """
         subdivision, facets, known = problem.subdivision, problem.facets, problem.known
-        made = _AssembledTerms.of(terms, problem)
-        trusted = made.equations(lambda term: term.position and not term.biased)
-        biased = made.equations(lambda term: term.biased)
+        assembled = _AssembledTerms.of(terms, problem)
+        trusted = assembled.equations(lambda term: term.position and not term.biased)
+        biased = assembled.equations(lambda term: term.biased)
         normals, shape = problem.photometric, problem.normals
         if (
             self.config.bias_iterations == 0
@@ -253,25 +251,25 @@ class Fuse(Stage):
                 tilt=None,
                 tilt_variance=normals.new_zeros(()),
                 terms=terms,
-                coarse=self._coarse(problem, made, expected, several),
+                coarse=self._coarse(problem, assembled, expected, several),
             )
 
-        def doubted(term: Term) -> bool:
+        def unreliable(term: Term) -> bool:
             return term.biased if trusted else term.guessed
 
-        # These are evaluated by the others first, which they would draw along.
-        taken = made.without(doubted)
+        # First evaluated against the other terms, as their error would bias these.
+        used = assembled.without(unreliable)
         vertex = torch.cat(
             [kind.unknowns[:, 0] for kind in trusted or biased] or [problem.edges.new_zeros(0)]
         )
         for _ in range(self.config.bias_iterations):
             tilt = normal_bias(subdivision, facets, normals, shape, known)
             tilted = problem.replace(tilt_variance=tilt.variance())
-            fused = self._fused(problem, taken.reassemble(tilted))
+            fused = self._fused(problem, used.reassemble(tilted))
             moved = fused.heights.to(problem.points)[:, None] * problem.directions
             shape = vertex_normals(subdivision.points + moved, subdivision.faces)
-            made, problem = made.reestimate(problem, fused.heights, vertex, doubted)
-            taken = made
+            assembled, problem = assembled.reestimate(problem, fused.heights, vertex, unreliable)
+            used = assembled
         tilt = normal_bias(subdivision, facets, normals, shape, known)
         normals = normalize(normals + tilt.at(subdivision, facets), dim=-1)
         variance = normal_bias(subdivision, facets, normals, shape, known).variance()
@@ -279,27 +277,27 @@ class Fuse(Stage):
         return _Shared(
             tilt=tilt,
             tilt_variance=variance,
-            terms=made.terms,
-            coarse=self._coarse(straight, made, expected, several, variance),
+            terms=assembled.terms,
+            coarse=self._coarse(straight, assembled, expected, several, variance),
         )
 
     def _coarse(
         self,
         problem: Problem,
-        made: "_AssembledTerms",
+        assembled: "_AssembledTerms",
         expected: bool,
         several: bool,
         tilt_variance: Scalar | None = None,
     ) -> blocks.Coarse:
-        """Solve as at full size, if anything of it is needed."""
+        """Return the solution of the coarser problem, as far as it is needed."""
         subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
         coarse, expected = blocks.Coarse(subdivision=subdivision), expected and draws > 0
         if not (expected or several):
             return coarse
-        made = made.reassemble(problem)
-        independent = correlated = self._fused(problem, made)
+        assembled = assembled.reassemble(problem)
+        independent = correlated = self._fused(problem, assembled)
         if tilt_variance is not None:
-            common = made.reassemble(problem.replace(tilt_variance=tilt_variance)).equations()
+            common = assembled.reassemble(problem.replace(tilt_variance=tilt_variance)).equations()
             correlated = fuse_like(independent, common, problem.start_of_shape)
         if several:
             start, known = problem.start, problem.known
@@ -308,10 +306,10 @@ class Fuse(Stage):
                 detail=independent.heights - start,
                 shape=correlated.heights - start,
                 exposed=exposed.double(),
-                noise=dict(zip(made.keys, independent.factors, strict=True)),
+                noise=dict(zip(assembled.keys, independent.factors, strict=True)),
                 typical={
                     SLOPES: own_slope_variance(problem),
-                    ROTATION: rotation(problem) / _COARSER,  # steps of a random walk are shorter
+                    ROTATION: rotation(problem) / _COARSER,  # shorter steps of a random walk
                 },
             )
         if not expected:
@@ -327,18 +325,17 @@ class Fuse(Stage):
         )
 
     def _solve(self, problem: Problem, shared: _Shared) -> PerVertex:
-        """Solve at full size, for the detail and once more for the coarse shape.
+        """Return the heights at full size: detail of one solve, coarse shape of a second one.
 
-        Noise is estimated anew: what the coarser mesh finds noisier than claimed may be its own
-        coarseness.
+        Noise is estimated again, as residuals may be larger on the coarser mesh.
         """
-        made = _AssembledTerms.of(shared.terms, problem)
+        terms = _AssembledTerms.of(shared.terms, problem)
         release_memory()
-        fused = self._fused(problem, made)
+        fused = self._fused(problem, terms)
         detail = fused.heights
         if shared.tilt is None:
             return detail
-        common = made.reassemble(problem.replace(tilt_variance=shared.tilt_variance)).equations()
+        common = terms.reassemble(problem.replace(tilt_variance=shared.tilt_variance)).equations()
 
         def with_coarse_shape() -> PerVertex:
             shape = fuse_like(fused, common, problem.start_of_shape).heights
@@ -352,74 +349,74 @@ class Fuse(Stage):
             done="The surface has the coarse shape of independent errors",
         )
 
-    def _fused(self, problem: Problem, made: "_AssembledTerms") -> Fused:
-        kinds, typical, iterations = made.equations(), problem.typical, self.config.noise_iterations
-        one = problem.spacing.new_ones((), dtype=torch.float64)
-        known = any(key in typical for key in made.keys)
-        factors = [typical.get(key, one) for key in made.keys] if known else None
+    def _fused(self, problem: Problem, terms: "_AssembledTerms") -> Fused:
+        kinds, typical, iterations = terms.equations(), problem.typical, self.config.noise_iterations
+        unit = problem.spacing.new_ones((), dtype=torch.float64)
+        known = any(key in typical for key in terms.keys)
+        factors = [typical.get(key, unit) for key in terms.keys] if known else None
         return fuse_terms(kinds, problem.start, problem.damping, iterations, factors)
 
 
 @dataclass(frozen=True, slots=True)
 class _AssembledTerms:
-    """Terms, with the equations that each of them has made."""
+    """Terms and the equations of each."""
 
     terms: tuple[Term, ...]
     kinds: tuple[list[Equations], ...]
 
     @classmethod
     def of(cls, terms: tuple[Term, ...], problem: Problem) -> "_AssembledTerms":
-        """Make the equations of all terms; those of points share one ray caster."""
+        """Assemble the equations of all terms; those of points share a ray caster."""
         if any(isinstance(term, Passing) and term.contacts is not None for term in terms):
             caster = RayCaster(problem.points, problem.subdivision.faces)
             problem = problem.replace(caster=caster)
         return cls(terms, tuple(term.equations(problem) for term in terms))
 
-    def equations(self, wanted: Callable[[Term], bool] = lambda _: True) -> list[Equations]:
-        """List those of all terms, or of some."""
+    def equations(self, select: Callable[[Term], bool] = lambda _: True) -> list[Equations]:
+        """Return the equations of all terms, or of selected ones."""
         pairs = zip(self.terms, self.kinds, strict=True)
-        return [one for term, kinds in pairs if wanted(term) for one in kinds]
+        return [kind for term, kinds in pairs if select(term) for kind in kinds]
 
     @property
     def keys(self) -> list[tuple[int, int]]:
-        """The term's number, and that among its kinds, of every kind."""
+        """Indices of every kind: that of its term, and its own within the term."""
         return [(term, kind) for term, kinds in enumerate(self.kinds) for kind in range(len(kinds))]
 
-    def without(self, unwanted: Callable[[Term], bool]) -> "_AssembledTerms":
-        """Leave out some terms."""
+    def without(self, exclude: Callable[[Term], bool]) -> "_AssembledTerms":
+        """Return all but the excluded terms."""
         pairs = zip(self.terms, self.kinds, strict=True)
-        terms, kinds = zip(*(pair for pair in pairs if not unwanted(pair[0])), strict=True)
+        terms, kinds = zip(*(pair for pair in pairs if not exclude(pair[0])), strict=True)
         return _AssembledTerms(terms, kinds)
 
     def reassemble(self, problem: Problem) -> "_AssembledTerms":
-        """Make the equations of tilted terms anew, for other normals or another tilt."""
+        """Return terms with the equations of tilted ones updated, for new normals or a new tilt."""
         pairs = zip(self.terms, self.kinds, strict=True)
-        made = (term.equations(problem) if term.tilted else kinds for term, kinds in pairs)
-        return _AssembledTerms(self.terms, tuple(made))
+        updated = (term.equations(problem) if term.tilted else kinds for term, kinds in pairs)
+        return _AssembledTerms(self.terms, tuple(updated))
 
     def reestimate(
         self,
         problem: Problem,
         heights: PerVertex,
         trusted: Int[Tensor, " known"],
-        doubted: Callable[[Term], bool],
+        unreliable: Callable[[Term], bool],
     ) -> tuple["_AssembledTerms", Problem]:
-        """Evaluate some terms, and make their equations anew, and what guesses leave open."""
+        """Return terms and problem, with unreliable terms reestimated and residual ones updated."""
         pairs = list(zip(self.terms, self.kinds, strict=True))
-        anew = [doubted(term) and bool(kinds) for term, kinds in pairs]
+        updated = [unreliable(term) and bool(kinds) for term, kinds in pairs]
         terms = tuple(
             term.reestimate(problem, heights, trusted) if new else term
-            for term, new in zip(self.terms, anew, strict=True)
+            for term, new in zip(self.terms, updated, strict=True)
         )
         if guessed := any(term.guessed and kinds for term, kinds in pairs):
             problem = _sloped(problem, terms)
         kinds = tuple(
             term.equations(problem) if new or (guessed and term.residual) else old
-            for term, new, old in zip(terms, anew, self.kinds, strict=True)
+            for term, new, old in zip(terms, updated, self.kinds, strict=True)
         )
         return _AssembledTerms(terms, kinds), problem
 
 
 def _sloped(problem: Problem, terms: tuple[Term, ...]) -> Problem:
-    known = [torch.zeros_like(problem.lit), *(term.sloped(problem) for term in terms)]
-    return problem.replace(sloped=torch.stack(known).any(dim=0))
+    masks = [torch.zeros_like(problem.lit), *(term.sloped(problem) for term in terms)]
+    return problem.replace(sloped=torch.stack(masks).any(dim=0))

@@ -1,13 +1,13 @@
-"""Errors that the terms of a facet have in common, as its light is fitted facet by facet.
+"""Errors that the terms of a facet share, since its light is fitted per facet.
 
-Normals know the fine detail, and positions the coarse shape. The mean difference of the two on
-every facet, blended between facets, is taken out of the normals. Swept heights are found in the
-same light: their common error is not taken out, but its variance is given. Detail is solved for
-with independent errors, the coarse shape with common errors, and both are put together.
+Normals determine fine detail, and positions the coarse shape. Their mean difference on every facet,
+blended between facets, is subtracted from the normals. Swept heights depend on the same light:
+their common error is not subtracted, but its variance is estimated. Detail is solved for with
+independent errors, the coarse shape with common errors, and the two are combined.
 
 Source: Nehab, Rusinkiewicz, Davis, Ramamoorthi: Efficiently combining positions and normals for
 precise 3D geometry, SIGGRAPH 2005, for the idea; facets, and functions linear on them,
-in place of a smoothing kernel are ours.
+instead of a smoothing kernel are ours.
 """
 
 import math
@@ -30,10 +30,11 @@ MEDIAN_OF_TILT = 2 * math.log(2)
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class NormalBias(Record):
-    """The mean difference of normals on every facet.
+    """The mean difference between the surface's normals and photometric ones, per facet.
 
     Attributes:
-        tilt: To be added to the normals; world.
+        tilt: Correction to add to the normals; world.
+        count: Number of vertices with known normals.
     """
 
     tilt: Float[Tensor, "facet 3"]
@@ -41,11 +42,11 @@ class NormalBias(Record):
     known: Bool[Tensor, " facet"]
 
     def variance(self) -> Scalar:
-        """Return the variance of a tilt, robustly, for normals that still have theirs."""
+        """Return a robust variance of the tilts of uncorrected normals, squared radians."""
         return self.tilt[self.known].square().sum(dim=-1).median() / MEDIAN_OF_TILT
 
     def at(self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> Vertices:
-        """Blend the tilts over the subdivided mesh, continuous across facets."""
+        """Return the tilt at every vertex, blended to be continuous across facets."""
         size = int(facets.max()) + 1
         corner = facets.flatten()
         weight = self.count.repeat_interleave(3)
@@ -63,12 +64,13 @@ def normal_bias(
     known: VertexMask,
     most: float = 0.25,
 ) -> NormalBias:
-    """Compare normals with those of a shape, facet by facet.
+    """Return the mean difference between normals and those of a shape, per facet.
 
     Args:
         normals: Photometric, unit.
-        shape: Of the surface, unit.
-        most: Larger differences, as across a cliff, are cut to so many radians.
+        shape: Normals of the surface, unit.
+        known: Vertices with photometric normals.
+        most: Radians to which larger differences, such as across a cliff, are clipped.
 
     Differentiable.
     """
@@ -86,35 +88,35 @@ def common_variance(
     facet: Int[Tensor, " vertex"],
     otherwise: Int[Tensor, " term"],
 ) -> Scalar:
-    """Return the variance of the error that swept heights of one facet have in common.
+    """Return the variance of the error that the swept heights of a facet share.
 
     Args:
-        found: The heights; one equation has one unknown.
-        heights: Of the surface, to which swept heights should have contributed little.
-        otherwise: Facets where the surface is known by other terms, which alone are evaluated.
+        found: Equations of swept heights, each with one unknown.
+        heights: Heights of the surface, to which swept heights should have contributed little.
+        otherwise: Facets where other terms determine the surface; only these are evaluated.
 
     Differentiable.
     """
     vertex = found.unknowns[:, 0]
     size = int(facet.max()) + 1
-    off = found.residual(heights)
-    weight = found.information.to(off)
+    residual = found.residual(heights)
+    weight = found.information.to(residual)
     total = sum_at(facet[vertex], weight, size)
-    mean = sum_at(facet[vertex], weight * off, size)
+    mean = sum_at(facet[vertex], weight * residual, size)
     used = torch.zeros_like(total, dtype=torch.bool).index_fill(0, otherwise, True) & (total > 0)
     square = (mean[used] / total[used]).square()
-    # The median of the square of unit Gaussian noise.
-    return square.median() / 0.4549 if len(square) > 0 else off.new_zeros(())
+    # 0.4549 is the median of the square of unit Gaussian noise.
+    return square.median() / 0.4549 if len(square) > 0 else residual.new_zeros(())
 
 
 def shared_error(variance: Scalar, facet: Int[Tensor, " vertex"], known: VertexMask) -> SharedError:
-    """Return the error that the known vertices of each facet have in common."""
+    """Return the error that the known vertices of each facet share."""
     count = torch.bincount(facet[known], minlength=int(facet.max()) + 1)
     return SharedError(variance=variance, count=count[facet].to(variance))
 
 
 class CoarsePart:
-    """Gives the continuous function linear on every facet that is nearest to values."""
+    """Least-squares fit of a continuous function that is linear on every facet."""
 
     def __init__(self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> None:
         self._subdivision, self._facets = subdivision, facets
@@ -123,19 +125,19 @@ class CoarsePart:
         products = fraction[:, :, None] * fraction[:, None]
         blocks = sum_at(subdivision.facet, products, len(facets))
         rows, cols = facets.mT[:, None].expand(-1, 3, -1), facets.mT.expand(3, -1, -1)
-        each = torch.arange(self._size, device=facets.device)
-        # It only keeps corners without a vertex from being singular.
-        damping = torch.full_like(each, 1e-3, dtype=fraction.dtype)
+        diagonal = torch.arange(self._size, device=facets.device)
+        # Only for corners without vertices, where the matrix would be singular.
+        damping = torch.full_like(diagonal, 1e-3, dtype=fraction.dtype)
         self._normal = prepare(
-            torch.cat([each, rows.flatten()]),
-            torch.cat([each, cols.flatten()]),
+            torch.cat([diagonal, rows.flatten()]),
+            torch.cat([diagonal, cols.flatten()]),
             torch.cat([damping, blocks.permute(1, 2, 0).flatten()]),
             self._size,
             "the fusion's coarse shape",
         )
 
     def __call__(self, values: Float[Tensor, "vertex ..."]) -> Float[Tensor, "vertex ..."]:
-        """Return it at the subdivided mesh's vertices, in one column or several. Differentiable."""
+        """Return the fit to values at all vertices, in one or more columns. Differentiable."""
         columns = values.double().reshape(len(values), -1)
         side = columns.new_zeros(self._size, columns.shape[1])
         for corner in range(3):
@@ -143,5 +145,5 @@ class CoarsePart:
             side = side.index_add(
                 0, self._facets[self._subdivision.facet, corner], fraction * columns
             )
-        at = self._normal.solve(side)
-        return self._subdivision.interpolate(at, self._facets).to(values).reshape(values.shape)
+        corners = self._normal.solve(side)
+        return self._subdivision.interpolate(corners, self._facets).to(values).reshape(values.shape)

@@ -1,4 +1,4 @@
-"""One subdivided mesh, heights of its vertices, and what patches know there."""
+"""The fusion problem: a subdivision, the unknown heights of its vertices, and the patches' data."""
 
 from dataclasses import dataclass, field
 
@@ -17,32 +17,32 @@ from pimper_torch.method.fusion.equations import BaseSurface, upright
 from pimper_torch.records import DepthPatches, Depths, FacetPoints, Record, SweptPatches
 from pimper_torch.runtime.memory import release_memory
 
-# Between its vertices the surface is flat: points know no more than this fraction of a spacing. A
-# choice.
+# Least standard error of a point, in spacings: a choice, as the surface is flat between vertices.
 FINEST = 0.03
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Problem(Record):
-    """Heights of the vertices of a subdivided mesh, which are unknown, and what patches know.
+    """Vertices of a subdivision with unknown heights, and the data of the patches.
 
     Attributes:
-        directions: Along which heights count.
-        blend: What the patches know at the vertices; offsets have one vertex's information.
-        points: Where the vertices are now, on the surface that the templates carry.
-        lit: Edges that photometric normals at both ends tell the slope of.
+        directions: Unit directions of the heights.
+        blend: Data of the patches at the vertices; offsets have the information of one vertex.
+        points: Current positions of the vertices, on the surface of the templates.
+        normals: Normals of this surface.
+        lit: Edges with photometric normals at both ends, which determine their slope.
         known: Vertices with a photometric normal.
-        sloped: Edges that terms tell the slope of.
+        sloped: Edges whose slope is determined by any term.
         spacing: Median distance between vertices, scene units.
-        correlated: Vertices in a window of the sweep, of the spacing at each.
-        density: Vertices of the finest spacing that each one stands for.
+        correlated: Number of vertices in a window of the sweep, for each vertex.
+        density: Number of vertices of the finest spacing that each one represents.
         cloud: Points of the cloud on facets, if any.
-        photometric: Normals, with or without the tilt that facets have in common.
-        tilt_variance: Of the tilt that the normals of a facet have in common, squared radians;
+        photometric: Photometric normals, with or without the tilt that facets share.
+        tilt_variance: Variance of the tilt that the normals of a facet share, squared radians;
             ``None`` for independent errors.
-        caster: Of rays on the surface, while terms are made that need it.
-        block: Of the whole subdivided mesh that this one is.
-        typical: Values that it does not show itself, as others of the mesh's blocks do.
+        caster: Ray caster of the surface, while equations that need it are assembled.
+        block: This subdivision as a part of the full one.
+        typical: Values estimated elsewhere, by all facets or by other blocks.
     """
 
     subdivision: Subdivision
@@ -67,7 +67,7 @@ class Problem(Record):
 
     @property
     def facet(self) -> Int[Tensor, " vertex"]:
-        """A facet that each vertex lies in."""
+        """A facet that contains each vertex."""
         return self.subdivision.facet
 
     @property
@@ -77,13 +77,13 @@ class Problem(Record):
 
     @property
     def border(self) -> VertexMask:
-        """Where the surface ends, or goes on beyond the block to where it does."""
+        """Vertices where the surface ends, or which no known normals enclose beyond the block."""
         ends = boundary_vertices(self.subdivision.faces, len(self.points))
         return ends & ~self.block.held | self.block.exposed
 
     @property
     def surface(self) -> BaseSurface:
-        """The surface that the vertices lie on now."""
+        """The current surface of the vertices."""
         return BaseSurface(
             points=self.points,
             faces=self.subdivision.faces,
@@ -96,7 +96,7 @@ class Problem(Record):
 
     @property
     def damping(self) -> PerVertex:
-        """Information of every vertex's present height, and of one that is held."""
+        """Information of the initial heights; that of held vertices is large."""
         square = self.spacing**2
         return torch.where(self.block.held, 1e7 / square, 1e-4 / square)
 
@@ -107,30 +107,31 @@ class Problem(Record):
 
     @property
     def start_of_shape(self) -> PerVertex:
-        """The same, with the errors that facets have in common."""
+        """``start`` for errors that facets share."""
         return self.blend.heights + self.block.shape.to(self.blend.heights)
 
 
 def subdivide_facets(swept: SweptPatches, spacing: Float[Tensor, " facet"]) -> Block:
-    """Lay a subdivided mesh over all facets, of that distance between vertices in each."""
+    """Return the subdivision of all facets, with the given vertex distance in each."""
     mesh = swept.patches.coarse.mesh
     return Block.whole(subdivide(mesh.vertices_world, mesh.faces, spacing), mesh.faces)
 
 
 def build_problem(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
-    """Blend the patches on a subdivided mesh.
+    """Return the problem of a block, with the patches blended on its subdivision.
 
     Args:
         swept: Photometry and swept heights of all patches.
+        slopes: Whether photometric normals are used.
     """
     patches = swept.patches
     subdivision, spacing = block.subdivision, block.subdivision.spacing
     directions = ray_directions(subdivision, patches.coarse)
-    some = swept.of_facets(block.facets)
-    height_fields = transferred_height_fields(some)
-    blend = blend_patches(height_fields, subdivision, directions, 4.0, some.buckets)
-    del some, height_fields
-    # A vertex stands for so many samples, each of which has its own information.
+    selected = swept.of_facets(block.facets)
+    height_fields = transferred_height_fields(selected)
+    blend = blend_patches(height_fields, subdivision, directions, 4.0, selected.buckets)
+    del selected, height_fields
+    # Each vertex represents this number of samples, which have independent information.
     density = (spacing / vertex_spacing(patches, 1.0)).square()[subdivision.facet]
     blend = blend.replace(offset_information=density * blend.offset_information)
     release_memory()
@@ -159,7 +160,7 @@ def build_problem(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
 
 
 def transferred_height_fields(swept: SweptPatches) -> DepthPatches:
-    """Take what the templates carry as their height field."""
+    """Return the depth of the templates' surface as height fields."""
     return DepthPatches(
         photometric=swept.photometric,
         buckets=tuple(

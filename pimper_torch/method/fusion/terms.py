@@ -1,7 +1,7 @@
-"""The terms of the fusion: each a kind of evidence, with its own settings, equations and variance.
+"""The terms of the fusion, each with its settings, equations and variances.
 
-A fusion takes a list of them. Leaving one out removes its effect, and one that is written elsewhere
-is added to the list: nothing else names it.
+The fusion takes a list of terms, and nothing else depends on them: to disable one, remove it from
+the list; to use a custom one, append it.
 """
 
 import math
@@ -31,43 +31,42 @@ from pimper_torch.method.fusion.problem import Problem
 KnownVertices = Int[Tensor, " known"]
 
 
-# Least squared angle from vertex to vertex, radians, and least variance of the slopes that a
-# surface has already: they keep weights finite on flat facets and exact surfaces.
+# Least squared angle between adjacent vertices, radians, and least variance of the surface's
+# slopes: they keep weights finite on flat facets and exact surfaces.
 _MIN_ROTATION, _MIN_SLOPE_VARIANCE = 1e-8, 1e-6
 
-# Normals count as if they had this standard error at least, and at most. No normals of rendered
-# scenes are as good as the one in the mean (1.5 degrees, `benchmarks/README.md`); the other only
-# keeps numbers in range.
+# Least and largest standard error of normals. Errors on rendered scenes are above the least, 1.5
+# degrees in the mean (`benchmarks/README.md`); the largest only keeps numbers in range.
 _NORMAL_ERROR_DEG = 0.25, 800.0
 
 
 # Standard error of the slopes of a surface without any photometric normal: a choice. With 8 degrees
-# a plane comes out a tenth rougher, with 4 potatoes lose a degree of their normals.
+# a plane is a tenth rougher, with 4 the normals of potatoes are a degree worse.
 UNKNOWN_SLOPE_DEG = 6.0
 
-# Errors of slopes that were not measured, over the standard error they are given: in the median
+# Ratio of errors of slopes that were not measured to their estimated standard error: in the median
 # 5.0 on the mug, 11.5 on the potatoes and 3.7 on the jar.
 UNMEASURED = 5.0
 
-# Names of what :func:`own_slope_variance` and :func:`rotation` return, among typical values.
+# Names of the results of :func:`own_slope_variance` and :func:`rotation` among typical values.
 SLOPES, ROTATION = "slopes", "rotation"
 
 
 class Term(nn.Module):
-    """A kind of evidence on the heights of vertices.
+    """A kind of residuals of the vertices' heights.
 
-    One of your own overrides :meth:`equations`, and whatever else does not suit it.
+    A custom term overrides :meth:`equations`, and other methods and attributes as needed.
 
     Attributes:
-        position: Whether it determines where the surface is, so that the tilt that the normals of a
-            facet have in common follows from it.
-        loose: Whether what it states of a facet has an error in common, whose variance the other
-            terms determine (:meth:`reestimate`).
-        guessed: Whether it is a guess: all terms that are not guesses evaluate it.
-        residual: Whether it states what other terms leave open: its equations depend on
+        position: Whether it determines positions, from which the tilt that the normals of a facet
+            share is estimated.
+        biased: Whether its equations of a facet share an error, whose variance is estimated from
+            the other terms (:meth:`reestimate`).
+        guessed: Whether it is from the views' priors: terms from the photographs evaluate it.
+        residual: Whether it covers edges that other terms do not: its equations depend on
             ``problem.sloped``.
-        tilted: Whether its normals have a tilt that those of a facet have in common: its equations
-            depend on ``problem.tilt_variance``.
+        tilted: Whether the normals of a facet share a tilt: its equations depend on
+            ``problem.tilt_variance``.
     """
 
     position: ClassVar[bool] = False
@@ -77,42 +76,43 @@ class Term(nn.Module):
     tilted: ClassVar[bool] = False
 
     def bound(self, problem: Problem, contours: Contours) -> "Term":
-        """Return the term with what it looks up once, on the coarser subdivided mesh."""
+        """Return the term with data that it computes once, on the coarser subdivision."""
         del problem, contours
         return self
 
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
-        """Find edges whose slope it determines: :class:`KeptSlopes` leaves them alone."""
+        """Return the edges whose slope it determines; :class:`KeptSlopes` skips them."""
         return torch.zeros_like(problem.lit)
 
     def equations(self, problem: Problem) -> list[Equations]:
-        """List equations of one kind each, with the variances that their source claims."""
+        """Return equations of one or more kinds, with the variances stated by their source."""
         raise NotImplementedError
 
     def reestimate(self, problem: Problem, heights: PerVertex, trusted: KnownVertices) -> "Term":
-        """Return the term with the variance of its common errors, as other terms' heights show it.
+        """Return the term with the variance of its common errors.
 
         Args:
-            firm: Vertices whose positions other terms determine.
+            heights: Heights of the surface, from the other terms.
+            trusted: Vertices whose positions other terms determine.
         """
         del problem, heights, trusted
         return self
 
 
 class Normals(Term):
-    """Edges are at right angles to the photometric normals at their ends.
+    """Edges are perpendicular to the photometric normals at their ends.
 
-    The variance is the normals' own. Without this term no normal counts anywhere in the fusion.
+    The variance is that of the normals. Without this term the fusion uses no photometric normals.
     """
 
     tilted = True
 
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
-        """Find edges between two photometric normals."""
+        """Return the edges between two photometric normals."""
         return problem.lit
 
     def equations(self, problem: Problem) -> list[Equations]:
-        """State the slopes, with the tilt that is common if ``problem`` has its variance."""
+        """Return slopes, with a common tilt if ``problem`` has its variance."""
         shared = problem.tilt_variance
         together = None if shared is None else shared_error(shared, problem.facet, problem.known)
         return [
@@ -128,13 +128,13 @@ class Normals(Term):
 
 
 class SweptHeights(Term):
-    """The sweep knows heights: with photometric normals, and with coarse ones.
+    """Heights are those of the sweep: one kind with photometric normals, one with coarse ones.
 
-    Light that was fitted to coarse normals is less exact: these have a noise of their own. The
-    variance is the sweep's.
+    Coarse normals have a separate noise factor, as light fitted to them is less accurate. The
+    variance is that of the sweep.
 
     Args:
-        variance: Of the error that the heights of a facet have in common, squared scene units.
+        variance: Variance of the error that the heights of a facet share, squared scene units.
     """
 
     position, biased = True, True
@@ -144,16 +144,16 @@ class SweptHeights(Term):
         self.variance = variance
 
     def equations(self, problem: Problem) -> list[Equations]:
-        """State the heights."""
+        """Return heights with photometric normals, and with coarse ones."""
         blend = problem.blend
         return [
             self._stated(
                 problem,
                 blend.offsets,
-                torch.where(some, blend.offset_information, 0),
+                torch.where(mask, blend.offset_information, 0),
                 problem.correlated,
             )
-            for some in (blend.seen, ~blend.seen)
+            for mask in (blend.seen, ~blend.seen)
         ]
 
     def _stated(
@@ -177,13 +177,13 @@ class SweptHeights(Term):
 
 
 class PriorNormals(Term):
-    """Edges are at right angles to the normals that were guessed of the photographs.
+    """Edges are perpendicular to the normals of the views' priors.
 
-    The variance is the guess's, of all views that see a vertex together, and that of the tilt which
-    the guesses of a facet have in common.
+    The variance is the joint variance of all views that see a vertex, plus that of the tilt that
+    the priors of a facet share.
 
     Args:
-        variance: Of that tilt, squared radians; ``None`` where nothing shows it.
+        variance: Variance of that tilt, squared radians; ``None`` if unknown.
     """
 
     biased, guessed = True, True
@@ -193,22 +193,22 @@ class PriorNormals(Term):
         self.variance = variance
 
     def _edges(self, problem: Problem) -> Bool[Tensor, " edge"]:
-        """Find edges between two guessed normals."""
+        """Return the edges between two prior normals."""
         known = problem.blend.prior_normal_information > 0
         along, normals = problem.directions, problem.blend.prior_normals_world
         return known[problem.edges].all(dim=1) & equations.upright(problem.edges, along, normals)
 
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
-        """Find those edges, if guesses are nearer to the truth than slopes that were not measured.
+        """Return the edges between prior normals, if these are better than unmeasured slopes.
 
-        A guess that is not yet evaluated is used together with these.
+        Before the variance is estimated, both are used.
         """
         unmeasured = UNMEASURED**2 * own_slope_variance(problem)
         better = self.variance is not None and bool(self.variance < unmeasured)
         return self._edges(problem) if better else torch.zeros_like(problem.lit)
 
     def equations(self, problem: Problem) -> list[Equations]:
-        """State the slopes, if anything was guessed."""
+        """Return slopes, if there are prior normals."""
         information = problem.blend.prior_normal_information
         normals = problem.blend.prior_normals_world
         edges = problem.edges[self._edges(problem)]
@@ -224,31 +224,31 @@ class PriorNormals(Term):
     def reestimate(
         self, problem: Problem, heights: PerVertex, trusted: KnownVertices
     ) -> "PriorNormals":
-        """Return the term with the variance of its tilt against the photometric normals.
+        """Return the term with the variance of its tilt relative to photometric normals.
 
-        What these are off the surface by themselves does not count.
+        The tilt of these relative to the surface is subtracted.
         """
         del trusted
-        both = problem.known & (problem.blend.prior_normal_information > 0)
-        if not bool(both.any()):
+        mask = problem.known & (problem.blend.prior_normal_information > 0)
+        if not bool(mask.any()):
             return self
         mesh, facets = problem.subdivision, problem.facets
         shape = vertex_normals(
             mesh.points + heights.to(problem.points)[:, None] * problem.directions, mesh.faces
         )
-        known, guess = problem.photometric, problem.blend.prior_normals_world
-        off = normal_bias(mesh, facets, guess, known, both, most=2.0).variance()
-        own = normal_bias(mesh, facets, known, shape, both).variance()
-        return PriorNormals((off - own).clamp_min(0))
+        normals, prior_normals = problem.photometric, problem.blend.prior_normals_world
+        total = normal_bias(mesh, facets, prior_normals, normals, mask, most=2.0).variance()
+        photometric = normal_bias(mesh, facets, normals, shape, mask).variance()
+        return PriorNormals((total - photometric).clamp_min(0))
 
 
 class PriorDepths(SweptHeights):
-    """Depths that were guessed of the photographs are heights. The variance is the guess's."""
+    """Heights are those of the views' prior depths, with the variance of the prior."""
 
     guessed = True
 
     def equations(self, problem: Problem) -> list[Equations]:
-        """State the heights, if anything was guessed."""
+        """Return heights, if there are prior depths."""
         offsets, information = problem.blend.prior_offsets, problem.blend.prior_offset_information
         if not bool(equations.upright_heights(information, problem.facing).any()):
             return []
@@ -256,31 +256,31 @@ class PriorDepths(SweptHeights):
 
 
 class CloudPoints(Term):
-    """The surface passes through the points of the cloud, of their covariance."""
+    """The surface passes through the points of the cloud, with their covariance."""
 
     position = True
 
     def bound(self, problem: Problem, contours: Contours) -> Term:
-        """Return the points with the lines along which they are known."""
+        """Return the term of the points and the lines along which they are known."""
         del contours
         cloud = problem.cloud
         return Passing(None if cloud is None else equations.cloud_points(cloud, problem.surface))
 
 
 class TouchedRays(Term):
-    """The surface touches the rays through the silhouettes, to the silhouettes' variance."""
+    """The surface is tangent to the rays through silhouettes, with the silhouettes' variance."""
 
     position = True
 
     def bound(self, problem: Problem, contours: Contours) -> Term:
-        """Return the points where the rays touch the surface that there is."""
+        """Return the term of the points where the rays touch the current surface."""
         tangent = contours.touching(problem.points, problem.normals)
         touched = len(tangent.ray) > 0
         return Passing(equations.contour_tangents(tangent, problem.surface) if touched else None)
 
 
 class Passing(Term):
-    """The surface passes through points, if there are any."""
+    """The surface passes through points; ``None`` for no points."""
 
     position = True
 
@@ -289,25 +289,25 @@ class Passing(Term):
         self.contacts = contacts
 
     def equations(self, problem: Problem) -> list[Equations]:
-        """State the heights of the vertices nearest to the points."""
+        """Return heights of the vertices nearest to the points."""
         if self.contacts is None:
             return []
         caster = problem.caster or RayCaster(problem.points, problem.subdivision.faces)
-        # Lines through points beyond a block meet it, too, where the object is thin.
+        # Where the object is thin, lines through points of other blocks intersect this one.
         contacts = self.contacts.take(problem.block.facets[self.contacts.facet])
         return [equations.passing(contacts, problem.surface, caster)]
 
 
 class KeptSlopes(Term):
-    """Where no other term determines slopes, the surface keeps its own.
+    """The surface keeps its slopes where other terms do not determine them.
 
-    Where lit surface encloses it, its normals are continued: the shape there is what the facets
-    started with, since no pass knew it. Elsewhere the shape is kept. Continued normals of a facet
-    have a common error: together they count as much as one of them. So do kept slopes within a
-    window of the sweep, or they would outvote its heights. Where there are heights, these show the
-    variance of kept slopes; elsewhere no residual does. Potatoes under one light for all views, 24
-    views of 800x600, have normals that are 7.9 degrees off, and 9.6 where each kept slope counts by
-    itself. Across contours and folds heights cannot follow normals, and go on differing as they do.
+    Where lit surface encloses an edge, normals are continued instead: the shape there is still that
+    of the facets, as no pass measured it. Continued normals of a facet share an error, so together
+    they have the weight of one. So do kept slopes within a window of the sweep, which would
+    otherwise outvote its heights. Swept heights determine the variance of kept slopes; without
+    them, residuals do not. Potatoes under one light for all views, 24 views of 800x600, have
+    normals with errors of 7.9 degrees, and 9.6 if kept slopes are independent. Across contours and
+    folds heights cannot follow normals, and height differences are kept.
 
     Args:
         unknown_deg: Standard error of the slopes of a surface without any photometric normal.
@@ -320,7 +320,7 @@ class KeptSlopes(Term):
         self.unknown_deg = unknown_deg
 
     def equations(self, problem: Problem) -> list[Equations]:
-        """State continued slopes, kept slopes with swept heights and without, and kept steps."""
+        """Return continued slopes, kept slopes with and without swept heights, and kept steps."""
         flat, along, edges = problem.subdivision.points, problem.directions, problem.edges
         start, facet = problem.blend.heights, problem.facet
         variance = own_slope_variance(problem, self.unknown_deg)
@@ -332,22 +332,22 @@ class KeptSlopes(Term):
             normals = continued(normals, ~inpainted, edges, problem.normals, damping)
             normals = normalize(normals, dim=-1)
         free = ~problem.sloped
-        over = free & inpainted[edges].any(dim=1) & equations.upright(edges, along, normals)
-        kept = free & ~over
-        level = kept & equations.upright(edges, along, problem.normals)
+        extended = free & inpainted[edges].any(dim=1) & equations.upright(edges, along, normals)
+        kept = free & ~extended
+        upright = kept & equations.upright(edges, along, problem.normals)
         swept = (problem.blend.offset_information > 0)[edges].all(dim=1)
         windows = problem.correlated.to(start)
         return [
-            equations.slopes(edges[over], flat, along, normals, together).replace(
-                correlated=(together / variance)[edges[over]].mean(dim=1), evaluated=False
+            equations.slopes(edges[extended], flat, along, normals, together).replace(
+                correlated=(together / variance)[edges[extended]].mean(dim=1), evaluated=False
             ),
             *(
                 equations.kept_slopes(
-                    edges[some], flat, along, problem.normals, start, variance * windows
-                ).replace(correlated=windows[edges[some][:, 0]], evaluated=evaluated)
-                for some, evaluated in ((level & swept, True), (level & ~swept, False))
+                    edges[mask], flat, along, problem.normals, start, variance * windows
+                ).replace(correlated=windows[edges[mask][:, 0]], evaluated=evaluated)
+                for mask, evaluated in ((upright & swept, True), (upright & ~swept, False))
             ),
-            equations.kept_steps(edges[kept & ~level], flat, start, variance),
+            equations.kept_steps(edges[kept & ~upright], flat, start, variance),
         ]
 
 
@@ -360,11 +360,11 @@ TERMS: dict[str, type[Term]] = {
     "prior_normals": PriorNormals,
     "prior_depths": PriorDepths,
 }
-"""The chain's own, by their names among settings, in the order that they are summed up."""
+"""Default terms by their names in settings, in the order in which they are summed."""
 
 
 def own_slope_variance(problem: Problem, unknown_deg: float = UNKNOWN_SLOPE_DEG) -> Scalar:
-    """Estimate the variance of the surface's own slopes from the photometric normals."""
+    """Return the variance of the surface's slopes, estimated from photometric normals."""
     if SLOPES in problem.typical:
         return problem.typical[SLOPES]
     if not bool(problem.known.any()):
@@ -375,16 +375,16 @@ def own_slope_variance(problem: Problem, unknown_deg: float = UNKNOWN_SLOPE_DEG)
 
 
 def slope_variance(information: PerVertex) -> PerVertex:
-    """Return the variance of a normal's angle along an edge, half that of both of its angles."""
+    """Return the variance of a normal's angle along an edge, half that of its two angles."""
     low, high = (math.radians(error) ** 2 for error in _NORMAL_ERROR_DEG)
     return 0.5 / information.clamp(1 / high, 1 / low)
 
 
 def rotation(problem: Problem) -> Scalar:
-    """Return the mean squared angle between normals along lit edges, folds cut; squared radians."""
+    """Return the mean squared angle between normals along lit edges, clipped; squared radians."""
     if ROTATION in problem.typical:
         return problem.typical[ROTATION]
     edges = problem.edges[problem.lit]
-    one, other = problem.normals[edges].unbind(dim=1)
-    square = (one - other).square().sum(dim=1).clamp_max(0.25**2)
+    start, end = problem.normals[edges].unbind(dim=1)
+    square = (start - end).square().sum(dim=1).clamp_max(0.25**2)
     return (total(square) / max(len(edges), 1)).clamp_min(_MIN_ROTATION)
