@@ -86,8 +86,8 @@ class Fuse(Stage):
 
     The normals are vertex normals of the surface; unknown albedo is continued from known albedo,
     with information 0. Differentiable in templates, normals, albedo, information, swept heights and
-    the cloud, through every solve. Positions of vertices on facets, and the selection of patches, samples, edges and
-    faces, are constant.
+    the cloud, through every solve. Constant: positions of vertices on facets, and the selection of
+    patches, samples, edges and faces.
     """
 
     def __init__(
@@ -350,11 +350,11 @@ class Fuse(Stage):
         )
 
     def _fused(self, problem: Problem, terms: "_AssembledTerms") -> Fused:
-        kinds, typical, iterations = terms.equations(), problem.typical, self.config.noise_iterations
+        typical, iterations = problem.typical, self.config.noise_iterations
         unit = problem.spacing.new_ones((), dtype=torch.float64)
         known = any(key in typical for key in terms.keys)
         factors = [typical.get(key, unit) for key in terms.keys] if known else None
-        return fuse_terms(kinds, problem.start, problem.damping, iterations, factors)
+        return fuse_terms(terms.equations(), problem.start, problem.damping, iterations, factors)
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,15 +119,15 @@ def _excess_variance(
     normals: list[Float[Tensor, "_ _ _ 3"]], guesses: list[PatchPriors | None]
 ) -> Scalar:
     """Return the variance of prior normals about the surface's, in excess of the stated ones."""
-    square, stated = [], []
+    squares, variances = [], []
     for bucket_normals, guess in zip(normals, guesses, strict=True):
         if guess is not None:
             valid = guess.normal_information > 0
-            square.append((guess.normals_patch - bucket_normals)[valid].square().sum(dim=-1))
-            stated.append(1 / guess.normal_information[valid])
+            squares.append((guess.normals_patch - bucket_normals)[valid].square().sum(dim=-1))
+            variances.append(1 / guess.normal_information[valid])
     # The median of the sum of two squared Gaussian components is 2 log 2 times their variance.
-    variance = torch.cat(square).median() / math.log(2)
-    stated = torch.cat(stated).median() + 1 / _SURFACE_INFORMATION
+    variance = torch.cat(squares).median() / math.log(2)
+    stated = torch.cat(variances).median() + 1 / _SURFACE_INFORMATION
     return (variance - stated).clamp_min(0)
 
 
