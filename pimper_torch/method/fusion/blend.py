@@ -309,10 +309,8 @@ class _Lists:
 
 
 def _barycentric_map(corners: Float[Tensor, "patch 3 2"]) -> Float[Tensor, "patch 3 3"]:
-    """Return the affine map from (x, y, 1) in the patch frame to barycentric coordinates.
-
-    It is not finite for a facet without area, so no ray counts as near.
-    """
+    """Return the affine map from (x, y, 1) in the patch frame to barycentric coordinates."""
+    # Not finite for a facet without area, so no ray counts as near.
     ones = torch.ones_like(corners[..., :1])
     return torch.linalg.inv_ex(torch.cat([corners, ones], dim=-1).mT).inverse
 
@@ -354,10 +352,7 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
 
 
 def _mean(
-    vertex: Int[Tensor, " estimate"],
-    weight: Float[Tensor, " estimate"],
-    layers: Float[Tensor, "estimate layer"],
-    count: int,
+    vertex: Tensor, weight: Tensor, layers: Float[Tensor, "estimate layer"], count: int
 ) -> tuple[PerVertex, Float[Tensor, "vertex value"]]:
     """Return summed information, and the mean of values weighted by it; 0 without any."""
     sums = sum_at(vertex, weight[:, None] * layers, count)

@@ -95,7 +95,7 @@ class Block(Record):
 
 
 def block_of(
-    whole: Subdivision, facets: Int[Tensor, "facet 3"], mask: Bool[Tensor, " facet"], coarse: Coarse
+    full: Subdivision, facets: Int[Tensor, "facet 3"], mask: Bool[Tensor, " facet"], coarse: Coarse
 ) -> Block:
     """Return the block of a subset of facets.
 
@@ -103,22 +103,22 @@ def block_of(
         coarse: If it is not solved, held vertices keep their heights.
     """
     if bool(mask.all()):
-        return Block.whole(whole, facets)
+        return Block.whole(full, facets)
     size = int(facets.max()) + 1
     grown = dilated(facets, mask, _RINGS, size)
-    faces, own = grown[whole.face_facet], mask[whole.facet]
-    vertex = (corners_of(whole.faces, faces, len(own)) | own).nonzero()[:, 0]
-    new_index = torch.zeros_like(whole.facet)
+    faces, own = grown[full.face_facet], mask[full.facet]
+    vertex = (corners_of(full.faces, faces, len(own)) | own).nonzero()[:, 0]
+    new_index = torch.zeros_like(full.facet)
     new_index[vertex] = torch.arange(len(vertex), device=vertex.device)
     subdivision = Subdivision(
-        points=whole.points[vertex],
-        facet=whole.facet[vertex],
-        barycentric=whole.barycentric[vertex],
-        faces=new_index[whole.faces[faces]],
-        face_facet=whole.face_facet[faces],
-        spacing=whole.spacing,
+        points=full.points[vertex],
+        facet=full.facet[vertex],
+        barycentric=full.barycentric[vertex],
+        faces=new_index[full.faces[faces]],
+        face_facet=full.face_facet[faces],
+        spacing=full.spacing,
     )
-    held = corners_of(whole.faces, ~faces, len(own))[vertex]
+    held = corners_of(full.faces, ~faces, len(own))[vertex]
 
     def on_border(values: Float[Tensor, " _"] | None) -> Float[Tensor, " _"]:
         zeros = torch.zeros(len(held), dtype=torch.float64, device=held.device)
@@ -155,14 +155,14 @@ def pooled(samples: Iterable[Mapping[Key, tuple[int, Scalar]]]) -> Typical:
     return {key: value / count[key] for key, value in total.items()}
 
 
-def parts_of(whole: Subdivision, mesh: Mesh, most: float) -> list[Bool[Tensor, " facet"]]:
+def parts_of(full: Subdivision, mesh: Mesh, most: float) -> list[Bool[Tensor, " facet"]]:
     """Return parts of the facets, halved across their longest side until blocks are small enough.
 
     Args:
         most: Approximate maximum number of vertices of a block; one of a single facet may have
             more.
     """
-    count = torch.bincount(whole.facet, minlength=len(mesh.faces))
+    count = torch.bincount(full.facet, minlength=len(mesh.faces))
     centre = mesh.vertices_world.detach()[mesh.faces].mean(dim=1)
     pending, parts = [torch.arange(len(count), device=count.device)], []
     while pending:

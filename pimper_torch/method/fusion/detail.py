@@ -44,9 +44,9 @@ def _apart(
     templates: Templates, photometry: Photometry, heights: Heights, max_lost: float
 ) -> Float[Tensor, " patch"]:
     """Return the vertex spacing of each facet, in finest spacings."""
-    own = (templates.barycentric >= 0).all(dim=-1)
+    on_facet = (templates.barycentric >= 0).all(dim=-1)
     observed, albedo = photometry.observed, photometry.albedo
-    bright = _MAX_ALBEDO * _mean(albedo.mean(dim=-1), own & observed)
+    bright = _MAX_ALBEDO * _mean(albedo.mean(dim=-1), on_facet & observed)
     flat = (_MAX_HEIGHT * templates.spacing).square()
     limits = [
         (albedo, observed, albedo.shape[-1] * bright.square()),
@@ -55,15 +55,15 @@ def _apart(
     normals, offset = photometry.normals_patch, heights.offset[..., None]
     for values, information in (normals, photometry.information), (offset, heights.information):
         known = information > 0
-        variance = _mean(1 / torch.where(known, information, 1), own & known)
+        variance = _mean(1 / torch.where(known, information, 1), on_facet & known)
         limits.append((values, known, max_lost * variance))
     factor = torch.ones_like(bright)
     smooth = factor > 0
     # At least eight pieces a side: a small curved facet of a cap was too stiff with four.
-    enough = own.sum(dim=(1, 2)) / (math.sqrt(3) / 4 * 16**2)
+    enough = on_facet.sum(dim=(1, 2)) / (math.sqrt(3) / 4 * 16**2)
     for step in (1, 2):  # a choice: at least a sixteenth of the vertices
         for values, known, limit in limits:
-            smooth &= _lost(values, known, own, step) <= limit
+            smooth &= _lost(values, known, on_facet, step) <= limit
         smooth &= enough >= step**2
         factor = torch.where(smooth, 2 * step, factor)
     return factor

@@ -234,10 +234,7 @@ class BaseSurface(Record):
 
 
 def cloud_points(points: FacetPoints, surface: BaseSurface) -> Contacts:
-    """Return contacts with points of the cloud, along the directions of the nearest vertices.
-
-    Differentiable; the nearest vertex is constant.
-    """
+    """Return contacts with cloud points; differentiable except in the nearest vertex."""
     vertex = surface.nearest(points.points_world)
     line = surface.directions[vertex]
     covariance = points.covariance_world.to(line)
@@ -272,10 +269,7 @@ def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
 
 
 def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equations:
-    """Return equations by which the surface passes through points.
-
-    Differentiable; the nearest face is constant.
-    """
+    """Return equations for the surface to contain points; differentiable, nearest face constant."""
     points, line = contacts.points, contacts.lines
     # Intersection of the line through each point with the nearer of the faces on both sides.
     ahead, behind = caster.cast(points, line), caster.cast(points, -line)

@@ -162,22 +162,22 @@ class Fuse(Stage):
         )
 
     def _blended(
-        self, swept: SweptPatches, whole: Subdivision, shared: _Shared, most: float
+        self, swept: SweptPatches, full: Subdivision, shared: _Shared, most: float
     ) -> tuple[Blend, PerVertex, Float[Tensor, "vertex channel"]]:
         """Return patches, heights and albedo of all vertices, by blocks if memory requires it."""
         mesh, coarse = swept.patches.coarse.mesh, shared.coarse
         parts = [torch.ones_like(mesh.faces[:, 0], dtype=torch.bool)]
         typical: blocks.Typical = {}
         if coarse.detail is not None:
-            parts = blocks.parts_of(whole, mesh, most)
+            parts = blocks.parts_of(full, mesh, most)
             two = parts[:: math.ceil(len(parts) / 2)]  # enough for estimates of the noise
-            noise = (self._noise(swept, whole, mask, shared) for mask in two)
+            noise = (self._noise(swept, full, mask, shared) for mask in two)
             typical = {**coarse.typical, **coarse.noise, **blocks.pooled(noise)}
         channels = swept.photometric.buckets[0].albedo.shape[-1]
-        values = whole.points.new_zeros(len(whole.points), 1 + channels, dtype=torch.float64)
+        values = full.points.new_zeros(len(full.points), 1 + channels, dtype=torch.float64)
         blends, owned = [], []
         for mask in parts:
-            problem = self._build(swept, whole, mask, shared, typical)
+            problem = self._build(swept, full, mask, shared, typical)
             heights = self._solve(problem, shared)
             release_memory()
             blend, block = problem.blend, problem.block
@@ -194,13 +194,13 @@ class Fuse(Stage):
     def _build(
         self,
         swept: SweptPatches,
-        whole: Subdivision,
+        full: Subdivision,
         mask: Bool[Tensor, " facet"],
         shared: _Shared,
         typical: blocks.Typical,
     ) -> Problem:
         """Return the problem of a block of facets, with corrected normals."""
-        block = blocks.block_of(whole, swept.patches.coarse.mesh.faces, mask, shared.coarse)
+        block = blocks.block_of(full, swept.patches.coarse.mesh.faces, mask, shared.coarse)
         problem = build_problem(swept, block, self._lit)
         problem = _sloped(problem.replace(typical=typical), shared.terms)
         release_memory()
@@ -210,10 +210,10 @@ class Fuse(Stage):
         return problem.replace(photometric=normalize(problem.photometric + tilt, dim=-1))
 
     def _noise(
-        self, swept: SweptPatches, whole: Subdivision, mask: Bool[Tensor, " facet"], shared: _Shared
+        self, swept: SweptPatches, full: Subdivision, mask: Bool[Tensor, " facet"], shared: _Shared
     ) -> dict[blocks.Key, tuple[int, Scalar]]:
         """Return the noise factors of a block, each with its number of equations."""
-        problem = self._build(swept, whole, mask, shared, shared.coarse.typical)
+        problem = self._build(swept, full, mask, shared, shared.coarse.typical)
         assembled = _AssembledTerms.of(shared.terms, problem)
         fused = self._fused(problem, assembled)
         counts = [len(kind.targets) for kind in fused.kinds]

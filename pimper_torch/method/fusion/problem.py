@@ -118,12 +118,7 @@ def subdivide_facets(swept: SweptPatches, spacing: Float[Tensor, " facet"]) -> B
 
 
 def build_problem(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
-    """Return the problem of a block, with the patches blended on its subdivision.
-
-    Args:
-        swept: Photometry and swept heights of all patches.
-        slopes: Whether photometric normals are used.
-    """
+    """Return a block's problem, with the patches blended; ``slopes`` enables their normals."""
     patches = swept.patches
     subdivision, spacing = block.subdivision, block.subdivision.spacing
     directions = ray_directions(subdivision, patches.coarse)

@@ -224,10 +224,7 @@ class PriorNormals(Term):
     def reestimate(
         self, problem: Problem, heights: PerVertex, trusted: KnownVertices
     ) -> "PriorNormals":
-        """Return the term with the variance of its tilt relative to photometric normals.
-
-        The tilt of these relative to the surface is subtracted.
-        """
+        """Return the term with the variance of its tilt to photometric normals, less their own."""
         del trusted
         mask = problem.known & (problem.blend.prior_normal_information > 0)
         if not bool(mask.any()):

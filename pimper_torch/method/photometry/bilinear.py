@@ -191,12 +191,9 @@ def update_shading(
 
 
 def tangent_step(manifold: Manifold, packed: Packed, slope: Shading, shading: Shading) -> Shading:
-    r"""Return shading after the step :math:`(B^\top A B)^{-1} B^\top r`, ``B`` the tangents.
+    r"""Return shading ``s`` after the step :math:`(B^\top A B)^{-1} B^\top r`, of bounded length.
 
-    Args:
-        packed: ``A``.
-        slope: ``r = b - A s``.
-        shading: ``s``.
+    ``A`` is packed, ``B`` are the tangents, and ``slope`` is ``r = b - A s``.
     """
     columns = manifold.tangents(shading)
     descent = quadratics.coordinates(columns, slope)

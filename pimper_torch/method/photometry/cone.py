@@ -52,10 +52,7 @@ def project_to_cone(shading: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch
 
 
 def split_shading(shading: Float[Tensor, "*batch 4"]) -> tuple[Scalars, Vectors]:
-    """Return albedo and unit normal of vectors on the cone.
-
-    The normal of a vector without direction is zero. Differentiable away from the apex.
-    """
+    """Return albedo and unit normal of vectors on the cone; zero without gradient at the apex."""
     albedo, *vector = shading.unbind(dim=-1)
     length, directed = _length(vector)
     return albedo, _vectors([torch.where(directed, axis / length, 0) for axis in vector])

@@ -47,8 +47,7 @@ _VIEWS, _FEWEST, _WIDEST_DEG = 16, 8, 45.0
 # iterations. Choices: 8 bits are 0.4 % of white, and shadows and highlights are not noise.
 _NOISE, _FLOOR, _ITERATIONS = 0.03, 0.004, 4
 
-# Fraction of the trace of the normal equations that is added to their diagonal: a choice; the
-# precision of float32 is 1e-7.
+# Ridge of the normal equations over their trace: a choice; float32 has a precision of 1e-7.
 _RIDGE = 1e-6
 
 # Side of the windows in which costs and depths are averaged, pixels of the raster.
@@ -111,7 +110,7 @@ class _Rays(Record):
         rays_world: Ray vectors to depth 1.
         first: Depth of the first sample on each ray.
         step: Depth between samples.
-        in_hull: Whether each depth sample is inside the visual hull.
+        in_hull: Whether each depth sample is swept: inside the visual hull, or just in front.
     """
 
     views: Int[Tensor, " view"]
@@ -187,8 +186,8 @@ class DepthFromLight(Stage):
         test_rays = all_rays[:_TEST_VIEWS]
         swept = _sweep(lit, test_rays)
         caster, size = RayCaster(vertices, mesh.faces), (vertices.amax(0) - vertices.amin(0)).norm()
-        wrong = [_contradicted(*pair, caster, size) for pair in zip(test_rays, swept, strict=True)]
-        if not wrong or float(torch.cat(wrong).double().mean()) < _WRONG:
+        masks = [_contradicted(*pair, caster, size) for pair in zip(test_rays, swept, strict=True)]
+        if not masks or float(torch.cat(masks).double().mean()) < _WRONG:
             return empty
         swept += _sweep(lit, all_rays[_TEST_VIEWS:])
         for _ in range(_ROUNDS):
@@ -367,8 +366,8 @@ def _smoothed(rays: _Rays, index: Float[Tensor, " ray"]) -> tuple[Points, Points
     """Return points at smoothed depths, and their normals; NaN near gaps of the raster."""
     side = _WINDOW // 2
     depth = rays.first + rays.step * index
-    around = pad(rays.to_raster(depth[None]), (side,) * 4, value=torch.nan)[0]
-    windows = around.unfold(0, _WINDOW, 1).unfold(1, _WINDOW, 1).flatten(2)
+    padded = pad(rays.to_raster(depth[None]), (side,) * 4, value=torch.nan)[0]
+    windows = padded.unfold(0, _WINDOW, 1).unfold(1, _WINDOW, 1).flatten(2)
     depth = rays.averaged(windows.nanmedian(dim=2).values[rays.inside][None])[0]
     points = rays.eye_world + depth[:, None] * rays.rays_world
     grid = pad(rays.to_raster(points.mT), (side,) * 4, value=torch.nan)
@@ -380,10 +379,7 @@ def _smoothed(rays: _Rays, index: Float[Tensor, " ray"]) -> tuple[Points, Points
 
 
 def _mapped(photometric: Points, normals: Points) -> Points:
-    """Return photometric normals mapped to those of the depths by one linear map.
-
-    Depths are rough; photometric normals are smooth.
-    """
+    """Return smooth photometric normals, mapped by one linear map to the rough ones of depths."""
     weight = torch.ones_like(photometric[:, :1])
     for _ in range(10):
         weighted = (weight * photometric).mT

@@ -120,13 +120,10 @@ class SurfaceNormals(FactorPrior):
 
 
 class MapPriors(FactorPrior):
-    """Prior of normals, albedo, lights and inliers from the views' prior maps and their variance.
-
-    Albedo and lights are scaled by a factor per patch.
-    """
+    """Prior of normals, albedo, lights and inliers from the views' prior maps and variances."""
 
     def forward(self, samples: PatchSamples) -> PriorTerms:
-        """Return the prior maps in the scale of the light field and of the albedo under it."""
+        """Return prior maps; albedo and lights are scaled per patch, by the light field."""
         terms = PriorTerms(normals=samples.guessed_normals, inlier=samples.guessed_inlier)
         if (information := samples.guessed_information) is not None:
             terms = terms.replace(normal_weight=views_worth(information))
@@ -157,8 +154,6 @@ def _median_ratio(
 
 
 def views_worth(information: Scalars) -> Scalars:
-    """Return the number of views that give the same information on an angle or relative albedo.
-
-    It is at most one, so that photographs outweigh guesses.
-    """
+    """Return the number of views with the same information on an angle or on relative albedo."""
+    # At most one, so that photographs outweigh priors.
     return (RELATIVE_NOISE**2 * information).clamp_max(1)

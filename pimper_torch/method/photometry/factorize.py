@@ -197,9 +197,8 @@ class Factorize(Stage):
         counts = rows.seen.sum(dim=2)
         constant = undetermined & ~light_varies(prior_mean, counts, config.min_light_variation)
         rows = rows.only(lit | constant[:, None, None])
-        prior_mean = torch.where(
-            undetermined[:, None, None], recomputed(_exposed, rows, prior_mean), prior_mean
-        )
+        exposed = recomputed(_exposed, rows, prior_mean)
+        prior_mean = torch.where(undetermined[:, None, None], exposed, prior_mean)
         variance = light.guess_variance
         problem = self._problem(rows, prior_mean, undetermined, raster, bucket.registered, variance)
         return rows, status, problem
@@ -334,21 +333,16 @@ def _lit(
     illuminated: PatchMasks,
     shadowed: PatchMasks,
 ) -> tuple[Bool[Tensor, "patch view sample"], Float[Tensor, "patch view 4"]]:
-    """Return the samples under first-order light, and that light.
-
-    It is the room's light in views where a patch is mostly in shadow of the lamp.
-    """
+    """Return the samples under first-order light, and that light."""
     lights, soft, point_light = lights_in_patches(field, patch_from_world)
-    lit = (
-        flatten_samples(illuminated, rows.index)
-        & rows.seen
-        & faces_light(point_light, rows.normals)
-    )
+    lit = flatten_samples(illuminated, rows.index) & rows.seen
+    lit &= faces_light(point_light, rows.normals)
     shaded = flatten_samples(shadowed, rows.index) | faces_light(-point_light, rows.normals)
     # Directed soft light whose shading is strong compared with the point light.
     directed, strength = (soft[..., 1:] != 0).any(dim=-1), point_light.norm(dim=-1)
     strong = directed & (strength > 0) & (soft[..., 0] - soft[..., 3] > strength / 4)
     by_soft = shaded & rows.seen & strong[..., None]
+    # The room's light in views where a patch is mostly in shadow of the lamp.
     in_room = (by_soft.sum(dim=2) > lit.sum(dim=2))[..., None]
     return torch.where(in_room, by_soft, lit), torch.where(in_room, soft, lights)
 

@@ -65,11 +65,7 @@ class FitLight(Stage):
         self.config = config or FitLightConfig()
 
     def forward(self, seen: PatchViews) -> Illumination:
-        """Return the light of all views.
-
-        Args:
-            seen: Samples of all patches; templates may be thinned.
-        """
+        """Return the light of all views, from samples of all patches, which may be thinned."""
         coarse = [transferred_normals(seen.patches.coarse, each) for each in seen.patches.buckets]
         field = self._field(seen, coarse)
         variance = field.soft.new_zeros(())

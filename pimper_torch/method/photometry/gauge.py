@@ -26,11 +26,7 @@ class FixGauge(Stage):
         self.config = config or FactorizeConfig()
 
     def forward(self, solved: PhotometricPatches) -> PhotometricPatches:
-        """Return patches with albedo divided by the percentile, and lights multiplied by it.
-
-        Args:
-            solved: All patches.
-        """
+        """Return all patches, with albedo divided by the percentile and lights multiplied by it."""
         config = self.config
         status = torch.cat([bucket.status for bucket in solved.buckets])
         mesh, facets = solved.patches.coarse.mesh, [x.facet for x in solved.patches.buckets]

@@ -51,11 +51,7 @@ def linearized(lights: Float[Tensor, "view 9"], normals: Points) -> Float[Tensor
 def rotate_lights(
     target_from_source: Float[Tensor, "*#batch 4 4"], lights: Float[Tensor, "*#batch view 4"]
 ) -> Float[Tensor, "*batch view 4"]:
-    """Return lights in the target frame: ``l_0`` is unchanged, the vector part rotates.
-
-    Shading ``l . (1, n)`` is the same in both frames. Only the rotation of the rigid transform
-    matters.
-    """
+    """Return lights rotated to the target frame; ``l_0`` and shading ``l . (1, n)`` are kept."""
     rotated = lights[..., 1:] @ target_from_source[..., :3, :3].mT
     return torch.cat([lights[..., :1].expand_as(rotated[..., :1]), rotated], dim=-1)
 

@@ -230,11 +230,7 @@ class LightModel:
         return inside
 
     def initialize(self, samples: ImageSamples) -> Unknowns:
-        """Return initial lights and albedo.
-
-        Soft light is along the mean normal, with the median radiance of each view. Ambient and
-        point light are those of :func:`search_point_lights`.
-        """
+        """Return initial lights and albedo; soft light is along the mean normal."""
         if self.normals is None:
             gain, albedo = samples.brightness()
             mean = self.basis.mean(dim=0)

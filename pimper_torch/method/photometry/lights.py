@@ -167,13 +167,11 @@ def fit_light_field(
         scales.append(ratio.median() if len(ratio) else scales[0])
     order = torch.cat([torch.arange(first, views, step) for first in range(step)]).argsort()
     lights, point_lights = (
-        torch.cat([scale * fit[part] for scale, fit in zip(scales, fits, strict=True)])[order]
-        for part in (0, 1)
+        torch.cat([scale * fit[column] for scale, fit in zip(scales, fits, strict=True)])[order]
+        for column in (0, 1)
     )
-    inverse_distance = torch.cat([fit[3] for fit in fits])[order]
-    inverse_distance = (
-        torch.zeros_like(inverse_distance) if points is None else inverse_distance / size
-    )
+    relative = torch.cat([fit[3] for fit in fits])[order]
+    inverse_distance = torch.zeros_like(relative) if points is None else relative / size
     square = lights.square().sum(dim=1) + point_lights.square().sum(dim=1)
     factor = square[square > 0].sqrt().median().nan_to_num(nan=1.0)
     return LightField(

@@ -67,12 +67,10 @@ def light_varies(
 def warn_of_undetermined(
     buckets: Sequence[Photometry], min_views: int, min_light_variation: float
 ) -> None:
-    """Warn, with counts by cause, if light does not determine the normals of most patches.
-
-    :mod:`pimper_torch.runtime.failures` reports failed patches.
-    """
+    """Warn, with counts by cause, if light does not determine the normals of most patches."""
     statuses = Counter(code for bucket in buckets for code in bucket.status.tolist())
     total = sum(statuses.values())
+    # Failed patches are reported by runtime.failures.
     undetermined = total - statuses[PatchStatus.DETERMINED] - statuses[PatchStatus.FAILED]
     if undetermined <= _MAX_UNDETERMINED * total:
         return

@@ -93,7 +93,6 @@ def curvature_of_lights(
     """Return the Gauss-Newton matrices ``H``, unknowns ordered by view, with regularization.
 
     Args:
-        problem: Problem with manifold, regularization and prior.
         samples: Approximate number of evenly spaced samples to sum over; all if ``None``.
     """
     rank = lights.shape[2]
