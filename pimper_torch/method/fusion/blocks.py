@@ -77,7 +77,7 @@ class Block(Record):
     exposed: VertexMask
 
     @classmethod
-    def whole(cls, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> "Block":
+    def full(cls, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> "Block":
         """Return the block of all facets."""
         index = torch.arange(len(subdivision.points), device=facets.device)
         ones = torch.ones((), dtype=torch.float64, device=facets.device).expand(len(index))
@@ -103,7 +103,7 @@ def block_of(
         coarse: If it is not solved, held vertices keep their heights.
     """
     if bool(mask.all()):
-        return Block.whole(full, facets)
+        return Block.full(full, facets)
     size = int(facets.max()) + 1
     grown = dilated(facets, mask, _RINGS, size)
     faces, own = grown[full.face_facet], mask[full.facet]

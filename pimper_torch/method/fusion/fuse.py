@@ -289,7 +289,7 @@ class Fuse(Stage):
         several: bool,
         tilt_variance: Scalar | None = None,
     ) -> blocks.Coarse:
-        """Return the solution of the coarser problem, as far as it is needed."""
+        """Return the needed values of the coarser problem's solution."""
         subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
         coarse, expected = blocks.Coarse(subdivision=subdivision), expected and draws > 0
         if not (expected or several):

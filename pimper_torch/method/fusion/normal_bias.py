@@ -83,7 +83,7 @@ def normal_bias(
 
 
 def common_variance(
-    found: Equations,
+    swept: Equations,
     heights: PerVertex,
     facet: Int[Tensor, " vertex"],
     otherwise: Int[Tensor, " term"],
@@ -91,16 +91,16 @@ def common_variance(
     """Return the variance of the error that the swept heights of a facet share.
 
     Args:
-        found: Equations of swept heights, each with one unknown.
+        swept: Equations of swept heights, each with one unknown.
         heights: Heights of the surface, to which swept heights should have contributed little.
         otherwise: Facets where other terms determine the surface; only these are evaluated.
 
     Differentiable.
     """
-    vertex = found.unknowns[:, 0]
+    vertex = swept.unknowns[:, 0]
     size = int(facet.max()) + 1
-    residual = found.residual(heights)
-    weight = found.information.to(residual)
+    residual = swept.residual(heights)
+    weight = swept.information.to(residual)
     total = sum_at(facet[vertex], weight, size)
     mean = sum_at(facet[vertex], weight * residual, size)
     used = torch.zeros_like(total, dtype=torch.bool).index_fill(0, otherwise, True) & (total > 0)

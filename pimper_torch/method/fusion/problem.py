@@ -114,7 +114,7 @@ class Problem(Record):
 def subdivide_facets(swept: SweptPatches, spacing: Float[Tensor, " facet"]) -> Block:
     """Return the subdivision of all facets, with the given vertex distance in each."""
     mesh = swept.patches.coarse.mesh
-    return Block.whole(subdivide(mesh.vertices_world, mesh.faces, spacing), mesh.faces)
+    return Block.full(subdivide(mesh.vertices_world, mesh.faces, spacing), mesh.faces)
 
 
 def build_problem(swept: SweptPatches, block: Block, slopes: bool) -> Problem:

@@ -90,7 +90,7 @@ class ImageSamples:
         return self.seen * cauchy_weights(residual, scale)
 
     def brightness(self) -> tuple[Float[Tensor, " view"], Albedo]:
-        """Return the median radiance of each view, and of each sample relative to its views."""
+        """Return the median radiance of each view, and of each sample relative to these."""
         missing = torch.where(self.seen, self.radiance, torch.nan)
         gain = missing.nanmedian(dim=0).values.nan_to_num(nan=0.0)
         valid = self.seen & (gain > 0)
