@@ -351,9 +351,7 @@ def _blend(estimates: _Estimates, count: int, outlier_samples: float) -> Blend:
     )
 
 
-def _mean(
-    vertex: Tensor, weight: Tensor, layers: Float[Tensor, "estimate layer"], count: int
-) -> tuple[PerVertex, Float[Tensor, "vertex value"]]:
+def _mean(vertex: Tensor, weight: Tensor, layers: Tensor, count: int) -> tuple[PerVertex, Tensor]:
     """Return summed information, and the mean of values weighted by it; 0 without any."""
     sums = sum_at(vertex, weight[:, None] * layers, count)
     information = sums[:, 0]
