@@ -75,7 +75,7 @@ def cuts_of(masks: Tensor, margins_px: Tensor) -> Cuts:
         margins_px=margins_px,
         exposed=none,
         held=1 + none,
-        doubted=none > 0,
+        rejected=none > 0,
         agreement=None,
     )
 

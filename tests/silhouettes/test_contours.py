@@ -68,5 +68,5 @@ def test_above_a_plane_is_held_and_its_points_are_used(cameras):
 def test_silhouettes_without_a_common_place_are_told_of(cameras):
     silhouettes = silhouettes_of(ball, cameras)
     nothing = silhouettes.replace(inside=torch.zeros_like(silhouettes.inside))
-    with pytest.warns(PimperWarning, match="no place in common"):
+    with pytest.warns(PimperWarning, match="no point in common"):
         assert not TraceContours()(nothing, cameras).confine

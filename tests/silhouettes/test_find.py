@@ -82,8 +82,8 @@ def test_a_view_abstains_where_something_stands_before_the_object(staged, monkey
         column = int(staged.truth[view].any(dim=0).nonzero().double().mean())
         person[view, :, column : column + 60] = True
     cut = staged.truth & ~person
-    monkeypatch.setattr(cuts, "_first", lambda cues: cut)
-    monkeypatch.setattr(cuts, "_again", lambda cues, masks, seen, unknown: cut)
+    monkeypatch.setattr(cuts, "_initial_cuts", lambda cues: cut)
+    monkeypatch.setattr(cuts, "_cut_again", lambda cues, masks, seen, unknown: cut)
     monkeypatch.setattr(Cues, "relearned", lambda cues, masks: cues)
     known = cues.replace(agreement=agreement.where(~person, -0.2))
     carved = cues.replace(agreement=agreement.where(~person, 0.95))
@@ -171,12 +171,12 @@ def test_a_mask_of_a_view_that_the_border_cuts_is_right(staged):
 def test_masks_of_which_no_majority_agrees_are_refused(staged):
     masks = staged.truth.clone()
     masks[::2] = ~masks[::2]
-    with pytest.raises(InputError, match="masks contradict one another, and no more than half"):
+    with pytest.raises(InputError, match="masks contradict each other, and at most half"):
         FindSilhouettes()(with_masks(staged.scene, masks))
 
 
 def test_masks_are_asked_for_and_missing(staged):
-    with pytest.raises(InputError, match="come without any"):
+    with pytest.raises(InputError, match="photographs have no masks"):
         FindSilhouettes(SilhouetteConfig(object="masks"))(staged.scene)
 
 
@@ -185,7 +185,7 @@ def test_silhouettes_that_contradict_one_another_are_not_trusted(staged):
     views = staged.scene.views
     shifted = [image.roll(90 * (view % 2) - 45, 2) for view, image in enumerate(views.images)]
     scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))
-    with pytest.warns(PimperWarning, match=r"is taken for the object.*`silhouettes.region`"):
+    with pytest.warns(PimperWarning, match=r"is treated as the object.*`silhouettes.region`"):
         assert FindSilhouettes(SMALL)(scene).source == "everything"
 
 
@@ -201,7 +201,9 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
     nonsense = shapes.cuts_of(masks, projections)
     monkeypatch.setattr(find, "cut_in_iterations", lambda _: nonsense)
     overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
-    with pytest.warns(PimperWarning, match=f"above the plane.*by {overlap_percent:.0f}%"):
+    with pytest.warns(
+        PimperWarning, match=f"above the supporting plane.*by {overlap_percent:.0f}%"
+    ):
         silhouettes = FindSilhouettes(SMALL)(staged.scene)
     assert silhouettes.source == "everything"
     # The ball stands on z = 0; what is a few hundredths thick is the table.
@@ -225,7 +227,7 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
 
 @pytest.mark.parametrize(
     ("grown_px", "why"),
-    [(20, "show what is behind the object on"), (-20, "hold [0-9]+% of the object's points")],
+    [(20, "show background on"), (-20, "contain [0-9]+% of the object's points")],
 )
 def test_silhouettes_that_all_err_alike_are_not_trusted(staged, monkeypatch, grown_px, why):
     """Hulls twice and half as wide as the ball: all views agree with them."""
@@ -346,7 +348,9 @@ def test_a_region_is_two_corners():
 
 def test_a_region_that_nothing_shows_is_refused(staged):
     away = SilhouetteConfig(size_px=240, region=(50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
-    with pytest.raises(InputError, match="no photograph shows and no point of the cloud is in"):
+    with pytest.raises(
+        InputError, match="no photograph shows it, and no point of the cloud is in it"
+    ):
         FindSilhouettes(away)(staged.scene)
     tiny = SilhouetteConfig(size_px=240, region=(0.0, 0.0, 0.4, 1e-6, 1e-6, 0.400001))
     with pytest.warns(PimperWarning, match="Everything"):  # shown, though no point is in it

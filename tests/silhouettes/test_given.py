@@ -101,7 +101,7 @@ def order(*changed):
             lambda masks: torch.stack([masks, masks.flip(1, 2)], dim=1)[
                 torch.arange(VIEWS), torch.arange(VIEWS) % 2
             ],
-            "of the pixels that files store, not turned by EXIF",
+            "in the stored orientation, not turned by EXIF",
         ),
         (lambda masks: masks[order((3, 11), (11, 3))], r"exchanged between (03|11)\.png and"),
         (

@@ -108,7 +108,7 @@ def test_a_click_that_meets_nothing_is_refused_by_name(staged, place):
     pointing = pointing.clone()
     pointing[0, place[0] : place[0] + 3, place[1] : place[1] + 3] = 1
     missed = guessed(("04.png",), pointing)
-    with pytest.raises(InputError, match=r"A click in 04\.png meets nothing"):
+    with pytest.raises(InputError, match=r"A click in 04\.png is outside"):
         FindSilhouettes(SMALL)(with_priors(staged.scene, prior, missed))
 
 

@@ -28,17 +28,17 @@ from pimper_torch.records import Cameras, Record, SilhouettePrior, SparseScene, 
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import by_view
 
-FEW = 3  # soft masks: fewer have no majority
-_SAYS_NOTHING = 0.1  # about one half: maps are resampled on their way here
+FEW = 3  # soft masks: fewer than these have no majority
+_NEUTRAL = 0.1  # probabilities this close to one half carry no information: maps are resampled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SoftMasks(Record):
-    """Silhouettes that priors state, at the working size.
+    """Silhouettes given as priors, at the working size.
 
     Attributes:
-        inside: Probability of the object; one half where nothing is said.
-        seeds_px: Pixels of the object in each view, from maps that say nothing else.
+        inside: Probability of the object; one half where nothing is known.
+        seeds_px: Pixels of the object in each view, from maps without any background.
     """
 
     inside: Maps
@@ -47,27 +47,27 @@ class SoftMasks(Record):
 
     @property
     def points(self) -> bool:
-        """Whether anything is pointed at."""
+        """Whether any view has seeds."""
         return any(len(pixels) for pixels in self.seeds_px)
 
     @property
     def masks(self) -> Masks:
-        """True where a pixel more likely shows the object than not."""
+        """Pixels that show the object more likely than not."""
         return self.inside > 0.5
 
 
 def points_at(inside: Map) -> bool:
-    """Return whether a map nowhere says that the object is not there, as maps of clicks."""
-    return float(inside.min()) > 0.5 - _SAYS_NOTHING
+    """Return whether a map only marks object pixels, such as a map of clicks."""
+    return float(inside.min()) > 0.5 - _NEUTRAL
 
 
 def soft_masks_of(views: Views, sizes_px: Int[Tensor, "view 2"]) -> SoftMasks | None:
-    """Merge the silhouettes that views carry as priors; ``None`` without any.
+    """Merge the silhouette priors of the views; ``None`` without any.
 
-    Log odds of several maps of one view add up.
+    The log odds of several maps of one view are added.
 
     Args:
-        sizes_px: Of the masks, as photographs are shrunk.
+        sizes_px: Sizes of the masks, those of the shrunk photographs.
     """
     wide, high = sizes_px.amax(dim=0).tolist()
     odds = torch.zeros(views.num_views, high, wide)
@@ -88,50 +88,50 @@ def soft_masks_of(views: Views, sizes_px: Int[Tensor, "view 2"]) -> SoftMasks | 
                 antialias=True,
             )
             if points_at(inside):
-                seeds[view, :high, :wide] |= small[0, 0] > 0.5 + _SAYS_NOTHING
+                seeds[view, :high, :wide] |= small[0, 0] > 0.5 + _NEUTRAL
             else:
                 # 8 bits hold no finer probabilities.
                 odds[view, :high, :wide] += torch.logit(small[0, 0].clamp(1e-3, 1 - 1e-3))
                 given[view] = True
     if not priors:
         return None
-    centres = tuple(one.nonzero().flip(1).float() + 0.5 for one in seeds)
+    centres = tuple(mask.nonzero().flip(1).float() + 0.5 for mask in seeds)
     return SoftMasks(inside=torch.sigmoid(odds), given=given, seeds_px=centres)
 
 
 def keep_seeded_components(
     hull: Hull, cameras: Cameras, seeds_px: Sequence[Float[Tensor, "_ 2"]]
 ) -> Hull:
-    """Keep the components of a hull that rays through seeds meet first.
+    """Keep the components of a hull that rays through seeds hit first.
 
     Returns:
-        The hull itself where none are met.
+        The hull itself if no component is hit.
     """
     labels = torch.from_numpy(label(hull.occupied.numpy())[0])
-    met: set[int] = set()
+    hit_labels: set[int] = set()
     for view, pixels in enumerate(seeds_px):
         if len(pixels):
             pose, eye = cameras.cam_from_world[view], cameras.centers_world[view]
             rays = normalize(rays_through(pixels, pose, cameras.intrinsics[view]), dim=1)
             far = (hull.corners_world - eye).norm(dim=1).sum()
             along = torch.arange(0, float(far), float(hull.spacing) / 2)
-            places = (eye + along[:, None] * rays[:, None] - hull.origin_world) / hull.spacing
-            index = places.round().long()
+            positions = (eye + along[:, None] * rays[:, None] - hull.origin_world) / hull.spacing
+            index = positions.round().long()
             last = torch.tensor(labels.shape) - 1
             inside = ((index >= 0) & (index <= last)).all(dim=-1)
             x, y, z = torch.minimum(index.clamp_min(0), last).unbind(dim=-1)
-            found = labels[x, y, z] * inside
-            first = found.gather(1, (found > 0).int().argmax(dim=1, keepdim=True))
-            met |= set(first.flatten().tolist()) - {0}
-    if not met:
+            along_ray = labels[x, y, z] * inside
+            first = along_ray.gather(1, (along_ray > 0).int().argmax(dim=1, keepdim=True))
+            hit_labels |= set(first.flatten().tolist()) - {0}
+    if not hit_labels:
         return hull
-    kept = torch.isin(labels, torch.tensor(sorted(met)))
+    kept = torch.isin(labels, torch.tensor(sorted(hit_labels)))
     away = torch.from_numpy(distance_transform_edt(~kept.numpy())).to(hull.distance)
     outside = torch.minimum(hull.distance, (1 - away) * hull.spacing)
     return hull.replace(distance=torch.where(kept, hull.distance, outside))
 
 
-MIN_POINTS = 12  # of the object that a view must observe for them to tell anything
+MIN_POINTS = 12  # of the object in a view; fewer carry no information
 _BOX = 0.75  # half its side, of the cameras' distance: photographs of 70 degrees
 
 
@@ -140,10 +140,10 @@ class Cues(Record):
     """Cues about the object before any view is cut.
 
     Attributes:
-        object_px: Pixels of the object's points, one tensor a view.
-        background_from_view: Maps to a room at rest behind an object that turns; empty without.
-        agreement: With the texture of plane and room, the better of both.
-        soft: Masks that the photographs come with as priors.
+        object_px: Pixels of the object's points, one tensor per view.
+        background_from_view: Maps to a static background behind a turning object; empty without.
+        agreement: With the texture of plane and static background, the better of the two.
+        soft: Masks given as priors.
     """
 
     pictures: parallax.WorkingPictures
@@ -163,13 +163,13 @@ class Cues(Record):
 
     @property
     def has_points(self) -> bool:
-        """Whether views observe enough points of the object to be seeded by them."""
+        """Whether the median view has enough object points to seed its cut."""
         counts = torch.tensor([len(pixels) for pixels in self.object_px])
         return int(counts.median()) >= MIN_POINTS
 
     @property
     def all_round(self) -> bool:
-        """Whether known backgrounds surround the object: a room, and a plane in front of it."""
+        """Whether a static background, and a plane in front of it, surround the object."""
         return self.plane is not None and len(self.background_from_view) > 0
 
     def agreement_in(self, view: int) -> Map | None:
@@ -177,7 +177,7 @@ class Cues(Record):
         return None if self.agreement is None else self.agreement[view]
 
     def surrounded(self) -> Masks:
-        """Find what the object's points surround in each view."""
+        """Return the pixels that the object's points surround in each view."""
         height, width = self.pictures.grey.shape[1:]
         return parallax.of_views(
             lambda view: convex_hull_of(self.object_px[view], (width, height)), self.num_views
@@ -189,50 +189,50 @@ class Cues(Record):
         Args:
             masks: The cuts; ``None`` before the first.
         """
-        found = []
+        layers = []
         if self.plane is not None:
-            found.append(parallax.plane_agreement(self.pictures, self.plane, self.fixation, masks))
+            layers.append(parallax.plane_agreement(self.pictures, self.plane, self.fixation, masks))
         if len(self.background_from_view):
-            room = parallax.background_agreement(self.pictures, self.background_from_view, masks)
-            surrounded = self.surrounded()
-            found.append(by_view(lambda one, at: one.masked_fill(at, torch.nan), room, surrounded))
-        if not found:
+            static = parallax.background_agreement(self.pictures, self.background_from_view, masks)
+            inside = self.surrounded()
+            layers.append(by_view(lambda x, mask: x.masked_fill(mask, torch.nan), static, inside))
+        if not layers:
             return self
-        newest = by_view(lambda *all_of: reduce(torch.fmax, all_of), *found)
+        newest = by_view(lambda *maps: reduce(torch.fmax, maps), *layers)
         if self.agreement is not None:
             newest = by_view(lambda new, old: new.where(~new.isnan(), old), newest, self.agreement)
         return self.replace(agreement=newest)
 
-    def without(self, doubted: ViewMask) -> tuple["Cues", ViewMask | None]:
-        """Leave soft masks out, and find the views that have one; ``None`` where they are few."""
+    def without(self, rejected: ViewMask) -> tuple["Cues", ViewMask | None]:
+        """Drop rejected soft masks; also return the views with others, ``None`` if few."""
         if self.soft is None:
             return self, None
-        given = self.soft.given & ~doubted
+        given = self.soft.given & ~rejected
         voting = given if int(given.sum()) >= FEW else None
         return self.replace(soft=self.soft.replace(given=given)), voting
 
     def seed_at_fixation(self) -> "Cues":
-        """Point at the fixation point in every view."""
+        """Use the fixation point as the seed in every view."""
         if self.soft is None:
             return self
-        cameras, place = self.pictures.cameras, self.fixation.fixation_world[None]
-        pixels, _ = project(place, cameras.cam_from_world, cameras.intrinsics)
+        cameras, point = self.pictures.cameras, self.fixation.fixation_world[None]
+        pixels, _ = project(point, cameras.cam_from_world, cameras.intrinsics)
         return self.replace(soft=self.soft.replace(seeds_px=tuple(pixels)))
 
-    def seen_in(self, seen: Maps) -> "Cues":
-        """Keep points inside the hull alone where soft masks show the object."""
+    def inside_hull(self, margins_px: Maps) -> "Cues":
+        """Drop object points outside the hull if there are soft masks."""
         if self.soft is None:
             return self
-        last = torch.tensor(seen.shape[:0:-1]) - 1
+        last = torch.tensor(margins_px.shape[:0:-1]) - 1
         kept = []
-        for pixels, margin in zip(self.object_px, seen, strict=True):
+        for pixels, margin in zip(self.object_px, margins_px, strict=True):
             column, row = torch.minimum(pixels.floor().long().clamp_min(0), last).unbind(dim=1)
             kept.append(pixels[margin[row, column] > 0])
         return self.replace(object_px=tuple(kept))
 
 
 def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
-    """Gather what is known of the object from photographs, cameras and cloud."""
+    """Gather the cues from photographs, cameras and cloud."""
     scene = scene.to("cpu", torch.float32)
     pictures = parallax.working_pictures(scene.views, scene.cameras, config.size_px)
     cameras, points = pictures.cameras, scene.points_world
@@ -257,8 +257,8 @@ def cues_of(scene: SparseScene, config: SilhouetteConfig) -> Cues:
         soft=soft_masks_of(scene.views, cameras.sizes_px),
     )
     if not len(cues.background_from_view):
-        rests = parallax.static_background_maps(pictures, cues.surrounded())
-        cues = cues.replace(background_from_view=rests)
+        maps = parallax.static_background_maps(pictures, cues.surrounded())
+        cues = cues.replace(background_from_view=maps)
     return cues.relearned(None)
 
 
@@ -269,23 +269,23 @@ def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 
     inside = ((points > box[0]) & (points < box[1])).all(dim=1)
     steps = torch.cartesian_prod(*[torch.linspace(0, 1, 5, dtype=torch.float64)] * 3)
     cameras = scene.cameras
-    places = (box[0] + steps * (box[1] - box[0])).to(cameras.cam_from_world)
-    pixels, depth = project(places, cameras.cam_from_world, cameras.intrinsics)
+    samples = (box[0] + steps * (box[1] - box[0])).to(cameras.cam_from_world)
+    pixels, depth = project(samples, cameras.cam_from_world, cameras.intrinsics)
     shown = (pixels > 0) & (pixels < cameras.sizes_px[:, None])
     if not bool(inside.any()) and not bool((shown.all(dim=-1) & (depth > 0)).any()):
         around = torch.stack([points.quantile(q, dim=0) for q in (0.05, 0.95)]) + offset
-        found = ", ".join(f"{value:.4g}" for value in around.flatten().tolist())
+        usual_box = ", ".join(f"{value:.4g}" for value in around.flatten().tolist())
         raise InputError(
-            f"region is {corners}, which no photograph shows and no point of the cloud is in; "
-            f"nine of ten points are in ({found}). Give a box in the frame of the cameras."
+            f"region is {corners}: no photograph shows it, and no point of the cloud is in it; "
+            f"nine of ten points are in ({usual_box}). Give a box in the frame of the cameras."
         )
     return box.float()
 
 
-_CLEAR = 1.5  # tolerances above the plane: nearer points may lie on it
+_CLEAR = 1.5  # tolerances above the plane: nearer points may be on it
 _NEAR = 0.6  # of the cameras' distance: an object that fills photographs of 60 degrees
-# Without a plane: this quantile of the distances to the fixation point, and what beyond it is
-# the object's, and certainly is not.
+# Without a plane: a quantile of the distances to the fixation point, and factors of it. Nearer than
+# the first is the object, beyond the second is background.
 _CENTRE, _WITHIN, _OUTSIDE = 0.7, 1.3, 2.6
 
 
@@ -296,25 +296,24 @@ def split_cloud(
     tolerance: float,
     box_world: Float[Tensor, "2 3"] | None,
 ) -> tuple[PointMask, PointMask]:
-    """Find the points of the object, and those that certainly are not; others may be either.
+    """Return the points of the object, and those of the background; others may be either.
 
-    With a plane they are the points above it near the fixation point, without one those near that
-    point.
+    With a plane, the object's points are those above it near the fixation point; without one, those
+    near that point.
 
     Args:
         tolerance: Of the plane, scene units.
-        box_world: What is outside is not the object.
+        box_world: Points outside this box are background.
     """
     points, tracked = scene.points_world, well_tracked(scene)
-    away = (points - fixation.fixation_world).norm(dim=1)
+    apart = (points - fixation.fixation_world).norm(dim=1)
     if plane is None:
-        centre = torch.quantile(away[tracked], _CENTRE) if bool(tracked.any()) else away.sum()
-        on_object = away < _WITHIN * centre
-        background = away > _OUTSIDE * centre
+        radius = torch.quantile(apart[tracked], _CENTRE) if bool(tracked.any()) else apart.sum()
+        on_object = apart < _WITHIN * radius
+        background = apart > _OUTSIDE * radius
     else:
-        on_object = (plane.height_of(points) > _CLEAR * tolerance) & (
-            away < _NEAR * fixation.distance
-        )
+        above = plane.height_of(points) > _CLEAR * tolerance
+        on_object = above & (apart < _NEAR * fixation.distance)
         background = ~on_object
     if box_world is not None:
         low, high = box_world.to(points)
@@ -326,11 +325,11 @@ def split_cloud(
 def pixels_of(
     scene: SparseScene, cameras: Cameras, chosen: PointMask, observed: bool = True
 ) -> tuple[Float[Tensor, "_ 2"], ...]:
-    """Return where the chosen points are in each view.
+    """Return the pixels of the chosen points in each view.
 
     Args:
-        observed: Those that the view observes, or else all in its frame: a point of the object is
-            inside its silhouette even where a different part hides it.
+        observed: Only of points that the view observes; otherwise of all in its frame: a point of
+            the object is inside its silhouette even where a different part hides it.
     """
     pixels, _ = project(scene.points_world, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px.to(pixels)[:, None]

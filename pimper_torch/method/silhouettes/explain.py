@@ -1,4 +1,4 @@
-"""How much of the silhouettes a surface explains, as each view sees it."""
+"""Coverage of the silhouettes by a surface, per view."""
 
 import math
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ from pimper_torch.runtime.parallel import side_by_side
 def explain(
     surface: Mesh | Surface, contours: Contours, names: Sequence[str] = (), most: float = 0.1
 ) -> SilhouetteCoverage:
-    """Compare a surface with the silhouettes that it was made from; a constant to autograd.
+    """Compare a surface with the silhouettes that it was made from. Not differentiable.
 
     Args:
-        names: Of the views, to warn of the worst; silent by default.
-        most: Fraction of a silhouette's area that is not warned of. Worst views of plain sets lack
-            up to 0.08 (potatoes, 12 views along the arc, 320x240, fast) and have 0.05 that sticks
-            out (the demo).
+        names: Of the views, to warn about the worst; no warning by default.
+        most: Fraction of a silhouette's area without a warning. The worst views of plain sets lack
+            up to 0.08 (potatoes, 12 views along the arc, 320x240, fast), and 0.05 sticks out (the
+            demo).
     """
     vertices, faces = surface.vertices_world, surface.faces
     caster, normals = RayCaster(vertices, faces), face_normals(vertices, faces)
@@ -40,21 +40,21 @@ def explain(
         rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
         face = caster.cast(cameras.centers_world[view], rays).face
         front = (face >= 0) & ((normals[face.clamp_min(0)] * rays).sum(dim=1) < 0)
-        shown, own = (one.reshape(len(columns), len(rows)).mT for one in (face >= 0, front))
+        hit, covered = (x.reshape(len(columns), len(rows)).mT for x in (face >= 0, front))
         area = (inside > 0.5).sum().clamp_min(1)
-        beside = (shown * (1 - 2 * inside).clamp_min(0)).sum()
-        return torch.stack([((inside > 0.5) & ~own).sum() / area, beside / area])
+        outside = (hit * (1 - 2 * inside).clamp_min(0)).sum()
+        return torch.stack([((inside > 0.5) & ~covered).sum() / area, outside / area])
 
     views = silhouettes.reliable.nonzero()[:, 0].tolist() if contours.confine else []
-    rows = [vertices.new_zeros(0, 2), *(one[None] for one in side_by_side(of_view, views))]
+    rows = [vertices.new_zeros(0, 2), *(row[None] for row in side_by_side(of_view, views))]
     uncovered, outside = torch.cat(rows).unbind(dim=1)
-    for found, what in ((uncovered, "lacks"), (outside, "sticks out by")):
-        if names and len(found) and float(found.max()) > most:
-            worst = names[views[int(found.argmax())]]
+    for values, verb in ((uncovered, "lacks"), (outside, "sticks out by")):
+        if names and len(values) and float(values.max()) > most:
+            worst = names[views[int(values.argmax())]]
             caution(
-                f"{worst}: the surface {what} {float(found.max()):.0%} of the silhouette's area, "
-                f"and {int((found > most).sum())} of {len(views)} views see more than "
-                f"{most:.0%}. Look at its silhouette in overview.png; `--masks` replaces it.",
+                f"{worst}: the surface {verb} {float(values.max()):.0%} of the silhouette's area; "
+                f"it is more than {most:.0%} in {int((values > most).sum())} of {len(views)} views. "
+                "Check the silhouette in overview.png; `--masks` replaces it.",
                 stacklevel=2,
             )
     return SilhouetteCoverage(uncovered=uncovered, outside=outside)

@@ -1,4 +1,4 @@
-"""Which pixels of every view show the object."""
+"""The stage that finds the object's silhouette in every view."""
 
 from collections.abc import Callable
 
@@ -28,16 +28,16 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view
 from pimper_torch.runtime.stage import Stage
 
-# Intersection over union of silhouettes and projections, in the median, below which silhouettes are
+# Median intersection over union of silhouettes and hull projections, below which silhouettes are
 # not reliable.
 _MIN_OVERLAP = 0.8
-_USED = 0.25  # probability above which a pixel is used as the object's
-_UNLIKE = "its soft mask lacks most of what the others have in common"
-_BY_HULL = "The hull of the other masks stands in for them, and they do not constrain the surface"
+_USED = 0.25  # probability above which a pixel belongs to the mask of the object
+_UNLIKE = "its soft mask lacks most of the common hull of the others"
+_BY_HULL = "The hull of the other masks replaces them, and they do not constrain the surface"
 
 
 class FindSilhouettes(Stage):
-    """Find the object's silhouette in every view; a constant to autograd."""
+    """Find the object's silhouette in every view. Not differentiable."""
 
     def __init__(self, config: SilhouetteConfig | None = None) -> None:
         super().__init__()
@@ -45,118 +45,115 @@ class FindSilhouettes(Stage):
 
     @torch.no_grad()
     def forward(self, scene: SparseScene) -> Silhouettes:
-        """Find silhouettes, or take the masks for them.
+        """Find silhouettes, or use the masks.
 
         Returns:
-            Everything where that is asked for. A mask that clearly contradicts those of the others
-            is not believed: the hull of these stands in for it. Where silhouettes cannot be
-            reliable, everything above the plane that the object stands on, or everything where none
-            is found, with a :class:`~pimper_torch.runtime.errors.PimperWarning` that says why.
-            Where the object was moved between series of photographs, each series is looked at by
-            itself.
+            Silhouettes of the full images if the configuration asks for it. A mask that clearly
+            contradicts the others is replaced by their hull. If silhouettes are not reliable,
+            everything above the supporting plane, or everything without a plane, with a
+            :class:`~pimper_torch.runtime.errors.PimperWarning` that gives the reason. If the object
+            was moved between capture sessions, silhouettes are found in each session separately.
 
         Raises:
-            InputError: No more than half of the masks agree, or a click meets nothing.
+            InputError: At most half of the masks agree, or a click is outside the common hull.
         """
         config, masks = self.config, scene.views.masks
         if config.object == "everything":
             return Silhouettes.everything(scene.views)
         if masks is not None:
             reliable = torch.ones(len(masks), dtype=torch.bool, device=masks.device)
-            found = Silhouettes(
+            silhouettes = Silhouettes(
                 inside=by_view(Tensor.float, masks), reliable=reliable, source="masks"
             ).to(masks.device)
-            return self._agreeing(_believed(found, scene.views.names), scene)
+            return self._replace_rejected(_without_empty(silhouettes, scene.views.names), scene)
         if config.object == "masks":
             raise InputError(
-                "`silhouettes.object` is masks, but the photographs come without any. Give a "
-                "folder of masks, or let silhouettes be found: `silhouettes.object` auto."
+                "`silhouettes.object` is masks, but the photographs have no masks. Give a folder "
+                "of masks, or set `silhouettes.object` to auto to find silhouettes."
             )
-        return by_session(scene, self._found).to(scene.views.images.device)
+        return by_session(scene, self._find).to(scene.views.images.device)
 
-    def _agreeing(self, silhouettes: Silhouettes, scene: SparseScene) -> Silhouettes:
-        """Replace masks that clearly contradict the others by what the hull of these shows."""
-        doubted = contradictory(scene).to(silhouettes.reliable.device)
-        if not bool(doubted.any()):
+    def _replace_rejected(self, silhouettes: Silhouettes, scene: SparseScene) -> Silhouettes:
+        """Replace masks that clearly contradict the others by the hull of the others."""
+        rejected = contradictory(scene).to(silhouettes.reliable.device)
+        if not bool(rejected.any()):
             return silhouettes
-        if torch.equal(doubted, silhouettes.reliable):
+        if torch.equal(rejected, silhouettes.reliable):
             raise InputError(
-                "The masks contradict one another, and no more than half of them agree. Look "
-                "whether they show the same object in all photographs, and whether the cameras are "
-                "those of these; or leave the masks out."
+                "The masks contradict each other, and at most half of them agree. Check whether "
+                "they show the same object in all photographs, and whether the cameras belong to "
+                "these photographs; or omit the masks."
             )
-        _warn(doubted, scene.views.names, "its mask contradicts those of the others", _BY_HULL)
-        others = silhouettes.replace(reliable=silhouettes.reliable & ~doubted)
+        _warn(rejected, scene.views.names, "its mask contradicts those of the others", _BY_HULL)
+        others = silhouettes.replace(reliable=silhouettes.reliable & ~rejected)
         cameras, box = scene.cameras.to(torch.float32), bounding_box(others, scene.cameras)
         hull = None
         if box is not None:
             hull = visual_hull(others, cameras, box.float(), num_voxels=NUM_VOXELS)
-        within = scene.views.inside
+        valid = scene.views.inside
         inside = by_view(Tensor.detach, silhouettes.inside)
-        for view in doubted.nonzero()[:, 0].tolist():
-            # What looks past a photograph's edge once it is undistorted is black.
-            inside[view] = within[view] & (scene.views.images[view].detach().amax(dim=0) > 0)
+        for view in rejected.nonzero()[:, 0].tolist():
+            # Undistorted pixels from outside the photograph are black.
+            inside[view] = valid[view] & (scene.views.images[view].detach().amax(dim=0) > 0)
             if hull is not None:
                 width, height = (int(side) for side in scene.views.sizes_px[view])
                 K, pose = cameras.intrinsics[view], cameras.cam_from_world[view]
                 inside[view, :height, :width] *= margins(hull, K, pose, (width, height)) > 0
         return others.replace(inside=inside)
 
-    def _found(self, scene: SparseScene) -> Silhouettes:
-        """Find silhouettes in photographs between which the object was not moved."""
+    def _find(self, scene: SparseScene) -> Silhouettes:
+        """Find silhouettes in photographs between which the object did not move."""
         cues = cues_of(scene, self.config)
-        cuts, doubt = _cut(cues)
-        if doubt and cues.soft is not None and not cues.soft.points:
-            # Several things stand apart: the one that cameras look at is likelier than all.
-            cuts, doubt = _cut(cues.seed_at_fixation())
-        leave_out("silhouettes.disagreement", bool(doubt))
-        if cuts is None or doubt:
-            above = cues.plane is not None
-            what = "above the plane that it stands on" if above else "that the photographs show"
+        cuts, reason = _cut(cues)
+        if reason and cues.soft is not None and not cues.soft.points:
+            # The component that the cameras look at is more likely than all of them.
+            cuts, reason = _cut(cues.seed_at_fixation())
+        leave_out("silhouettes.disagreement", bool(reason))
+        if cuts is None or reason:
+            region = "in the photographs" if cues.plane is None else "above the supporting plane"
             caution(
-                f"Everything {what} is taken for the object: {doubt}. Give masks, or a box round "
-                "the object (`silhouettes.region`); `silhouettes.object` everything says that this "
-                "is meant.",
+                f"Everything {region} is treated as the object: {reason}. Give masks, or a box "
+                "around the object (`silhouettes.region`). If this is intended, set "
+                "`silhouettes.object` to everything.",
                 stacklevel=2,
             )
-            return Silhouettes.everything(scene.views, _top(cues))
-        if missed := _missed(cues, cuts):
-            where = some([scene.views.names[view] for view in missed])
+            return Silhouettes.everything(scene.views, _plane_top(cues))
+        if views_missed := _views_missed(cues, cuts):
+            names = some([scene.views.names[view] for view in views_missed])
             raise InputError(
-                f"A click in {where} meets nothing that the silhouettes have in common; needed: a "
-                "pixel that shows the object. Choose another by `--object-at`, or give masks that "
-                "hold it."
+                f"A click in {names} is outside the silhouettes and their hull; needed: a pixel of "
+                "the object. Choose another one by `--object-at`, or give masks that contain it."
             )
-        _warn(cuts.doubted, scene.views.names, _UNLIKE, "It is cut as if it had come without")
-        return _believed(silhouettes_of(cuts, scene.views), scene.views.names)
+        _warn(cuts.rejected, scene.views.names, _UNLIKE, "It is cut without the soft mask")
+        return _without_empty(silhouettes_of(cuts, scene.views), scene.views.names)
 
 
 def _cut(cues: Cues) -> tuple[Cuts | None, str]:
-    """Cut all views, and state why the cuts are unreliable, or nothing."""
+    """Cut all views; return the cuts, and why they are unreliable, or an empty string."""
     cuts = None
     if cues.agreement is not None or cues.has_points or cues.soft is not None:
         cuts = cut_in_iterations(cues)
     if cuts is None:
         return None, "the views' silhouettes have nothing in common"
-    return cuts, _doubt(cuts)
+    return cuts, _unreliable_reason(cuts)
 
 
-def _missed(cues: Cues, cuts: Cuts) -> list[int]:
-    """List the views in which something is pointed at that neither cut nor hull shows."""
+def _views_missed(cues: Cues, cuts: Cuts) -> list[int]:
+    """List the views with a click outside both the cut and the hull."""
     missed = []
-    for view, pixels in enumerate(cues.soft.seeds_px if cues.soft else ()):
-        column, row = pixels.long().unbind(dim=1)
-        pointed = torch.zeros_like(cuts.masks[view])
-        pointed[row, column] = True
-        shown = cuts.masks[view] | (cuts.margins_px[view] > 0)
-        clicks, count = label(pointed.numpy(), structure=[[1] * 3] * 3)
-        if len(set(clicks[(pointed & shown).numpy()].tolist())) < count:
+    for view, seeds_px in enumerate(cues.soft.seeds_px if cues.soft else ()):
+        column, row = seeds_px.long().unbind(dim=1)
+        seeds = torch.zeros_like(cuts.masks[view])
+        seeds[row, column] = True
+        object_mask = cuts.masks[view] | (cuts.margins_px[view] > 0)
+        clicks, count = label(seeds.numpy(), structure=[[1] * 3] * 3)
+        if len(set(clicks[(seeds & object_mask).numpy()].tolist())) < count:
             missed.append(view)
     return missed
 
 
-def _top(cues: Cues) -> Float[Tensor, "plane 4"] | None:
-    """Return the upper side of the supporting plane, as thick as its points are rough."""
+def _plane_top(cues: Cues) -> Float[Tensor, "plane 4"] | None:
+    """Return the supporting plane's upper side, raised by the roughness of its points."""
     if cues.plane is None:
         return None
     thickness = PLANE_TOLERANCE * cues.fixation.distance
@@ -164,7 +161,7 @@ def _top(cues: Cues) -> Float[Tensor, "plane 4"] | None:
     return torch.cat([cues.plane.normal_world, -height.reshape(1)])[None]
 
 
-def _doubt(cuts: Cuts) -> str:
+def _unreliable_reason(cuts: Cuts) -> str:
     overlaps, reliable = agreement_of(cuts)
     overlap = float(overlaps.median())
     if overlap < _MIN_OVERLAP:
@@ -175,12 +172,12 @@ def _doubt(cuts: Cuts) -> str:
     exposed, held = float(cuts.exposed.median()), float(cuts.held.median())
     if exposed > MAX_EXPOSED:
         return (
-            f"silhouettes show what is behind the object on {exposed:.0%} of their pixels in "
-            f"the median; at most: {MAX_EXPOSED:.0%}"
+            f"silhouettes show background on {exposed:.0%} of their pixels in the median; at most: "
+            f"{MAX_EXPOSED:.0%}"
         )
     if held < MIN_HELD:
         return (
-            f"silhouettes hold {held:.0%} of the object's points in the median; needed: "
+            f"silhouettes contain {held:.0%} of the object's points in the median; needed: "
             f"{MIN_HELD:.0%}"
         )
     if int(reliable.sum()) < max(3, len(reliable) / 2):
@@ -189,17 +186,16 @@ def _doubt(cuts: Cuts) -> str:
 
 
 def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
-    """Return the scene with silhouettes that were found for masks, a little wider where unsure.
+    """Return the scene with found silhouettes as its masks, slightly wider where uncertain.
 
-    What hides the object is left out.
+    Pixels of occluders are excluded.
 
     Args:
-        silhouettes: Where they are masks that a person gave, those stay as they are, but for masks
-            that were not believed.
+        silhouettes: Masks given by the user are kept as they are, except rejected ones.
     """
     used = by_view(lambda inside: inside > _USED, silhouettes.inside)
     if silhouettes.hidden is not None:
-        used = by_view(lambda one, hidden: one & ~hidden, used, silhouettes.hidden)
+        used = by_view(lambda mask, hidden: mask & ~hidden, used, silhouettes.hidden)
     given = scene.views.masks
     if silhouettes.source == "everything" or (given is not None and torch.equal(used, given)):
         return scene
@@ -207,24 +203,23 @@ def masked(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
 
 
 def of_all_photographs(
-    scene: SparseScene, few: ViewPerPose, found: Silhouettes
+    scene: SparseScene, per_pose: ViewPerPose, silhouettes: Silhouettes
 ) -> tuple[SparseScene, Silhouettes]:
-    """Carry silhouettes of one photograph a pose to all photographs of the scene.
+    """Carry silhouettes from one photograph per pose to all photographs of the scene.
 
     Args:
-        found: In the photographs of ``few``.
+        silhouettes: In the photographs of ``per_pose``.
 
     Returns:
-        The scene with these silhouettes for masks, see :func:`masked`, and silhouettes of its
-        views.
+        The scene with these silhouettes as masks, see :func:`masked`, and silhouettes of its views.
     """
-    if few.scene is not scene:
-        found = found.take(few.of)
-    return masked(scene, found), found
+    if per_pose.scene is not scene:
+        silhouettes = silhouettes.take(per_pose.of)
+    return masked(scene, silhouettes), silhouettes
 
 
-def _believed(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
-    """Take empty silhouettes for unreliable: the hull of all views would be empty."""
+def _without_empty(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouettes:
+    """Mark empty silhouettes as unreliable: with them, the hull of all views would be empty."""
     leave_out("silhouettes.unreliable", ~silhouettes.reliable, names=names)
     empty = silhouettes.reliable & ~by_view(lambda inside: (inside > 0.5).any(), silhouettes.inside)
     leave_out("silhouettes.empty", empty, names=names)
@@ -244,35 +239,36 @@ def _warn(views: ViewMask, names: tuple[str, ...], reason: str, done: str) -> No
 
 
 def by_session(scene: SparseScene, find: Callable[[SparseScene], Silhouettes]) -> Silhouettes:
-    """Find silhouettes in the views of each series, and put them side by side.
+    """Find silhouettes in the views of each capture session, and concatenate them.
 
     Args:
-        find: From the scene of one series to its silhouettes.
+        find: Maps the scene of one session to its silhouettes.
 
     Returns:
-        Of all views. Where those of one series are everything, everything above every known plane.
+        Silhouettes of all views. If those of one session are everything, everything above all known
+        planes.
     """
     if not len(scene.sessions):
         return find(scene)
     views = [(scene.sessions == number).nonzero()[:, 0] for number in torch.unique(scene.sessions)]
-    found = [find(part(scene, one.tolist())) for one in views]
-    doubtful = sum(one.source == "everything" for one in found)
-    leave_out("silhouettes.by_session", doubtful, total=len(found))
-    if doubtful:
-        planes = torch.cat([one.planes_world for one in found])
+    parts = [find(subscene(scene, indices.tolist())) for indices in views]
+    unreliable = sum(part.source == "everything" for part in parts)
+    leave_out("silhouettes.by_session", unreliable, total=len(parts))
+    if unreliable:
+        planes = torch.cat([part.planes_world for part in parts])
         return Silhouettes.everything(scene.views, planes)
     order = torch.cat(views).argsort()
-    hidden = [one.inside < 0 if one.hidden is None else one.hidden for one in found]
-    return found[0].replace(
-        inside=torch.cat([one.inside for one in found])[order],
-        reliable=torch.cat([one.reliable for one in found])[order],
+    hidden = [part.inside < 0 if part.hidden is None else part.hidden for part in parts]
+    return parts[0].replace(
+        inside=torch.cat([part.inside for part in parts])[order],
+        reliable=torch.cat([part.reliable for part in parts])[order],
         hidden=torch.cat(hidden)[order] if any(map(torch.any, hidden)) else None,
     )
 
 
-def part(scene: SparseScene, views: list[int]) -> SparseScene:
-    """Return the scene of some views, as if the object had stood there alone."""
+def subscene(scene: SparseScene, views: list[int]) -> SparseScene:
+    """Return the scene of the chosen views, as a single capture session."""
     kept = torch.zeros(scene.views.num_views, dtype=torch.bool)
     kept[views] = True
-    some = with_views(scene, kept)
-    return some.replace(sessions=some.sessions[:0])
+    chosen = with_views(scene, kept)
+    return chosen.replace(sessions=chosen.sessions[:0])

@@ -1,9 +1,9 @@
-"""Parallax: a thing in front of a background does not look like the background from elsewhere.
+"""Agreement of every view with the texture of known backgrounds (plane and parallax).
 
-Backgrounds are what views see through homographies: the plane that the object stands on, and a room
-at rest in front of which it turns. All photographs are rectified to it. Their median is its
-texture, without things in front of it and without shadows, which move with the light. Where a view
-agrees with it, it shows the background; elsewhere something is in front of it, textured or not.
+A background is visible through homographies: the supporting plane, or a static background in front
+of which the object turns. All photographs are rectified to it. Their median is its texture without
+the things in front of it, and without shadows, which move with the light. Where a view agrees with
+the texture it shows the background; elsewhere something is in front of it, textured or not.
 
 Source: Irani & Anandan, PAMI 20(6), 1998, for plane and parallax.
 """
@@ -27,19 +27,19 @@ from pimper_torch.runtime.mapped import by_view, stacked, zeros
 from pimper_torch.runtime.parallel import side_by_side
 
 Homographies = Float[Tensor, "view 3 3"]
-_FAINT = 0.03  # of white; ratios of darker colours tell noise
+_FAINT = 0.03  # of white; ratios of darker colours are noise
 _RATIO = 100.0  # grey levels for a ratio of e
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class WorkingPictures(Record):
-    """Photographs in display colours, reduced.
+    """Photographs in display colours at the working size.
 
     Attributes:
-        colours: Encoded as sRGB, exposed alike; padding is black.
-        opponent: Brightness and two ratios of colours, which shadows change little.
+        colours: Encoded as sRGB, with equal exposure; padding is black.
+        opponent: Brightness and two colour ratios, which shadows change little.
         grey: Logarithm of the mean radiance.
-        factors: Size of these pictures over that of the photographs, across and down.
+        factors: Size of these images over that of the photographs, across and down.
     """
 
     colours: UInt8[Tensor, "view height width 3"]
@@ -50,28 +50,28 @@ class WorkingPictures(Record):
 
 
 def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPictures:
-    """Shrink photographs so that the longer side of the raster is at most so long."""
+    """Shrink photographs so that the raster's longer side is at most ``size_px``."""
     height, width = views.images.shape[-2:]
     factor = min(1.0, size_px / max(height, width))
     wide, high = max(1, round(factor * width)), max(1, round(factor * height))
     factors = (wide / width, high / height)
 
-    def shown(image: Float[Tensor, "channel _ _"]) -> tuple[Tensor, Tensor, Tensor]:
+    def layers_of(image: Float[Tensor, "channel _ _"]) -> tuple[Tensor, Tensor, Tensor]:
         small = shrunk(image, wide, high)
-        level = torch.quantile(small.mean(dim=0).flatten()[::7], 0.99).clamp_min(1e-6)
-        radiance = (small / level).clamp(0, 1).expand(3, -1, -1)
+        white = torch.quantile(small.mean(dim=0).flatten()[::7], 0.99).clamp_min(1e-6)
+        radiance = (small / white).clamp(0, 1).expand(3, -1, -1)
         colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)
         red, green, blue = torch.log(radiance + _FAINT)
         luma = 255 * srgb_from_linear(radiance.mean(dim=0))
         ratios = [128 + _RATIO * (red - green), 128 + _RATIO * (blue - green)]
         opponent = torch.stack([luma, *ratios], dim=-1).clamp(0, 255).round().byte()
         # Logarithms of darker values are noise.
-        return colours, opponent, torch.log(small.mean(dim=0) / level + 0.005)
+        return colours, opponent, torch.log(small.mean(dim=0) / white + 0.005)
 
     images = views.images.detach().cpu().unbind()
     colours, opponent = (zeros((len(images), high, wide, 3), torch.uint8) for _ in range(2))
     grey = zeros((len(images), high, wide))
-    for view, layers in enumerate(side_by_side(shown, images, tracked=False)):
+    for view, layers in enumerate(side_by_side(layers_of, images, tracked=False)):
         colours[view], opponent[view], grey[view] = layers
     scale = torch.tensor(factors)
     return WorkingPictures(
@@ -87,26 +87,27 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPic
 
 
 def of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
-    """Stack what is computed of every view by itself."""
+    """Stack the results of independent work on every view."""
     return stacked(side_by_side(work, range(count)), count)
 
 
-# A room is at rest if photographs, shifted, correlate with one of them by more than the first, and
-# agree with it by more than the second on more than the third of the background, in the median. A
-# turntable in a room: 0.26 and a fraction of 0.58; arcs and orbits: 0.5 and 0.05 at most.
+# A background is static if the shifted photographs correlate with one of them by more than the
+# first number, and agree with it by more than the second on more than the third of the background,
+# all in the median. A turntable in a room has 0.26 and a fraction of 0.58; arcs and orbits have at
+# most 0.5 and 0.05.
 _ALIKE, _SHOWN, _AT_REST = 0.2, 0.75, 0.25
 
-DISPUTED = 0.5  # agreement where views do not agree on what the background looks like
-# Fractions of the pictures' longer side.
-_WINDOW = 1 / 80  # windows that are compared: 9 px of 640
-_SHADING = 1 / 25  # what is smoother than this is light, not texture
-# Log radiance whose deviation in a window is below this is flat: a sensor's noise of 0.01.
+DISPUTED = 0.5  # agreement where views disagree about the texture of the background
+# Fractions of the images' longer side.
+_WINDOW = 1 / 80  # side of the compared windows: 9 px of 640
+_SHADING = 1 / 25  # smoother variation is light, not texture
+# A window with a smaller standard deviation of log radiance is flat: a sensor has 0.01 of noise.
 _FLAT = 0.008
-_REACH = 1.0  # of the cameras' distance: the plane that is rectified, to each side
+_REACH = 1.0  # of the cameras' distance: half the side of the rectified plane
 _STEP = 2.0  # working pixels at the fixation point between samples of the plane
-# The same for brightness, where there is no texture.
+# The same two for brightness, where there is no texture.
 _FAR_REACH, _FAR_STEP = 2.0, 8.0
-_NO_SHADOW = 3.0  # log radiance, a factor of 20: more than light changes on a plane
+_NO_SHADOW = 3.0  # of log radiance, a factor of 20: light changes less on a plane
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -114,7 +115,7 @@ class Raster(Record):
     """A raster on a background.
 
     Attributes:
-        pixels_from_raster: From homogeneous pixels of the raster to those of each view; NaN for a
+        pixels_from_raster: Homographies from the raster's pixels to those of each view; NaN for a
             view that does not see the background.
     """
 
@@ -125,11 +126,11 @@ class Raster(Record):
 def plane_agreement(
     pictures: WorkingPictures, plane: Plane, fixation: Fixation, hidden: Masks | None = None
 ) -> Maps:
-    """Return how well each view agrees with a plane's texture; see :func:`texture_agreement`.
+    """Return the agreement of each view with a plane's texture; see :func:`texture_agreement`.
 
     Args:
-        fixation: Its fixation point is the centre of what is looked at.
-        hidden: Where views do not show the plane, as far as is known.
+        fixation: The raster is centred at the foot of its fixation point.
+        hidden: Pixels that are known not to show the plane.
     """
     near = _plane_raster(pictures.cameras, plane, fixation, _REACH, _STEP)
     far = _plane_raster(pictures.cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
@@ -139,14 +140,14 @@ def plane_agreement(
 def background_agreement(
     pictures: WorkingPictures, background_from_view: Homographies, hidden: Masks | None = None
 ) -> Maps:
-    """Return how well each view agrees with a room at rest; see :func:`texture_agreement`.
+    """Return the agreement of each view with a static background; see :func:`texture_agreement`.
 
-    The raster is of working pixels where the room is at rest, as far as views see.
+    The raster covers the views, in working pixels of the frame in which the background is static.
 
     Args:
-        background_from_view: From pixels of each photograph to those where the room is at rest;
-            NaN for views that show too little of it.
-        hidden: Where views do not show the room, as far as is known.
+        background_from_view: From pixels of each photograph to the frame in which the background is
+            static; NaN for views that show too little of it.
+        hidden: Pixels that are known not to show the background.
     """
     height, width = pictures.grey.shape[1:]
     scale = torch.diag(torch.tensor([*pictures.factors, 1.0]).double())
@@ -155,14 +156,14 @@ def background_agreement(
     ends = (maps @ corners.mT).mT.reshape(-1, 3)
     ends = (ends[:, :2] / ends[:, 2:])[ends.isfinite().all(dim=1)]
     size = maps.new_tensor([width, height])
-    # A room that shifts by more than the picture's size is not looked at.
+    # Shifts beyond the image's size are ignored.
     low = torch.maximum(ends.amin(dim=0), -size).floor()
     high = torch.minimum(ends.amax(dim=0), 2 * size).ceil()
     shift = torch.eye(3).to(maps)
     shift[:2, 2] = low
     to_pixels = torch.full_like(maps, torch.nan)
-    seen = maps.isfinite().flatten(1).all(dim=1)
-    to_pixels[seen] = torch.linalg.inv(maps[seen]) @ shift
+    mapped = maps.isfinite().flatten(1).all(dim=1)
+    to_pixels[mapped] = torch.linalg.inv(maps[mapped]) @ shift
     columns, rows = (high - low).int().tolist()
     raster = Raster(pixels_from_raster=to_pixels.to(pictures.grey), size_px=(columns, rows))
     return texture_agreement(pictures, raster, raster, hidden)
@@ -171,28 +172,28 @@ def background_agreement(
 def static_background_maps(
     pictures: WorkingPictures, surrounded: Masks
 ) -> Float[Tensor, "mapped 3 3"]:
-    """Find a static background of an object that turned, also if the camera was shifted meanwhile.
+    """Estimate maps to the static background of a turned object, even if the camera shifted.
 
     Args:
         surrounded: Pixels that the object's points surround.
 
     Returns:
-        Maps for :func:`background_agreement`; none if the photographs do not agree.
+        Maps for :func:`background_agreement`; empty if the photographs do not agree.
     """
     longer, nowhere = max(pictures.grey.shape[1:]), torch.zeros_like(surrounded[0])
     textures = by_view(
-        lambda grey, at: _textured(grey, nowhere, longer).masked_fill(at, 0),
+        lambda grey, inside: _textured(grey, nowhere, longer).masked_fill(inside, 0),
         pictures.grey,
         surrounded,
     )
     axes = pictures.cameras.cam_from_world[:, 2, :3]
     middle = int((axes @ axes.mT).sum(dim=1).argmax())
-    found = [shift_between(one, textures[middle]) for one in textures]
-    maps = torch.eye(3).double().repeat(len(found), 1, 1)
-    maps[:, :2, 2] = torch.stack([shift for shift, _ in found]) / torch.tensor(pictures.factors)
-    if torch.stack([alike for _, alike in found]).median() > _ALIKE:
-        shown = (background_agreement(pictures, maps) > _SHOWN) & ~surrounded
-        if (shown.sum(dim=(1, 2)) / (~surrounded).sum(dim=(1, 2))).median() > _AT_REST:
+    shifts = [shift_between(texture, textures[middle]) for texture in textures]
+    maps = torch.eye(3).double().repeat(len(shifts), 1, 1)
+    maps[:, :2, 2] = torch.stack([shift for shift, _ in shifts]) / torch.tensor(pictures.factors)
+    if torch.stack([correlation for _, correlation in shifts]).median() > _ALIKE:
+        agrees = (background_agreement(pictures, maps) > _SHOWN) & ~surrounded
+        if (agrees.sum(dim=(1, 2)) / (~surrounded).sum(dim=(1, 2))).median() > _AT_REST:
             return maps
     return maps[:0]
 
@@ -200,20 +201,20 @@ def static_background_maps(
 def texture_agreement(
     pictures: WorkingPictures, near: Raster, far: Raster, hidden: Masks | None = None
 ) -> Maps:
-    r"""Return how well each view agrees with the texture of a background.
+    r"""Return the agreement of each view with the texture of a background.
 
     Agreement in a window is :math:`2\,\mathrm{cov} / (\mathrm{var} + \mathrm{var}')` of log
     radiance without its smooth part.
 
     Args:
-        far: Samples of the brightness, which may be fewer and reach farther.
-        hidden: Where views do not show the background, as far as is known. What they show there is
-            compared with its texture, but is no part of it.
+        far: Samples of the brightness, which may be fewer and extend farther.
+        hidden: Pixels that are known not to show the background. They are compared with its
+            texture, but do not contribute to it.
 
     Returns:
-        Between -1 and 1; ``DISPUTED`` where views do not agree on what the background looks like,
-        as where it is always hidden; NaN where it is flat, or few views see it; -1 where a view
-        that does not agree is brighter or darker than the others by more than light does it.
+        Between -1 and 1; ``DISPUTED`` where views disagree about the background, such as where it
+        is always hidden; NaN where it is flat, or few views see it; -1 where a view that does not
+        agree is brighter or darker than the others by more than light explains.
     """
     count, longer = len(pictures.grey), max(pictures.grey.shape[1:])
     hidden = torch.zeros_like(pictures.grey, dtype=torch.bool) if hidden is None else hidden
@@ -223,52 +224,52 @@ def texture_agreement(
 
     texture = of_views(textured, count)
     common, spread = _common(texture, hidden, near)
-    level, level_spread = _common(pictures.grey, hidden, far)
+    brightness, brightness_spread = _common(pictures.grey, hidden, far)
 
     def agreement_of(view: int) -> Map:
         agreement = _agreement(texture[view], common[view], spread[view], longer)
-        other = (pictures.grey[view] - level[view]).abs() > _NO_SHADOW
-        other &= level_spread[view] < _NO_SHADOW / 2
-        return torch.where(~(agreement > DISPUTED) & other, -1, agreement)
+        implausible = (pictures.grey[view] - brightness[view]).abs() > _NO_SHADOW
+        implausible &= brightness_spread[view] < _NO_SHADOW / 2
+        return torch.where(~(agreement > DISPUTED) & implausible, -1, agreement)
 
     return of_views(agreement_of, count)
 
 
 def _common(values: Maps, hidden: Masks, raster: Raster) -> tuple[Maps, Maps]:
-    """Return the views' median on a background, and its spread, as each view sees it."""
+    """Return the views' median on a background, and its spread, warped back to each view."""
     maps, size_px = raster.pixels_from_raster, (values.shape[2], values.shape[1])
     sees = maps.isfinite().flatten(1).all(dim=1).tolist()
 
     def rectified(view: int) -> Float[Tensor, "row column"]:
         if not sees[view]:
             return values.new_full(raster.size_px[::-1], torch.nan)
-        seen = values[view].masked_fill(hidden[view], torch.nan)
-        return warped(seen, maps[view], raster.size_px)
+        visible = values[view].masked_fill(hidden[view], torch.nan)
+        return warped(visible, maps[view], raster.size_px)
 
-    seen = of_views(rectified, len(values))
-    rows = torch.split(seen, max(1, 2**20 // (len(seen) * raster.size_px[0])), dim=1)
+    stack = of_views(rectified, len(values))
+    rows = torch.split(stack, max(1, 2**20 // (len(stack) * raster.size_px[0])), dim=1)
     common, spread = torch.cat(list(side_by_side(_centre, rows, tracked=False)), dim=1)
 
     def back(view: int) -> Float[Tensor, "layer height width"]:
         if not sees[view]:
             return values.new_full((2, *size_px[::-1]), torch.nan)
         to = torch.linalg.inv(maps[view])
-        return torch.stack([_in_front(warped(one, to, size_px), to) for one in (common, spread)])
+        return torch.stack([_in_front(warped(x, to, size_px), to) for x in (common, spread)])
 
     common, spread = of_views(back, len(values)).unbind(dim=1)
     return common, spread
 
 
-def _centre(seen: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row column"]:
-    """Return the views' median and the spread round it; NaN where too few see the plane."""
-    common = seen.nanmedian(dim=0).values
-    spread = (seen - common).abs().nanmedian(dim=0).values
-    few = seen.isfinite().sum(dim=0) < 3
-    return torch.stack([common, spread]).masked_fill(few, torch.nan)
+def _centre(values: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row column"]:
+    """Return the views' median and the spread around it; NaN where too few see the background."""
+    common = values.nanmedian(dim=0).values
+    spread = (values - common).abs().nanmedian(dim=0).values
+    too_few = values.isfinite().sum(dim=0) < 3
+    return torch.stack([common, spread]).masked_fill(too_few, torch.nan)
 
 
 def _in_front(layer: Map, raster_from_pixels: Matrix3) -> Map:
-    """Mask what a homography maps in front of the camera though it lies behind it."""
+    """Set pixels to NaN that the homography maps to points behind the camera."""
     height, width = layer.shape
     pixels = pixel_centers(width, height, like=layer)
     scale = pixels @ raster_from_pixels[2, :2] + raster_from_pixels[2, 2]
@@ -278,7 +279,7 @@ def _in_front(layer: Map, raster_from_pixels: Matrix3) -> Map:
 def _plane_raster(
     cameras: Cameras, plane: Plane, fixation: Fixation, reach: float, step_px: float
 ) -> Raster:
-    """Lay a raster on the plane about the foot of the fixation point."""
+    """Return a raster on the plane, centred at the foot of the fixation point."""
     normal = plane.normal_world
     axis = torch.eye(3)[normal.abs().argmin()].to(normal)
     first = normalize(torch.linalg.cross(normal, axis), dim=0)
@@ -294,7 +295,7 @@ def _plane_raster(
 
 
 def _textured(grey: Map, hidden: Mask, longer: int) -> Map:
-    """Take the light out: what varies smoothly, on the plane and on what hides it apart."""
+    """Subtract the light: the smooth part, on the background and on hidden pixels separately."""
     window = _odd(_SHADING * longer)
     off = hidden.to(grey)
     sums = window_means(torch.stack([grey * off, off, grey * (1 - off), 1 - off]), window)
@@ -302,17 +303,17 @@ def _textured(grey: Map, hidden: Mask, longer: int) -> Map:
     return grey - smooth
 
 
-def _agreement(one: Map, common: Map, spread: Map, longer: int) -> Map:
-    known = common.isfinite() & spread.isfinite()
-    common, spread = torch.where(known, common, 0), torch.where(known, spread, 0)
-    layers = [one, common, one * one, common * common, one * common, spread, known.to(one)]
+def _agreement(view: Map, common: Map, spread: Map, longer: int) -> Map:
+    valid = common.isfinite() & spread.isfinite()
+    common, spread = torch.where(valid, common, 0), torch.where(valid, spread, 0)
+    layers = [view, common, view * view, common * common, view * common, spread, valid.to(view)]
     means = window_means(torch.stack(layers), _odd(_WINDOW * longer))
     variance = (means[2] - means[0] ** 2).clamp_min(0)
     variance_common = (means[3] - means[1] ** 2).clamp_min(0)
     agreement = 2 * (means[4] - means[0] * means[1]) / (variance + variance_common)
     disputed = means[5] > variance_common.sqrt().clamp_min(_FLAT)
-    known_here = (torch.maximum(variance, variance_common) > _FLAT**2) & (means[6] > 0.999)
-    return torch.where(known_here, torch.where(disputed, DISPUTED, agreement), torch.nan)
+    comparable = (torch.maximum(variance, variance_common) > _FLAT**2) & (means[6] > 0.999)
+    return torch.where(comparable, torch.where(disputed, DISPUTED, agreement), torch.nan)
 
 
 def _odd(size: float) -> int:

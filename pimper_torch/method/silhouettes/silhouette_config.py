@@ -1,4 +1,4 @@
-"""Settings of finding and correcting silhouettes."""
+"""Settings of silhouettes."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -11,13 +11,12 @@ class SilhouetteConfig:
     """Settings of :class:`~pimper_torch.method.silhouettes.find.FindSilhouettes`.
 
     Attributes:
-        object: Find silhouettes and fall back to everything (``auto``), take the masks that come
-            with the photographs (``masks``), or take all that the photographs show for the object
-            (``everything``), as for walls, height fields and scenes. Masks that are given are
-            taken by ``auto``, too.
-        region: Box that the object is inside: smallest x, y, z, then largest, in the cameras'
-            frame; none unless given.
-        size_px: Longer side of the pictures that are cut.
+        object: ``auto`` uses the photographs' masks, or else finds silhouettes, with the full image
+            as a fallback. ``masks`` requires masks. ``everything`` treats the full image as the
+            object, such as for walls, height fields and scenes.
+        region: Box that contains the object: smallest x, y, z, then largest, in the cameras'
+            frame; no box by default.
+        size_px: Longer side of the images that are cut.
     """
 
     object: Literal["auto", "masks", "everything"] = "auto"

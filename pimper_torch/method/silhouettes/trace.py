@@ -9,22 +9,22 @@ from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
-# Fraction of the views whose silhouette may be wrong at a place. Those that are found lack parts in
-# shadow: with 0.05, where 4 of 24 silhouettes of a cow lack a third of it, 23 % of its pixels are
-# not covered, with 0.1 0.3 %. With 0.15 one of 8 views is outvoted: Chamfer 0.19 for 0.12.
+# Fraction of the views whose silhouette may be wrong at a position. Found silhouettes lack parts in
+# shadow: with 0.05, if 4 of 24 silhouettes of a cow lack a third of it, 23 % of its pixels are not
+# covered, with 0.1 only 0.3 %. With 0.15, one of 8 views is outvoted: Chamfer 0.19 instead of 0.12.
 _DISAGREEING = {"masks": 0.03, "found": 0.1}
 
 
 class TraceContours(Stage):
-    """Turn silhouettes into constraints on the surface; a constant to autograd."""
+    """Turn silhouettes into constraints on the surface. Not differentiable."""
 
     @torch.no_grad()
     def forward(self, silhouettes: Silhouettes, cameras: Cameras) -> Contours:
         """Cast rays through the silhouettes and build their visual hull.
 
         Returns:
-            Contours that constrain nothing where silhouettes leave nothing out, and, with a
-            warning, where they have no place in common.
+            Contours without constraints if silhouettes exclude nothing and, with a warning, if they
+            have no point in common.
         """
         if silhouettes.source == "everything":
             return Contours.none(silhouettes, cameras)
@@ -38,9 +38,9 @@ class TraceContours(Stage):
         leave_out("contours.hull", hull is None)
         if hull is None:
             caution(
-                "contours: the silhouettes of the views have no place in common, so that they "
-                "say nothing about the surface. Look at the masks: do they show the same "
-                "object in all photographs?",
+                "contours: the silhouettes of the views have no point in common, so they do not "
+                "constrain the surface. Check whether the masks show the same object in all "
+                "photographs.",
                 stacklevel=2,
             )
             return Contours.none(silhouettes, cameras)
