@@ -22,7 +22,7 @@ def test_the_largest_component_that_sees_depth_is_kept(parts, spread, chosen):
     assert choose_component(parts, spread, NAMES, 0.6) == chosen
 
 
-LOW = "sides from low down in every series"
+LOW = "sides from low down in every session"
 FEW = "registered {} of 6 photographs; at least 3 are needed.*05.jpg"
 
 
@@ -43,7 +43,7 @@ FEW = "registered {} of 6 photographs; at least 3 are needed.*05.jpg"
             [NAMES],
             [0],
             NAMES,
-            "registered 20 of 20 photographs, but only 0 of them see.*background at rest.*masks"
+            "registered 20 of 20 photographs, but only 0 of them see.*static background.*masks"
             ".*plain cloth.*move the camera",
         ),
     ],

@@ -69,7 +69,7 @@ def test_a_doubtful_model_says_so_in_the_scene_and_in_a_warning(generator, tmp_p
     model = of_a_room(generator, 5)
     views = views_of(torch.rand(5, 3, HEIGHT, WIDTH, generator=generator))
     write_model(assemble_scene(views, model), tmp_path)
-    with pytest.warns(PimperWarning, match="cameras are doubtful"):
+    with pytest.warns(PimperWarning, match="cameras are unreliable"):
         scene = Reconstruct()(views, tmp_path)
     assert "only rotated" in scene.diagnosis
 

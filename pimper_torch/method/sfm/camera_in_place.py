@@ -1,13 +1,12 @@
-r"""The motion of a background in front of a camera that stays in its place.
+r"""The motion of a static background seen by a camera that only rotates or zooms.
 
-A camera that turns about its centre, zooms, or has its pictures cropped sees a background at rest
-move by one homography from photograph to photograph. With small turns it is a similarity with a
-perspective row, to the second order of the angle (2.7 px at the corner of 800 after a turn by 6.7
-degrees, or 150 px):
+If a camera turns about its centre, zooms, or its images are cropped, a static background moves
+by one homography from image to image. For small turns it is a similarity with a perspective row, to
+second order in the angle (2.7 px at the corner of 800 after a turn by 6.7 degrees, or 150 px):
 
 .. math:: A \propto \begin{pmatrix} a & -b & t_u \\ b & a & t_v \\ p & q & 1 \end{pmatrix}
 
-A plane that turns with the object, such as a table, moves by homographies, too, but by
+A plane that turns with the object, such as a table, also moves by homographies, but by
 :math:`I + t n^T / d`, which shears and does not preserve angles.
 """
 
@@ -20,7 +19,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.pixels import homogeneous
 from pimper_torch.ground.shapes import Matrix3
 
-# Zoom, and roll in radians, of a touched tripod or of a cropped picture: a choice.
+# Zoom, and roll in radians, of a touched tripod or a cropped image: a choice.
 _MAX_ZOOM, _MAX_ROLL = 1.3, 0.35
 
 
@@ -31,35 +30,35 @@ def follows_camera_in_place(
     max_error_px: float,
     generator: torch.Generator,
 ) -> Bool[Tensor, " match"]:
-    """Find the matches that move as before a camera in its place.
+    """Return the matches that move as if the camera only rotated or zoomed.
 
-    Similarities through two matches each are hypotheses (RANSAC); the best is refined with the
-    perspective row by least squares of the matches that follow.
+    Similarities through two matches each are hypotheses (RANSAC). The best is refined with the
+    perspective row by least squares over its inliers.
 
     Args:
-        first: Pixels, also of matches that are wrong or of what turns.
-        centre: Of the picture; about it the map is a similarity with a perspective row.
+        first: Pixels; they include outliers and points that turn.
+        centre: Of the image; about it the map is a similarity with a perspective row.
 
     Returns:
-        False everywhere where no hypothesis is a small zoom and roll.
+        False everywhere if no hypothesis is a small zoom and roll.
     """
     none = torch.zeros(len(first), dtype=torch.bool)
     if len(first) < 2:
         return none
     first, second = first.double(), second.double()
-    x, y = (torch.view_as_complex(end.contiguous()) for end in (first, second))
-    # Enough to hit two of the room once at 0.99 where it has 15 % of the matches.
-    one, other = torch.randint(len(x), (2, 200), generator=generator)
-    scale = (y[other] - y[one]) / (x[other] - x[one])  # not finite where both are one match
+    x, y = (torch.view_as_complex(pixels.contiguous()) for pixels in (first, second))
+    # With probability 0.99 one pair is of the background if that has 15 % of the matches.
+    start, stop = torch.randint(len(x), (2, 200), generator=generator)
+    scale = (y[stop] - y[start]) / (x[stop] - x[start])  # not finite if both are one match
     small = (scale.abs().log().abs() < math.log(_MAX_ZOOM)) & (scale.angle().abs() < _MAX_ROLL)
-    scale, shift = scale[small], (y[one] - scale * x[one])[small]
+    scale, shift = scale[small], (y[start] - scale * x[start])[small]
     if len(scale) == 0:
         return none
-    some = torch.randperm(len(x), generator=generator)[:2000]
-    # Without perspective, a map is right in a part of the picture only.
-    error = (scale[:, None] * x[some] + shift[:, None] - y[some]).abs()
-    most = int((error < 2 * max_error_px).sum(dim=1).argmax())
-    follows = (scale[most] * x + shift[most] - y).abs() < 2 * max_error_px
+    sample = torch.randperm(len(x), generator=generator)[:2000]
+    # Without perspective, a map is valid in a part of the image only.
+    error = (scale[:, None] * x[sample] + shift[:, None] - y[sample]).abs()
+    best = int((error < 2 * max_error_px).sum(dim=1).argmax())
+    follows = (scale[best] * x + shift[best] - y).abs() < 2 * max_error_px
     for _ in range(10):
         if follows.sum() < 8:
             break
@@ -81,17 +80,18 @@ def least_squares_map(
     u, v = x[:, :1], x[:, 1:]
     linear = [torch.cat([u, -v, one, zero], dim=1), torch.cat([v, u, zero, one], dim=1)]
     rows = torch.cat(
-        [torch.cat([part, -y[:, side, None] * x], dim=1) for side, part in enumerate(linear)]
+        [torch.cat([terms, -y[:, axis, None] * x], dim=1) for axis, terms in enumerate(linear)]
     )
-    found = torch.linalg.lstsq(rows, y.mT.reshape(-1, 1), driver="gelsd").solution[:, 0]
-    a, b, right, down, p, q = found
-    elements = torch.stack([a, -b, right, b, a, down, p, q, torch.ones_like(a)])
-    between = torch.diag(torch.stack([1 / size, 1 / size, torch.ones_like(size)]))
-    between[:2, 2] = -centre / size
-    return torch.linalg.solve(between, elements.reshape(3, 3) @ between)
+    a, b, u0, v0, p, q = torch.linalg.lstsq(rows, y.mT.reshape(-1, 1), driver="gelsd").solution[
+        :, 0
+    ]
+    elements = torch.stack([a, -b, u0, b, a, v0, p, q, torch.ones_like(a)])
+    scaling = torch.diag(torch.stack([1 / size, 1 / size, torch.ones_like(size)]))
+    scaling[:2, 2] = -centre / size
+    return torch.linalg.solve(scaling, elements.reshape(3, 3) @ scaling)
 
 
 def mapped(matrix: Matrix3, pixels: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 2"]:
-    """Map pixels by a homography; float64."""
-    found = homogeneous(pixels.double()) @ matrix.mT
-    return found[:, :2] / found[:, 2:]
+    """Return pixels mapped by a homography; float64."""
+    projective = homogeneous(pixels.double()) @ matrix.mT
+    return projective[:, :2] / projective[:, 2:]

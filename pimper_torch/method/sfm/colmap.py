@@ -1,4 +1,4 @@
-"""COLMAP's models: of cameras, and of what they see."""
+"""Conversion to and from COLMAP models, reprojection errors, and bundle adjustment."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
     """Write a model as COLMAP's binary files.
 
     Args:
-        folder: Made if it does not exist; files of those names in it are replaced.
+        folder: Created if needed; files of the same names are replaced.
     """
     with quiet():
         reconstruction = reconstruction_of(model, colors)
@@ -28,29 +28,29 @@ def write_binary(model: SparseModel, colors: UInt8[Tensor, "point 3"], folder: P
             folder.mkdir(parents=True, exist_ok=True)
             reconstruction.write_binary(str(folder))
         except (ValueError, RuntimeError, OSError) as error:
-            why = f" ({error.strerror})" if isinstance(error, OSError) else ""
+            reason = f" ({error.strerror})" if isinstance(error, OSError) else ""
             raise OutputError(
-                f"The sparse model cannot be written to {folder}{why}. Choose a folder that exists "
-                "and may be written."
+                f"The sparse model cannot be written to {folder}{reason}. Choose a folder that "
+                "exists and is writable."
             ) from error
 
 
 def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see camera_of
-    """Read COLMAP's own model; views by their ids, points by theirs."""
+    """Convert COLMAP's own model; views and points are sorted by their ids."""
     image_ids = sorted(reconstruction.reg_image_ids())
-    number = {image_id: index for index, image_id in enumerate(image_ids)}
+    view_of = {image_id: index for index, image_id in enumerate(image_ids)}
     images = [reconstruction.image(image_id) for image_id in image_ids]
     pixels = {
         image_id: [point.xy for point in image.points2D]
         for image_id, image in zip(image_ids, images, strict=True)
     }
-    points, tracks, places = [], [], []
+    points, tracks, observed_pixels = [], [], []
     for index, point_id in enumerate(sorted(reconstruction.point3D_ids())):
         point = reconstruction.point3D(point_id)
         points.append(point.xyz)
         for element in point.track.elements:
-            tracks.append((index, number[element.image_id]))
-            places.append(pixels[element.image_id][element.point2D_idx])
+            tracks.append((index, view_of[element.image_id]))
+            observed_pixels.append(pixels[element.image_id][element.point2D_idx])
     track = torch.tensor(tracks, dtype=torch.long).reshape(-1, 2)
     matrices = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
     poses = torch.from_numpy(matrices)
@@ -61,12 +61,14 @@ def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see camera_o
         points_world=torch.from_numpy(np.array(points, dtype=np.float64).reshape(-1, 3)),
         observation_point=track[:, 0],
         observation_view=track[:, 1],
-        observation_pixels=torch.from_numpy(np.array(places, dtype=np.float64).reshape(-1, 2)),
+        observation_pixels=torch.from_numpy(
+            np.array(observed_pixels, dtype=np.float64).reshape(-1, 2)
+        ),
     )
 
 
 def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | None = None) -> Any:  # noqa: ANN401 - see camera_of
-    """Make COLMAP's own model; its ids keep the order of views and points."""
+    """Convert to COLMAP's own model; its ids keep the order of views and points."""
     pycolmap = loaded()
 
     reconstruction = pycolmap.Reconstruction()
@@ -75,17 +77,17 @@ def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | Non
     view, pixels = model.observation_view.numpy(), model.observation_pixels.numpy()
     position = np.empty(len(view), dtype=np.int64)  # of each observation in its image
     for index, (name, lens) in enumerate(zip(model.names, model.lenses, strict=True)):
-        here = np.flatnonzero(view == index)
-        position[here] = np.arange(len(here))
+        in_view = np.flatnonzero(view == index)
+        position[in_view] = np.arange(len(in_view))
         image = pycolmap.Image(
-            name=name, keypoints=pixels[here], camera_id=lens.camera, image_id=index + 1
+            name=name, keypoints=pixels[in_view], camera_id=lens.camera, image_id=index + 1
         )
         pose = pycolmap.Rigid3d(model.cam_from_world[index, :3].numpy())
         reconstruction.add_image_with_trivial_frame(image, pose)
     tracks = [pycolmap.Track() for _ in model.points_world]
     ends = (model.observation_point.tolist(), (view + 1).tolist(), position.tolist())
-    for point, image_id, place in zip(*ends, strict=True):
-        tracks[point].add_element(image_id, place)
+    for point, image_id, index in zip(*ends, strict=True):
+        tracks[point].add_element(image_id, index)
     black = torch.zeros(len(tracks), 3, dtype=torch.uint8)
     rgb = (black if colors is None else colors.cpu()).numpy()
     for xyz, track, color in zip(model.points_world.numpy(), tracks, rgb, strict=True):
@@ -95,22 +97,22 @@ def reconstruction_of(model: SparseModel, colors: UInt8[Tensor, "point 3"] | Non
 
 
 def observation_errors(model: SparseModel) -> Float[Tensor, " observation"]:
-    """Return the distance between where a point is seen and where it should be, in pixels.
+    """Return the reprojection error of each observation, in pixels.
 
-    Infinite for a point that a camera sees from behind.
+    Infinite for a point behind the camera.
     """
     residual = torch.full_like(model.observation_pixels[:, 0], torch.inf)
     for index, lens in enumerate(model.lenses):
-        here = torch.nonzero(model.observation_view == index)[:, 0]
-        points = model.points_world[model.observation_point[here]]
+        in_view = torch.nonzero(model.observation_view == index)[:, 0]
+        points = model.points_world[model.observation_point[in_view]]
         expected = distort(lens, transform(model.cam_from_world[index], points))
-        distance = (expected - model.observation_pixels[here]).norm(dim=-1)
-        residual[here] = distance.nan_to_num(nan=torch.inf)
+        distance = (expected - model.observation_pixels[in_view]).norm(dim=-1)
+        residual[in_view] = distance.nan_to_num(nan=torch.inf)
     return residual
 
 
 def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
-    """Average :func:`observation_errors` over each point's track."""
+    """Return the mean of :func:`observation_errors` over each point's track."""
     total = torch.zeros_like(model.points_world[:, 0])
     total = total.index_add(0, model.observation_point, observation_errors(model))
     count = torch.bincount(model.observation_point, minlength=len(total))
@@ -120,16 +122,16 @@ def reprojection_errors(model: SparseModel) -> Float[Tensor, " point"]:
 def bundle(
     model: SparseModel, scale_px: float, *, cameras: bool = True, tolerance: float = 1e-6
 ) -> SparseModel:
-    """Adjust poses, lenses and points to the observations, robustly.
+    """Adjust poses, lenses and points robustly to the observations.
 
-    Principal points stay; focal lengths and distortions are adjusted, one set a lens. On one
-    thread, so that the same observations give the same bits.
+    Principal points are fixed; focal lengths and distortions are adjusted, one set per lens. Runs
+    on one thread, so that results are reproducible bit for bit.
 
     Args:
         scale_px: Residual at which Cauchy's weight is a half.
 
     Returns:
-        Views, points and observations in their old order.
+        Views, points and observations in the same order.
     """
     pycolmap = loaded()
 
@@ -155,7 +157,7 @@ def bundle(
         pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
     points = [reconstruction.point3D(point + 1).xyz for point in range(len(model.points_world))]
     images = [reconstruction.image(view + 1) for view in range(model.num_views)]
-    poses = torch.from_numpy(np.array([one.cam_from_world().matrix() for one in images]))
+    poses = torch.from_numpy(np.array([image.cam_from_world().matrix() for image in images]))
     return model.replace(
         lenses=tuple(lens_of(reconstruction.camera(lens.camera)) for lens in model.lenses),
         cam_from_world=torch.cat([poses, model.cam_from_world[:, 3:]], dim=1),

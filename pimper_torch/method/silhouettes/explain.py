@@ -53,8 +53,8 @@ def explain(
             worst = names[views[int(values.argmax())]]
             caution(
                 f"{worst}: the surface {verb} {float(values.max()):.0%} of the silhouette's area; "
-                f"it is more than {most:.0%} in {int((values > most).sum())} of {len(views)} views. "
-                "Check the silhouette in overview.png; `--masks` replaces it.",
+                f"more than {most:.0%} in {int((values > most).sum())} of {len(views)} views. "
+                "Check it in overview.png; `--masks` replaces it.",
                 stacklevel=2,
             )
     return SilhouetteCoverage(uncovered=uncovered, outside=outside)
