@@ -100,7 +100,7 @@ SHORT = b"\xff" * 4096, struct.pack("<Q", 2**40), b"", b"\1"
 )
 def test_files_that_are_cut_short_or_none_of_colmaps_are_refused(folder, damage):
     damage(folder)
-    with pytest.raises(InputError, match="cannot be read: cut short, or of another format"):
+    with pytest.raises(InputError, match="cannot be read: truncated or in another format"):
         read_model(folder)
 
 
@@ -116,7 +116,7 @@ def as_text(folder, part, line):
 def test_an_image_that_is_there_twice_is_refused(model, tmp_path):
     twice = model.replace(names=("a.png", "b.png", "a.png", "c.png"))
     reconstruction_of(twice, COLORS).write_text(str(tmp_path))
-    with pytest.raises(InputError, match=r"is broken: a\.png is in it twice"):
+    with pytest.raises(InputError, match=r"is broken: a\.png appears twice"):
         read_model(tmp_path)
 
 
@@ -135,7 +135,7 @@ def test_an_image_that_is_there_twice_is_refused(model, tmp_path):
 )
 def test_an_image_without_a_sound_pose_or_camera_is_refused(folder, name, layout, at, values):
     change(folder / f"{name}.bin", layout, 8 + at, *values)
-    with pytest.raises(InputError, match=r"is broken: a b\.png has no sound pose or camera"):
+    with pytest.raises(InputError, match=r"is broken: a b\.png has no valid pose or camera"):
         read_model(folder)
 
 

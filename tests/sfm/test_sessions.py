@@ -53,12 +53,12 @@ def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generato
 
 def test_series_are_noted_and_named_and_views_of_a_series_that_is_hardly_there_left_out(generator):
     model = model_of((12, 10), generator)
-    with pytest.warns(PimperWarning, match=r"between 2 series .*12 \(0.png.*10 \(12.png"):
+    with pytest.warns(PimperWarning, match=r"between 2 capture sessions.*12 \(0.png.*10 \(12.png"):
         noted = with_series(model, torch.tensor([0] * 12 + [1] * 10), model.names)
     assert noted.sessions.tolist() == [0] * 12 + [1] * 10
     with pytest.warns(PimperWarning, match=r"2 of 22 photographs .* 20.png, 21.png\. "):
         alone = with_series(model, torch.tensor([0] * 20 + [1] * 2), model.names)
     assert alone.num_views == 20
     assert len(alone.sessions) == 0
-    with pytest.warns(PimperWarning, match="background shifts against the object.*--masks"):
+    with pytest.warns(PimperWarning, match="background shifts relative to the object.*--masks"):
         assert with_series(model, torch.arange(22), model.names) is model

@@ -16,7 +16,7 @@ def test_series_between_which_an_object_was_turned_over_are_registered_on_it_wit
         "mug", SceneConfig(**settings, elevation_deg=20.0, table="patterned", turned_over=True)
     )
     views = photographs(scene, list(range(24))).replace(masks=None)
-    with pytest.warns(PimperWarning, match="between 2 series of photographs: 12 .*; 12 "):
+    with pytest.warns(PimperWarning, match="between 2 capture sessions: 12 .*; 12 "):
         found = Reconstruct(ReconstructConfig(threads=1))(views)
     assert found.views.names == scene.names
     assert found.sessions.tolist() == [0] * 12 + [1] * 12

@@ -85,7 +85,7 @@ def test_before_a_room_that_shifts_cameras_are_those_of_the_object(solid, jitter
     larger = {"width": 480, "height": 360, "num_views": 36}
     scene = furnished(solid, fixed_table=True, **larger, **jitter)
     views = photographs(scene, list(range(6))).replace(masks=None)
-    with pytest.warns(PimperWarning, match=r"background shifts against .*\(`--masks`\)"):
+    with pytest.warns(PimperWarning, match=r"background shifts relative to .*\(`--masks`\)"):
         found = Reconstruct(QUICK)(views)
     assert found.unregistered == ()
     assert center_errors(found, scene).median() < 0.005

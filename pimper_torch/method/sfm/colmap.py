@@ -44,13 +44,13 @@ def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see camera_o
         image_id: [point.xy for point in image.points2D]
         for image_id, image in zip(image_ids, images, strict=True)
     }
-    points, tracks, observed_pixels = [], [], []
+    points, tracks, centers = [], [], []
     for index, point_id in enumerate(sorted(reconstruction.point3D_ids())):
         point = reconstruction.point3D(point_id)
         points.append(point.xyz)
         for element in point.track.elements:
             tracks.append((index, view_of[element.image_id]))
-            observed_pixels.append(pixels[element.image_id][element.point2D_idx])
+            centers.append(pixels[element.image_id][element.point2D_idx])
     track = torch.tensor(tracks, dtype=torch.long).reshape(-1, 2)
     matrices = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
     poses = torch.from_numpy(matrices)
@@ -61,9 +61,7 @@ def model_of(reconstruction: Any) -> SparseModel:  # noqa: ANN401 - see camera_o
         points_world=torch.from_numpy(np.array(points, dtype=np.float64).reshape(-1, 3)),
         observation_point=track[:, 0],
         observation_view=track[:, 1],
-        observation_pixels=torch.from_numpy(
-            np.array(observed_pixels, dtype=np.float64).reshape(-1, 2)
-        ),
+        observation_pixels=torch.from_numpy(np.array(centers, dtype=np.float64).reshape(-1, 2)),
     )
 
 

@@ -1,13 +1,14 @@
-"""COLMAP's model files, text and binary, and the part of a model that is sound.
+"""Readers of COLMAP's model files, text and binary; broken parts of a model are skipped.
 
-The format is that of COLMAP's ``scene/reconstruction_io_*.cc``. What rigs and frames add is left
-out: ``images`` holds every pose, too. Files of strangers are read without COLMAP, whose reader ends
-the process where they are broken; nothing is allocated for a count before the file has the bytes.
+The format is that of COLMAP's ``scene/reconstruction_io_*.cc``. Rigs and frames are ignored:
+``images`` also contains every pose. Untrusted files are read without COLMAP, whose reader ends the
+process on broken ones; nothing is allocated for a count before the file has the bytes.
 """
 
 import struct
 from collections.abc import Iterator
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,11 +29,11 @@ _MAX_COORDINATE = 1e30  # poses and points beyond leave the range of single prec
 
 
 class _Image(NamedTuple):
-    """An image as its file has it.
+    """An image in its file.
 
     Attributes:
         pose: ``cam_from_world``: a quaternion, real part first, then the translation.
-        pixels: Of its features, ``feature 2``. Which points they see, tracks tell.
+        pixels: Of its features, ``feature 2``. Tracks specify their points.
     """
 
     number: int
@@ -43,7 +44,7 @@ class _Image(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """A point as its file has it; its track is ``element 2``, of an image and a feature of it."""
+    """A point in its file; its track is ``element 2``: an image and a feature of it."""
 
     number: int
     xyz: tuple[float, ...]
@@ -52,7 +53,7 @@ class _Point(NamedTuple):
 
 @cache
 def camera_models() -> dict[int, tuple[str, int]]:
-    """List COLMAP's camera models by their number in binary files: name, count of parameters."""
+    """Return COLMAP's camera models by number in binary files: name, number of parameters."""
     pycolmap = loaded()
     blank = pycolmap.Camera.create_from_model_name
     return {
@@ -65,42 +66,42 @@ def camera_models() -> dict[int, tuple[str, int]]:
 def read_model(folder: Path) -> SparseModel:
     """Read a COLMAP model: ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``.
 
-    Views and points are in the order of their numbers. Points that are not finite, and observations
-    that name an image or a feature that is not there, are left out with a warning.
+    Views and points are sorted by number. Points that are not finite, and observations with an
+    unknown image or feature, are skipped with a warning.
 
     Raises:
-        InputError: The folder holds no such files; one is cut short, or of another format; or an
-            image is there twice, or has a pose or a camera that is none.
+        InputError: The folder contains no such files; one is truncated or in a different format; or
+            an image is duplicated or has no valid pose or camera.
     """
     ending = _ending(folder)
     if ending is None:
         raise InputError(
-            f"{folder} holds no COLMAP model: needed are cameras, images and points3D, all .bin "
-            "or all .txt. Point to the folder that has them, often named sparse/0."
+            f"{folder} contains no COLMAP model; needed: cameras, images and points3D, all .bin or "
+            "all .txt. Give the folder that contains them, often named sparse/0."
         )
     text = ending == ".txt"
     try:
         data = [(folder / f"{part}{ending}").read_bytes() for part in _PARTS]
-        lenses = {one.camera: one for one in (_text_cameras if text else _binary_cameras)(data[0])}
-        images = sorted((_text_images if text else _binary_images)(data[1]), key=lambda one: one[0])
-        points = sorted((_text_points if text else _binary_points)(data[2]), key=lambda one: one[0])
+        lenses = {x.camera: x for x in (_text_cameras if text else _binary_cameras)(data[0])}
+        images = sorted((_text_images if text else _binary_images)(data[1]), key=itemgetter(0))
+        points = sorted((_text_points if text else _binary_points)(data[2]), key=itemgetter(0))
     except (OSError, struct.error, ValueError, LookupError, OverflowError) as error:
-        why = (isinstance(error, OSError) and error.strerror) or "cut short, or of another format"
+        reason = (isinstance(error, OSError) and error.strerror) or "truncated or in another format"
         raise InputError(
-            f"The COLMAP model in {folder} cannot be read: {why}. Write it again with COLMAP's "
-            "model_converter, or leave it out to run structure from motion."
+            f"The COLMAP model in {folder} cannot be read: {reason}. Export it again with COLMAP's "
+            "model_converter, or omit it to run structure from motion."
         ) from None
     names = [image.name for image in images]
-    faults = [f"{name} is in it twice" for name in sorted(set(names)) if names.count(name) > 1]
+    faults = [f"{name} appears twice" for name in sorted(set(names)) if names.count(name) > 1]
     faults += [
-        f"{image.name} has no sound pose or camera"
+        f"{image.name} has no valid pose or camera"
         for image in images
         if not _sound(image, lenses.get(image.camera))
     ]
     if faults:
         raise InputError(
-            f"The COLMAP model in {folder} is broken: {some(faults, 4)}. Write it again, or leave "
-            "it out to run structure from motion."
+            f"The COLMAP model in {folder} is broken: {some(faults, 4)}. Export it again, or omit "
+            "it to run structure from motion."
         )
     poses = torch.tensor([image.pose for image in images], dtype=torch.float64).reshape(-1, 7)
     model = SparseModel(
@@ -112,7 +113,7 @@ def read_model(folder: Path) -> SparseModel:
 
 
 def largest_model(folder: Path) -> Path:
-    """Return a folder with a model, or the folder in it that has the largest; warn of others."""
+    """Return a folder with a model, or the subfolder with the largest model; warn about others."""
     inner = sorted(folder.iterdir()) if folder.is_dir() and not _ending(folder) else []
     endings = {path: ending for path in inner if (ending := _ending(path))}
     sizes = {path: (path / f"images{ending}").stat().st_size for path, ending in endings.items()}
@@ -120,14 +121,14 @@ def largest_model(folder: Path) -> Path:
     if len(sizes) > 1:
         others = some([path.name for path in sizes if path != largest])
         caution(
-            f"{folder} holds {len(sizes)} COLMAP models, each in a frame of its own; read is "
-            f"{largest.name}, the largest, not {others}. Point to another one if that is meant."
+            f"{folder} contains {len(sizes)} COLMAP models, each in its own frame. The largest, "
+            f"{largest.name}, is used, not {others}. To use another one, give its folder."
         )
     return largest
 
 
 def _ending(folder: Path) -> str | None:
-    """Find how the three files of a model end; ``None`` where one is missing."""
+    """Return the ending of the three files of a model; ``None`` if one is missing."""
     for ending in (".bin", ".txt"):
         names = (f"{part}{ending}" for part in _PARTS)
         if all((folder / name).is_file() for name in names):
@@ -136,40 +137,40 @@ def _ending(folder: Path) -> str | None:
 
 
 def _binary_cameras(data: bytes) -> Iterator[CameraModel]:
-    (count,), at = struct.unpack_from("<Q", data), 8
+    (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        camera, kind, width, height = struct.unpack_from("<IiQQ", data, at)
+        camera, kind, width, height = struct.unpack_from("<IiQQ", data, offset)
         model, size = camera_models()[kind]
-        params = struct.unpack_from(f"<{size}d", data, at + 24)
+        params = struct.unpack_from(f"<{size}d", data, offset + 24)
         yield CameraModel(camera=camera, model=model, params=params, width=width, height=height)
-        at += 24 + 8 * size
+        offset += 24 + 8 * size
 
 
 def _binary_images(data: bytes) -> Iterator[_Image]:
-    (count,), at = struct.unpack_from("<Q", data), 8
+    (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        image, *pose, camera = struct.unpack_from("<I7dI", data, at)
-        end = data.index(b"\0", at + 64)
-        name = data[at + 64 : end].decode("utf-8", "surrogateescape")
+        image, *pose, camera = struct.unpack_from("<I7dI", data, offset)
+        end = data.index(b"\0", offset + 64)
+        name = data[offset + 64 : end].decode("utf-8", "surrogateescape")
         (features,) = struct.unpack_from("<Q", data, end + 1)
         seen = np.frombuffer(data, _POINT2D, features, end + 9)
         yield _Image(image, tuple(pose), camera, name, np.stack([seen["x"], seen["y"]], axis=1))
-        at = end + 9 + seen.nbytes
+        offset = end + 9 + seen.nbytes
 
 
 def _binary_points(data: bytes) -> Iterator[_Point]:
-    (count,), at = struct.unpack_from("<Q", data), 8
+    (count,), offset = struct.unpack_from("<Q", data), 8
     head = struct.Struct("<Q3d3BdQ")
     for _ in range(count):
-        point, x, y, z, *_, length = head.unpack_from(data, at)
-        track = np.frombuffer(data, "<u4", 2 * length, at + head.size)
+        point, x, y, z, *_, length = head.unpack_from(data, offset)
+        track = np.frombuffer(data, "<u4", 2 * length, offset + head.size)
         yield _Point(point, (x, y, z), track.reshape(-1, 2))
-        at += head.size + track.nbytes
+        offset += head.size + track.nbytes
 
 
 def _lines(data: bytes) -> Iterator[str]:
     text = data.decode("utf-8-sig", "surrogateescape").removesuffix("\n")
-    # A name may hold what else Unicode ends lines by.
+    # A name may contain Unicode's other line separators.
     return (line.strip() for line in text.split("\n") if not line.lstrip().startswith("#"))
 
 
@@ -201,20 +202,20 @@ def _text_points(data: bytes) -> Iterator[_Point]:
 
 
 def _sound(image: _Image, lens: CameraModel | None) -> bool:
-    """Return whether an image has a rotation, a place, and a lens with a focal length."""
+    """Return whether an image has a rotation, a position, and a lens with a focal length."""
     if lens is None or lens.model == "EQUIRECTANGULAR":
         return False
     numbers = (*image.pose, *lens.params)
     rotation = abs(float(np.linalg.norm(image.pose[:4])) - 1) <= 0.1  # other programs round
     sizes = all(0 < side <= 10**6 for side in (lens.width, lens.height))
     focal = min(lens.params[: count_focals(lens)]) > 0
-    return rotation and sizes and focal and all(abs(one) < _MAX_COORDINATE for one in numbers)
+    return rotation and sizes and focal and all(abs(x) < _MAX_COORDINATE for x in numbers)
 
 
 def _with_points(
     model: SparseModel, images: list[_Image], points: list[_Point], folder: Path
 ) -> SparseModel:
-    """Take the points that are finite, and what images observe of them."""
+    """Add the finite points and their observations to the model."""
     xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     finite = (np.abs(xyz) < _MAX_COORDINATE).all(axis=1)
     number = np.where(finite, np.cumsum(finite) - 1, -1)
@@ -222,23 +223,23 @@ def _with_points(
     image, feature = np.concatenate([np.zeros((0, 2), np.int64), *tracks]).T
     point = number.repeat([len(track) for track in tracks])
     view_of = {image.number: view for view, image in enumerate(images)}
-    view = np.array([view_of.get(one, -1) for one in image.tolist()], np.int64)
-    counts = [*(len(image.pixels) for image in images), 0]  # the last of images that are not there
+    view = np.array([view_of.get(number, -1) for number in image.tolist()], np.int64)
+    counts = [*(len(image.pixels) for image in images), 0]  # the last one is for missing images
     pixels = np.concatenate([*(image.pixels for image in images), np.full((1, 2), np.nan)])
-    sound = (point >= 0) & (feature >= 0) & (feature < np.array(counts)[view])
-    place = np.where(sound, np.cumsum([0, *counts[:-1]])[view] + feature, -1)
-    sound &= (np.abs(pixels[place]) < _MAX_COORDINATE).all(axis=1)  # false for NaN
-    lost, unseen = int((~finite).sum()), int((point >= 0).sum() - sound.sum())
-    if lost or unseen:
+    valid = (point >= 0) & (feature >= 0) & (feature < np.array(counts)[view])
+    index = np.where(valid, np.cumsum([0, *counts[:-1]])[view] + feature, -1)
+    valid &= (np.abs(pixels[index]) < _MAX_COORDINATE).all(axis=1)  # false for NaN
+    lost, unknown = int((~finite).sum()), int((point >= 0).sum() - valid.sum())
+    if lost or unknown:
         caution(
-            f"The COLMAP model in {folder} is partly broken. Left out are {lost} of {len(points)} "
-            f"points, whose coordinates are not finite, and {unseen} observations, which name no "
-            "feature of an image. Write it again if these matter.",
+            f"The COLMAP model in {folder} is partly broken. Skipped: {lost} of {len(points)} "
+            f"points, whose coordinates are not finite, and {unknown} observations of unknown "
+            "features. Export it again if these matter.",
             stacklevel=4,
         )
     return model.replace(
         points_world=torch.from_numpy(xyz[finite]),
-        observation_point=torch.from_numpy(point[sound]),
-        observation_view=torch.from_numpy(view[sound]),
-        observation_pixels=torch.from_numpy(pixels[place[sound]]),
+        observation_point=torch.from_numpy(point[valid]),
+        observation_view=torch.from_numpy(view[valid]),
+        observation_pixels=torch.from_numpy(pixels[index[valid]]),
     )
