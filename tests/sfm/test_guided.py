@@ -15,9 +15,9 @@ from pimper_torch.method.sfm.matching import (
     Features,
     Near,
     guided_matches,
-    likeness,
     match_guided,
     match_pairs,
+    most_similar,
     verified_pairs,
 )
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
@@ -96,7 +96,7 @@ def test_the_two_largest_products_within_the_distance_are_found(generator, lengt
     assert ((away - limit).abs() > 1e-5 * limit).all()  # none within rounding of the limit
     products = first.descriptors @ second.descriptors.mT
     products = torch.where(away <= limit, products, -1)
-    found = likeness(first, second, Near(matrix, limit, planar=planar))
+    found = most_similar(first, second, Near(matrix, limit, planar=planar))
     for alike, table in zip(found, (products, products.mT), strict=True):
         largest, best = table.topk(2, dim=1)
         best = torch.where(largest[:, 0] >= 0, best[:, 0], -1)

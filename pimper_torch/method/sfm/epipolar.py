@@ -24,7 +24,7 @@ Ends = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ 2"]]  # of matches, in two p
 
 
 def sampson_errors(geometry: Matrix3, first: Matched, second: Matched) -> Float[Tensor, " match"]:
-    """Return the first-order distance of matches from an epipolar geometry, in pixels."""
+    """Return the first-order distance of matches to an epipolar geometry, in pixels."""
     ends = first.double(), second.double()
     return sampson_epipolar_distance(*ends, geometry, squared=False)
 
@@ -32,14 +32,14 @@ def sampson_errors(geometry: Matrix3, first: Matched, second: Matched) -> Float[
 def fundamental_matrix(first: Matched, second: Matched, weight: Float[Tensor, " match"]) -> Matrix3:
     """Fit ``F``, with ``second^T F first = 0``, by weighted least squares; float64.
 
-    kornia's ``find_fundamental`` weighs the normalization of the pixels, too: reweighted, still and
-    moving matches that contradict one another then violate the fit as little as 2 %, here 26 % at
-    least (30 turntables of two photographs).
+    kornia's ``find_fundamental`` also weighs the normalization of the pixels: reweighted with it,
+    static and moving matches that contradict each other violate the fit by as little as 2 %, here
+    by at least 26 % (30 turntables of two photographs).
 
     Source: Hartley, In Defense of the Eight-Point Algorithm, PAMI 19(6), 1997.
     """
-    x, from_first = (part[0] for part in normalize_points(first.double()[None]))
-    y, from_second = (part[0] for part in normalize_points(second.double()[None]))
+    x, from_first = (batch[0] for batch in normalize_points(first.double()[None]))
+    y, from_second = (batch[0] for batch in normalize_points(second.double()[None]))
     rows = (homogeneous(y)[:, :, None] * homogeneous(x)[:, None, :]).flatten(1)
     least = torch.linalg.eigh(rows.mT @ (weight[:, None] * rows)).eigenvectors[:, 0]
     u, s, v = torch.linalg.svd(least.reshape(3, 3))
@@ -48,27 +48,27 @@ def fundamental_matrix(first: Matched, second: Matched, weight: Float[Tensor, " 
 
 
 def shared_geometry(static: Ends, moving: Ends, max_error_px: float) -> Matrix3:
-    """Fit the fundamental matrix that explains still and moving matches best; float64.
+    """Fit one fundamental matrix to static and moving matches; float64.
 
-    The eight-point algorithm, reweighted for Cauchy's loss of Sampson's distance. Both kinds weigh
-    the same. Every translation explains the still ones, so that it is mostly the moving ones that
-    violate the result where no geometry explains both.
+    The eight-point algorithm, reweighted for Cauchy's loss of Sampson's distance. Both kinds have
+    the same total weight. Every translation explains the static ones, so if no geometry explains
+    both, mostly the moving ones violate the result.
     """
     first, second = (torch.cat(ends).double() for ends in zip(static, moving, strict=True))
     count = torch.tensor([len(static[0]), len(moving[0])])
-    weight = even = (1 / count.double()).repeat_interleave(count)
+    weight = balanced = (1 / count.double()).repeat_interleave(count)
     for _ in range(6):
         geometry = fundamental_matrix(first, second, weight)
         error = sampson_errors(geometry, first, second)
         lines = torch.cat([homogeneous(first) @ geometry.mT, homogeneous(second) @ geometry], dim=1)
         gradient = lines[:, [0, 1, 3, 4]].square().sum(dim=1)  # of the algebraic residual
         tiny = torch.finfo(gradient.dtype).tiny
-        weight = even / (gradient.clamp_min(tiny) * (1 + (error / max_error_px).square()))
+        weight = balanced / (gradient.clamp_min(tiny) * (1 + (error / max_error_px).square()))
     return geometry
 
 
 def pinholes_of(model: SparseModel) -> Cameras:
-    """Return the pinholes behind a model's lenses."""
+    """Return the pinhole cameras of a model, without the distortion of its lenses."""
     return Cameras(
         intrinsics=torch.stack([pinhole_of(lens) for lens in model.lenses]),
         cam_from_world=model.cam_from_world,
@@ -79,13 +79,13 @@ def pinholes_of(model: SparseModel) -> Cameras:
 def epipolar_geometry(cameras: Cameras, views: PhotographPair) -> Matrix3:
     """Return ``F`` of two views, with ``second^T F first = 0`` for undistorted pixels."""
     poses = (cameras.cam_from_world[view] for view in views)
-    motion = (part for pose in poses for part in (pose[:3, :3], pose[:3, 3:]))
+    motion = (block for pose in poses for block in (pose[:3, :3], pose[:3, 3:]))
     intrinsics = (cameras.intrinsics[view] for view in views)
     return fundamental_from_essential(essential_from_Rt(*motion), *intrinsics)
 
 
 def undistorted_pixels(model: SparseModel, view: int, pixels: Matched) -> Matched:
-    """Return where a pinhole of the lens's own focal length has pixels of a photograph."""
+    """Return undistorted pixels, of a pinhole with the focal length of the lens."""
     K = pinhole_of(model.lenses[view])
     return undistort_pixels(model.lenses[view], pixels) * K.diagonal()[:2] + K[:2, 2]
 
@@ -93,7 +93,7 @@ def undistorted_pixels(model: SparseModel, view: int, pixels: Matched) -> Matche
 def undistorted_pairs(
     model: SparseModel, pairs: Sequence[VerifiedPair]
 ) -> tuple[VerifiedPair, ...]:
-    """Undistort matches by the lenses of a model."""
+    """Return matches undistorted by the lenses of a model."""
     return tuple(
         pair.replace(
             first=undistorted_pixels(model, pair.views[0], pair.first),
@@ -104,7 +104,7 @@ def undistorted_pairs(
 
 
 def match_errors(model: SparseModel, pairs: Sequence[VerifiedPair]) -> Float[Tensor, " match"]:
-    """Measure Sampson's distances of matches from the epipolar lines of a model, in pixels."""
+    """Return Sampson's distances of matches to the epipolar lines of a model, in pixels."""
     cameras = pinholes_of(model)
     errors = [
         sampson_errors(epipolar_geometry(cameras, pair.views), pair.first, pair.second)
@@ -114,22 +114,22 @@ def match_errors(model: SparseModel, pairs: Sequence[VerifiedPair]) -> Float[Ten
 
 
 def inliers(cameras: Cameras, pair: VerifiedPair, max_error_px: float) -> Bool[Tensor, " match"]:
-    """Find the matches on each other's epipolar lines whose point is before both cameras.
+    """Return the matches near each other's epipolar lines with a point in front of both cameras.
 
     Args:
         cameras: Pinholes; axes may be mirrored.
-        pair: Its numbers are those of views; pixels of pinholes.
+        pair: With numbers of views; pixels of pinholes.
     """
-    one, other = pair.views
+    first_view, second_view = pair.views
     K, poses = cameras.intrinsics, cameras.cam_from_world
     geometry = epipolar_geometry(cameras, pair.views)
     near = sampson_errors(geometry, pair.first, pair.second) <= max_error_px
-    between = poses[other] @ torch.linalg.inv(poses[one])
-    rays = homogeneous(pair.first) @ torch.linalg.inv(K[one]).mT @ between[:3, :3].mT
-    back = homogeneous(pair.second) @ torch.linalg.inv(K[other]).mT
-    # Where x rays + t meets y back, as well as they do: signs of x and y tell.
+    between = poses[second_view] @ torch.linalg.inv(poses[first_view])
+    rays = homogeneous(pair.first) @ torch.linalg.inv(K[first_view]).mT @ between[:3, :3].mT
+    back = homogeneous(pair.second) @ torch.linalg.inv(K[second_view]).mT
+    # Signs of the x and y at which x rays + t is closest to y back.
     shift = between[:3, 3].expand_as(rays)
     normal = torch.linalg.cross(rays, back)
     ahead = (torch.linalg.cross(back, shift) * normal).sum(dim=1) > 0
-    ahead_there = (torch.linalg.cross(rays, shift) * normal).sum(dim=1) > 0
-    return near & ahead & ahead_there
+    ahead_in_second = (torch.linalg.cross(rays, shift) * normal).sum(dim=1) > 0
+    return near & ahead & ahead_in_second

@@ -1,4 +1,4 @@
-"""SIFT features of photographs, found by COLMAP on the CPU."""
+"""SIFT features of photographs, detected by COLMAP on the CPU."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,8 +28,8 @@ class Workspace:
 
     Attributes:
         files: Names of the photographs in ``images``, in the order of the views.
-        masked: Whether ``masks`` holds a mask for each, under its name with another ``.png``
-            behind, as COLMAP wants them.
+        masked: Whether ``masks`` contains a mask for each, under its name plus ``.png``, as COLMAP
+            requires.
     """
 
     folder: Path
@@ -57,7 +57,7 @@ class Workspace:
 def workspace(views: Views, threads: int) -> Iterator[Workspace]:
     """Write photographs and masks to a temporary folder, which is removed when the block ends.
 
-    Photographs are in 8-bit sRGB, without their padding.
+    Photographs are 8-bit gray in sRGB, without their padding.
     """
     with scratch() as folder:
         space = Workspace(
@@ -72,7 +72,7 @@ def workspace(views: Views, threads: int) -> Iterator[Workspace]:
             width, height = (int(side) for side in views.sizes_px[index])
             pixels = to_bytes(views.images[index, :, :height, :width].detach()).cpu()
             picture = Image.fromarray(pixels.movedim(0, -1).squeeze(-1).numpy()).convert("L")
-            # Fast compression: the files live for seconds. COLMAP finds features in luma alone.
+            # Fast compression: the files live for seconds. COLMAP uses luma alone.
             picture.save(space.images / space.files[index], compress_level=1)
             if views.masks is not None:
                 mask = views.masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
@@ -86,14 +86,14 @@ def workspace(views: Views, threads: int) -> Iterator[Workspace]:
         yield space
 
 
-# The side of photographs below which COLMAP 4.2's covariant detector reads past their end.
+# Side of photographs below which COLMAP 4.2's covariant detector reads out of bounds.
 SMALLEST_PX = 16
 
 
 def too_small(views: Views) -> list[str]:
-    """List photographs in which features cannot be looked for: COLMAP's process ends there."""
+    """List photographs too small for features: COLMAP would end the process."""
     small = (views.sizes_px < SMALLEST_PX).any(dim=1).tolist()
-    return [name for name, one in zip(views.names, small, strict=True) if one]
+    return [name for name, is_small in zip(views.names, small, strict=True) if is_small]
 
 
 def find_features(
@@ -102,14 +102,17 @@ def find_features(
     focals_px: Sequence[float | None],
     lenses: Sequence[int],
 ) -> list[int]:
-    """Find features and put them in the database, with one camera a lens.
+    """Detect features and write them to the database, with one camera per lens.
 
     Args:
-        space: Without a database, which is made. Where it has masks, features lie where they
+        space: Without a database, which is created. If it has masks, features are only where they
             are not black.
-        focals_px: Focal length of each photograph where it is known before. A camera shared by
-            several photographs gets their median.
-        lenses: Number of each photograph's lens; those of one lens have one size.
+        focals_px: Focal length of each photograph, if known. A camera shared by several photographs
+            gets their median.
+        lenses: Number of each photograph's lens; photographs of one lens have the same size.
+
+    Returns:
+        Number of features of each photograph.
     """
     pycolmap = loaded()
 
@@ -124,13 +127,13 @@ def find_features(
     reader.camera_model = settings.camera_model
     if space.masked:
         reader.mask_path = str(space.masks)
-    one = len(set(lenses)) == 1
-    mode = pycolmap.CameraMode.SINGLE if one else pycolmap.CameraMode.PER_IMAGE
+    shared = len(set(lenses)) == 1
+    mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
     with quiet():
         pycolmap.Database.open(space.database).close()
         _import(space, reader, lenses)
-        with pycolmap.Database.open(space.database) as stored:
-            _set_focals(stored, dict(zip(space.files, focals_px, strict=True)))
+        with pycolmap.Database.open(space.database) as database:
+            _set_focals(database, dict(zip(space.files, focals_px, strict=True)))
         step = 2 * settings.num_threads  # photographs between two reports of progress
         for start in track(range(0, len(space.files), step)):
             pycolmap.extract_features(
@@ -142,18 +145,18 @@ def find_features(
                 extraction_options=options,
                 device=pycolmap.Device.cpu,
             )
-        with pycolmap.Database.open(space.database) as stored:
-            return [stored.num_keypoints_for_image(image) for image in image_ids(stored, space)]
+        with pycolmap.Database.open(space.database) as database:
+            return [database.num_keypoints_for_image(image) for image in image_ids(database, space)]
 
 
-def image_ids(stored: Any, space: Workspace) -> list[int]:  # noqa: ANN401 - pycolmap is untyped
-    """Return the number of each photograph in the database."""
-    ids = {image.name: image.image_id for image in stored.read_all_images()}
+def image_ids(database: Any, space: Workspace) -> list[int]:  # noqa: ANN401 - pycolmap is untyped
+    """Return the id of each photograph in the database."""
+    ids = {image.name: image.image_id for image in database.read_all_images()}
     return [ids[file] for file in space.files]
 
 
 def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # noqa: ANN401 - no types
-    """Put photographs in the database in their order, each with the camera of its lens."""
+    """Add photographs to the database in their order, each with the camera of its lens."""
     pycolmap = loaded()
     cameras: dict[int, int] = {}
     for lens, run in groupby(zip(lenses, space.files, strict=True), key=itemgetter(0)):
@@ -162,21 +165,21 @@ def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # no
         shared = pycolmap.CameraMode.SINGLE
         pycolmap.import_images(space.database, space.images, shared, files, reader)
         if lens not in cameras:
-            with pycolmap.Database.open(space.database) as stored:
-                cameras[lens] = stored.read_image_with_name(files[0]).camera_id
+            with pycolmap.Database.open(space.database) as database:
+                cameras[lens] = database.read_image_with_name(files[0]).camera_id
     reader.existing_camera_id = -1
 
 
-def _set_focals(stored: Any, focals_px: dict[str, float | None]) -> None:  # noqa: ANN401 - no types
-    known: dict[int, list[float]] = {}
-    for image in stored.read_all_images():
+def _set_focals(database: Any, focals_px: dict[str, float | None]) -> None:  # noqa: ANN401 - no types
+    focals_of: dict[int, list[float]] = {}
+    for image in database.read_all_images():
         if (focal := focals_px[image.name]) is not None:
-            known.setdefault(image.camera_id, []).append(focal)
-    for camera in stored.read_all_cameras():
-        if camera.camera_id not in known:
+            focals_of.setdefault(image.camera_id, []).append(focal)
+    for camera in database.read_all_cameras():
+        if camera.camera_id not in focals_of:
             continue
         params = np.array(camera.params)
-        params[list(camera.focal_length_idxs())] = np.median(known[camera.camera_id])
+        params[list(camera.focal_length_idxs())] = np.median(focals_of[camera.camera_id])
         camera.params = params
         camera.has_prior_focal_length = True
-        stored.update_camera(camera)
+        database.update_camera(camera)

@@ -1,4 +1,4 @@
-"""A sparse model before it has photographs: what SfM finds and COLMAP's folders hold."""
+"""A sparse model without photographs: the result of SfM, and the content of COLMAP folders."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,13 +18,13 @@ class SparseModel(Record):
     """Registered views and their sparse points, in float64 on the CPU.
 
     Attributes:
-        lenses: One a view, before undistortion.
-        observation_pixels: Where, in the photograph before undistortion.
-        background_from_view: Maps from pixels of each photograph, before undistortion, to those
-            where the background is at rest before which the object turns; NaN where a view shows
-            too little of it. Empty without such a background.
-        series: Number of each view's series, where the object was moved between several; empty
-            where it was not.
+        lenses: One per view, before undistortion.
+        observation_pixels: In the photograph before undistortion.
+        background_from_view: Maps from pixels of each photograph, before undistortion, to the frame
+            in which the background of a turning object is static; NaN for a view that shows too
+            little of it. Empty without such a background.
+        sessions: Number of each view's capture session, if the object was moved between sessions;
+            otherwise empty.
     """
 
     names: tuple[str, ...]
@@ -46,12 +46,12 @@ class SparseModel(Record):
 
     @property
     def observed(self) -> Bool[Tensor, "point view"]:
-        """True where a view sees a point."""
+        """True where a view observes a point."""
         shape = len(self.points_world), self.num_views
         return pairs_table(self.observation_point, self.observation_view, shape)
 
     def with_points(self, other: "SparseModel") -> "SparseModel":
-        """Take points and observations from a model of the same views."""
+        """Replace points and observations by those of a model of the same views."""
         return self.replace(
             points_world=other.points_world,
             observation_point=other.observation_point,
@@ -70,7 +70,7 @@ class SparseModel(Record):
         )
 
     def without(self, observations: Bool[Tensor, " observation"]) -> "SparseModel":
-        """Leave observations out, and points that fewer than two views see then."""
+        """Remove observations, and points with fewer than two remaining ones."""
         kept = self.replace(
             observation_point=self.observation_point[~observations],
             observation_view=self.observation_view[~observations],
@@ -80,7 +80,7 @@ class SparseModel(Record):
 
 
 def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
-    """Take views of a model, in the order given, and the points that two of them see.
+    """Select views of a model, in the given order, and the points observed by at least two of them.
 
     Returns:
         Points in their old order. Observations are sorted by point, then view.
@@ -91,16 +91,16 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
     rows = torch.cat([views[:0], *(by_view[view] for view in chosen)])
     view = torch.arange(len(chosen)).repeat_interleave(counts[views])
     point = model.observation_point[rows]
-    tied = pairs_table(point, view, (len(model.points_world), len(chosen))).sum(dim=1) >= 2
-    rows, view, point = (values[tied[point]] for values in (rows, view, point))
-    point = (torch.cumsum(tied, dim=0) - 1)[point]
+    shared = pairs_table(point, view, (len(model.points_world), len(chosen))).sum(dim=1) >= 2
+    rows, view, point = (values[shared[point]] for values in (rows, view, point))
+    point = (torch.cumsum(shared, dim=0) - 1)[point]
     order = torch.argsort(point * max(len(chosen), 1) + view, stable=True)
     maps, sessions = model.background_from_view, model.sessions
     return SparseModel(
         names=tuple(model.names[index] for index in chosen),
         lenses=tuple(model.lenses[index] for index in chosen),
         cam_from_world=model.cam_from_world[views],
-        points_world=model.points_world[tied],
+        points_world=model.points_world[shared],
         observation_point=point[order],
         observation_view=view[order],
         observation_pixels=model.observation_pixels[rows[order]],
@@ -110,11 +110,11 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
 
 
 def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
-    """Drop views that see too few points for their pose to be trusted, until none is left."""
+    """Remove views with too few points for a reliable pose, repeatedly."""
     while model.num_views:
-        seen = torch.bincount(model.observation_view, minlength=model.num_views)
-        strong = torch.nonzero(seen >= fewest)[:, 0].tolist()
-        leave_out("sfm.weak_views", seen < fewest)
+        counts = torch.bincount(model.observation_view, minlength=model.num_views)
+        strong = torch.nonzero(counts >= fewest)[:, 0].tolist()
+        leave_out("sfm.weak_views", counts < fewest)
         if len(strong) == model.num_views:
             break
         model = select_views(model, strong)
@@ -122,10 +122,10 @@ def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
 
 
 def longest_tracks(model: SparseModel, most: int) -> SparseModel:
-    """Keep of every view the points that most views see, and with them all who sees them.
+    """Keep each view's points with the longest tracks, with all their observations.
 
     Args:
-        most: Points a view; more where they are among another view's.
+        most: Points per view; more if other views select them.
     """
     length = torch.bincount(model.observation_point)[model.observation_point]
     order = torch.argsort(length, descending=True, stable=True)

@@ -75,10 +75,8 @@ def find_moved_object(
         if len(second) >= max(_MIN_SECOND, _MIN_FRACTION * len(frequent[pair])):
             ends = [matching.pixels_of(keypoints, pair, rows) for rows in (verified[pair], second)]
             shared = shared_geometry(ends[0], ends[1], max_error_px)
-            violating = [
-                (sampson_errors(shared, *end) > max_error_px).double().mean() for end in ends
-            ]
-            if float(torch.stack(violating).amax()) > 0.2:  # no geometry explains both
+            far = [(sampson_errors(shared, *end) > max_error_px).double().mean() for end in ends]
+            if float(torch.stack(far).amax()) > 0.2:  # no geometry explains both
                 seconds[pair] = second
     if len(seconds) < 3:  # a thing that was moved between two photographs is in few
         return one_session
@@ -279,17 +277,17 @@ def with_series(
     if len(groups) > 1:
         listed = "; ".join(f"{len(group)} ({some(group)})" for group in groups)
         caution(
-            f"The object was moved on its support between {len(groups)} capture sessions: {listed}. "
-            "Between sessions only the object's features are matched; all cameras are in the "
+            f"The object was moved on its support between {len(groups)} capture sessions: {listed}"
+            ". Between sessions only the object's features are matched; all cameras are in the "
             "object's frame.",
             stacklevel=4,
         )
         return model.replace(sessions=numbers)
     if apart := [name for name in names if name not in model.names]:
         caution(
-            f"The object was moved on its support, and too few of its features link {len(apart)} of "
-            f"{len(names)} photographs to the others. Only the others are reconstructed, without "
-            f"{some(apart, most=20)}. {JOINING}",
+            f"The object was moved on its support, and too few of its features link {len(apart)} "
+            f"of {len(names)} photographs to the others. Only the others are reconstructed, "
+            f"without {some(apart, most=20)}. {JOINING}",
             stacklevel=4,
         )
     return model
