@@ -127,7 +127,7 @@ def turned(frame):
 
 
 FAULTS = {
-    "not finite all over": partial(with_image, value=torch.nan),
+    "not finite everywhere": partial(with_image, value=torch.nan),
     "it is black": partial(with_image, value=0.0),
     "saturated or": partial(with_image, value=1.0),
     "in its frame": partial(with_pose, change=moved),

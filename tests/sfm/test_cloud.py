@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pimper_torch.method.sfm.cloud import cloud_tracks, in_sight
+from pimper_torch.method.sfm.cloud import cloud_tracks, visible_from
 from pimper_torch.method.sfm.colmap import observation_errors
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
@@ -32,7 +32,7 @@ def bare(generator) -> SparseModel:
 def test_points_of_a_ball_are_in_sight_on_the_side_of_the_viewer():
     points, center = sphere(2000), torch.tensor([1.0, -2.0, 4.5], dtype=torch.float64)
     facing = points @ center  # more than 1 where the tangent plane is in front of the viewer
-    seen = in_sight(points, center)
+    seen = visible_from(points, center)
     assert bool(seen[facing > 1.3].all())
     assert not bool(seen[facing < 0.5].any())  # behind the rim by a spacing of the points
 
@@ -40,12 +40,12 @@ def test_points_of_a_ball_are_in_sight_on_the_side_of_the_viewer():
 def test_points_on_one_plane_are_all_in_sight():
     plane = torch.cartesian_prod(*[torch.linspace(-1, 1, 9).double()] * 2)
     points = torch.cat([plane, torch.zeros(81, 1).double()], dim=1)
-    assert bool(in_sight(points, torch.tensor([0.3, 0.2, 5.0]).double()).all())
+    assert bool(visible_from(points, torch.tensor([0.3, 0.2, 5.0]).double()).all())
 
 
 @pytest.mark.parametrize("count", [1, 3, 40])
 def test_of_points_at_one_place_some_are_in_sight(count):
-    seen = in_sight(torch.ones(count, 3).double(), torch.tensor([0.0, 0, 5]).double())
+    seen = visible_from(torch.ones(count, 3).double(), torch.tensor([0.0, 0, 5]).double())
     assert bool(seen.any())
 
 

@@ -9,9 +9,9 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.poses import (
     equal_poses,
-    of_photographs,
+    expand_to_photographs,
+    mean_images,
     one_view_per_pose,
-    pictures_of_poses,
     with_poses,
 )
 from pimper_torch.records import CameraModel, SilhouettePrior
@@ -33,21 +33,23 @@ def views():
 
 
 def test_structure_from_motion_gets_the_mean_radiance_of_a_pose(views):
-    few = pictures_of_poses(views)
+    few = mean_images(views)
     assert few.names == ("a", "b", "d")
     assert few.poses is None
     assert_close(few.images[0], views.images[[0, 2, 5]].mean(dim=0))
     assert torch.equal(few.masks[1], views.masks[1] | views.masks[4])
     assert_close(few.focals_px, torch.tensor([100.0, torch.nan, 90.0]), equal_nan=True)
     plain = views.replace(poses=None)
-    assert pictures_of_poses(plain) is plain
+    assert mean_images(plain) is plain
 
 
 def test_photographs_of_unlike_sizes_are_not_one_pose(views):
     sizes = views.sizes_px.clone()
     sizes[4, 0] = 10
-    with pytest.raises(InputError, match="of the poses of b have unlike sizes; needed: one size"):
-        pictures_of_poses(views.replace(sizes_px=sizes))
+    with pytest.raises(
+        InputError, match="of the poses of b have different sizes; needed: one size"
+    ):
+        mean_images(views.replace(sizes_px=sizes))
 
 
 def test_cameras_and_observations_of_a_picture_are_those_of_all_photographs_of_its_pose(views):
@@ -62,7 +64,7 @@ def test_cameras_and_observations_of_a_picture_are_those_of_all_photographs_of_i
         observation_pixels=torch.tensor([[1.0, 1], [2, 2], [3, 3]]).double(),
         sessions=torch.tensor([7, 8]),
     )
-    every = of_photographs(model, views)
+    every = expand_to_photographs(model, views)
     assert every.names == ("a", "c", "d", "f")
     assert every.cam_from_world[:, 0, 0].tolist() == [1, 1, 3, 1]
     assert [one.camera for one in every.lenses] == [2, 2, 1, 2]
@@ -70,7 +72,7 @@ def test_cameras_and_observations_of_a_picture_are_those_of_all_photographs_of_i
     assert every.observation_point.tolist() == [0, 0, 0, 0, 1, 1, 1]
     assert every.observation_view.tolist() == [0, 1, 2, 3, 0, 1, 3]
     assert every.observation_pixels[:, 0].tolist() == [2, 2, 1, 2, 3, 3, 3]
-    assert of_photographs(model, views.replace(poses=None)) is model
+    assert expand_to_photographs(model, views.replace(poses=None)) is model
 
 
 def test_equal_cameras_are_one_pose_and_neighbours_are_not():

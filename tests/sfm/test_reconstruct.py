@@ -52,7 +52,7 @@ def test_photographs_that_the_model_lacks_are_left_out_with_a_warning(scene, vie
     more = views.take([4, 0, 1, 2, 3]).replace(
         names=("ü.tif", "b.jpg", "new.jpg", "c 1.png", "d.jpg")
     )
-    with pytest.warns(PimperWarning, match=r"4 of 5 photographs.*left out: new\.jpg"):
+    with pytest.warns(PimperWarning, match=r"4 of 5 photographs.*excluded: new\.jpg"):
         placed = Reconstruct()(more, tmp_path)
     assert placed.unregistered == ("new.jpg",)
     assert placed.views.names == ("ü.tif", "b.jpg", "c 1.png", "d.jpg")

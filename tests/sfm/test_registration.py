@@ -174,7 +174,7 @@ def test_a_room_is_left_out_where_the_plain_model_is_doubtful(told, space, monke
     told([EVERY, EVERY], rest=ROOM)
     doubts = ["follows a camera in its place", ""]
     monkeypatch.setattr(registration, "diagnose", lambda model, count: doubts.pop(0))
-    with pytest.warns(PimperWarning, match="5 of 10 features lie still"):
+    with pytest.warns(PimperWarning, match="5 of 10 features are static"):
         found = register(space, SETTINGS)
     assert len(found.background) == 5
     assert found.inlier_ratio == 1

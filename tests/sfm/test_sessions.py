@@ -8,7 +8,7 @@ from pimper_bench.scenes.whole_scene import upside_down
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.method.sfm.matching import VerifiedPair
-from pimper_torch.method.sfm.moved_object import series_in, with_series
+from pimper_torch.method.sfm.moved_object import sessions_in, with_sessions
 from pimper_torch.records import Cameras
 from pimper_torch.runtime.errors import PimperWarning
 from tests.sfm.moved import K, bodies, poses
@@ -42,23 +42,23 @@ def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generato
     model = model.replace(cam_from_world=model.cam_from_world @ over)  # in the object's frame
     pairs = [(a, b) for a, b in combinations(range(12), 2) if (b - a) % 6 < 2]
     around = [VerifiedPair(views=(a, b), first=pixels[a], second=pixels[b]) for a, b in pairs]
-    assert series_in(model, model.names, around).tolist() == [0] * 6 + [1] * 6
+    assert sessions_in(model, model.names, around).tolist() == [0] * 6 + [1] * 6
     names = (*model.names[6:], "other.jpg", *model.names[:6])  # numbers are of all photographs
     moved = [
         one.replace(views=tuple(names.index(model.names[view]) for view in one.views))
         for one in around
     ]
-    assert series_in(model, names, moved).tolist() == [0] * 6 + [1] * 6
+    assert sessions_in(model, names, moved).tolist() == [0] * 6 + [1] * 6
 
 
 def test_series_are_noted_and_named_and_views_of_a_series_that_is_hardly_there_left_out(generator):
     model = model_of((12, 10), generator)
     with pytest.warns(PimperWarning, match=r"between 2 capture sessions.*12 \(0.png.*10 \(12.png"):
-        noted = with_series(model, torch.tensor([0] * 12 + [1] * 10), model.names)
+        noted = with_sessions(model, torch.tensor([0] * 12 + [1] * 10), model.names)
     assert noted.sessions.tolist() == [0] * 12 + [1] * 10
     with pytest.warns(PimperWarning, match=r"2 of 22 photographs .* 20.png, 21.png\. "):
-        alone = with_series(model, torch.tensor([0] * 20 + [1] * 2), model.names)
+        alone = with_sessions(model, torch.tensor([0] * 20 + [1] * 2), model.names)
     assert alone.num_views == 20
     assert len(alone.sessions) == 0
     with pytest.warns(PimperWarning, match="background shifts relative to the object.*--masks"):
-        assert with_series(model, torch.arange(22), model.names) is model
+        assert with_sessions(model, torch.arange(22), model.names) is model

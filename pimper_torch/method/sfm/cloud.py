@@ -9,7 +9,7 @@ from torch import Tensor
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.shapes import Points
 from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.method.sfm.refine_tracks import found_again
+from pimper_torch.method.sfm.refine_tracks import align_tracks
 from pimper_torch.method.sfm.undistort import pinholes_for
 from pimper_torch.records import Views
 
@@ -42,7 +42,7 @@ def cloud_tracks(views: Views, model: SparseModel) -> SparseModel:
     inside = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
     rotations, shifts = model.cam_from_world[:, :3, :3], model.cam_from_world[:, :3, 3]
     centers = -(rotations.mT @ shifts[..., None])[..., 0]
-    visible = torch.stack([in_sight(points, center) for center in centers])
+    visible = torch.stack([visible_from(points, center) for center in centers])
     point, view = torch.nonzero((visible & inside).mT, as_tuple=True)
     expected = model.replace(
         points_world=points,
@@ -50,10 +50,10 @@ def cloud_tracks(views: Views, model: SparseModel) -> SparseModel:
         observation_view=view,
         observation_pixels=pixels[view, point],
     )
-    return found_again(views, expected)
+    return align_tracks(views, expected)
 
 
-def in_sight(points_world: Points, center_world: Float[Tensor, "3"]) -> Bool[Tensor, " point"]:
+def visible_from(points_world: Points, center_world: Float[Tensor, "3"]) -> Bool[Tensor, " point"]:
     """Return which points of a surface are visible from a viewpoint, not hidden by other points.
 
     Source: Katz, Tal & Basri, Direct visibility of point sets, SIGGRAPH 2007: points flipped at a

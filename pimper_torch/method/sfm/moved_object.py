@@ -221,7 +221,7 @@ def link_sessions(database: Path, settings: ReconstructConfig) -> tuple[matching
     return tuple(matching.pairs_of(matched.keypoints, moved.around))
 
 
-def series_in(
+def sessions_in(
     model: SparseModel, names: Sequence[str], around: Sequence[matching.VerifiedPair]
 ) -> Int[Tensor, " view"]:
     """Return the session of each of a model's views, from matches around the object.
@@ -249,7 +249,7 @@ def series_in(
     return clusters(torch.where(apart, -torch.inf, points.mT @ points))[group]
 
 
-def with_series(
+def with_sessions(
     model: SparseModel, numbers: Int[Tensor, " view"], names: Sequence[str]
 ) -> SparseModel:
     """Return the model with the sessions of its views, and warn about the consequences.

@@ -1,8 +1,8 @@
-"""Several photographs of one pose, each under a different light: one is used for geometry.
+"""Several photographs per pose, each under a different light: one of them is used for geometry.
 
-Photographs of one pose have no parallax to one another. Structure from motion gets one picture a
-pose, and what it finds holds for all photographs of the pose; silhouettes and depth maps are those
-of one photograph a pose. Lights are fitted to all.
+Photographs of one pose have no parallax between them. Structure from motion gets one image per
+pose, and its result applies to all photographs of the pose; silhouettes and depth maps are those of
+one photograph per pose. Lights are fitted to all.
 """
 
 from collections.abc import Collection, Sequence
@@ -19,50 +19,50 @@ from pimper_torch.runtime.errors import InputError, some
 from pimper_torch.runtime.mapped import by_view
 
 
-def pictures_of_poses(views: Views) -> Views:
-    """Average the radiance of the photographs of each pose; without poses, return the views.
+def mean_images(views: Views) -> Views:
+    """Return the mean radiance of the photographs of each pose; without poses, the views.
 
     Returns:
-        Pictures in the order of the poses, under the names of their first photographs. The object
-        is where any of a pose's masks shows it.
+        Images in the order of the poses, named after their first photographs. The object is the
+        union of the masks of a pose.
     """
     if views.poses is None:
         return views
     groups = [(views.poses == pose).nonzero()[:, 0] for pose in sorted(set(views.poses.tolist()))]
     uneven = [
-        views.names[int(own[0])]
-        for own in groups
-        if bool((views.sizes_px[own] != views.sizes_px[own[:1]]).any())
+        views.names[int(group[0])]
+        for group in groups
+        if bool((views.sizes_px[group] != views.sizes_px[group[:1]]).any())
     ]
     if uneven:
         raise InputError(
-            f"Photographs of the poses of {some(uneven)} have unlike sizes; needed: one size a "
-            "pose, as of a camera that stands still. Put each of the others in a folder of its own."
+            f"Photographs of the poses of {some(uneven)} have different sizes; needed: one size "
+            "per pose, as from a static camera. Put each of the others in a separate folder."
         )
-    first = views.take([int(own[0]) for own in groups])
+    first = views.take([int(group[0]) for group in groups])
     masks = views.masks
     return first.replace(
-        images=by_view(lambda own: views.images[own].mean(dim=0), groups),
-        masks=None if masks is None else by_view(lambda own: masks[own].any(dim=0), groups),
-        focals_px=torch.stack([views.focals_px[own].nanmedian() for own in groups]),
+        images=by_view(lambda group: views.images[group].mean(dim=0), groups),
+        masks=None if masks is None else by_view(lambda group: masks[group].any(dim=0), groups),
+        focals_px=torch.stack([views.focals_px[group].nanmedian() for group in groups]),
         poses=None,
     )
 
 
-def of_photographs(model: SparseModel, views: Views) -> SparseModel:
-    """Carry what was found of :func:`pictures_of_poses` to every photograph of the poses."""
+def expand_to_photographs(model: SparseModel, views: Views) -> SparseModel:
+    """Copy the model of :func:`mean_images` to all photographs of the poses."""
     if views.poses is None:
         return model
-    place = {name: index for index, name in enumerate(model.names)}
+    index_of = {name: index for index, name in enumerate(model.names)}
     first = {pose: view for view, pose in reversed(list(enumerate(views.poses.tolist())))}
-    source = [place.get(views.names[first[pose]], -1) for pose in views.poses.tolist()]
-    shown = [view for view, found in enumerate(source) if found >= 0]
-    carried = select_views(model, [source[view] for view in shown])
-    return carried.replace(names=tuple(views.names[view] for view in shown))
+    source = [index_of.get(views.names[first[pose]], -1) for pose in views.poses.tolist()]
+    registered = [view for view, i in enumerate(source) if i >= 0]
+    copied = select_views(model, [source[view] for view in registered])
+    return copied.replace(names=tuple(views.names[view] for view in registered))
 
 
 def with_poses(scene: SparseScene) -> SparseScene:
-    """Number the poses where cameras that came with the photographs are equal."""
+    """Number the poses of a scene if given cameras are equal."""
     if scene.views.poses is not None or scene.cameras.num_views < 2:
         return scene
     poses = equal_poses(scene.cameras)
@@ -72,7 +72,7 @@ def with_poses(scene: SparseScene) -> SparseScene:
 
 
 def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
-    """Number the poses of cameras; those half a pixel apart at the object are the same."""
+    """Return the pose number of each camera; those within half a pixel at the object are equal."""
     pose = cameras.cam_from_world.detach().double()
     centers = cameras.centers_world.detach().double()
     focal = cameras.intrinsics[:, 0, 0].detach().double()
@@ -86,17 +86,17 @@ def equal_poses(cameras: Cameras) -> Int[Tensor, " view"]:
 
 
 def one_view_per_pose(scene: SparseScene, needed: Collection[str] = ()) -> ViewPerPose:
-    """Keep the most textured photograph of every pose; without poses, the scene as it is.
+    """Return the scene with the most textured photograph of every pose; without poses, the scene.
 
-    Guessed silhouettes of other photographs of a pose become those of the one that is kept.
+    Given silhouettes of other photographs of a pose become those of the kept one.
 
     Args:
-        needed: Names, with their suffix or without, of photographs that are preferred.
+        needed: Names, with or without suffix, of preferred photographs.
     """
     poses = scene.views.poses
     if poses is None:
-        every = torch.arange(scene.cameras.num_views)
-        return ViewPerPose(scene, every, every)
+        all_views = torch.arange(scene.cameras.num_views)
+        return ViewPerPose(scene, all_views, all_views)
     rank = by_view(_texture, scene.views.images, scene.views.sizes_px)
     for view, name in enumerate(scene.views.names):
         if {name, name.rsplit(".", 1)[0]} & set(needed):
@@ -104,27 +104,28 @@ def one_view_per_pose(scene: SparseScene, needed: Collection[str] = ()) -> ViewP
     numbers = poses.tolist()
     best = {pose: int(torch.where(poses == pose, rank, -1).argmax()) for pose in set(numbers)}
     lead = torch.tensor([best[pose] for pose in numbers], device=poses.device)
-    point, seer = scene.observation_point, lead[scene.observation_view]
-    table = pairs_table(point, seer, (len(scene.points_world), len(numbers)))
+    point, observer = scene.observation_point, lead[scene.observation_view]
+    table = pairs_table(point, observer, (len(scene.points_world), len(numbers)))
     pixels = scene.observation_pixels.new_zeros(*table.shape, 2)
-    pixels[point, seer] = scene.observation_pixels
-    point, seer = table.nonzero(as_tuple=True)
+    pixels[point, observer] = scene.observation_pixels
+    point, observer = table.nonzero(as_tuple=True)
     kept = torch.bincount(lead, minlength=len(lead)) > 0
-    one = scene.replace(
-        observation_point=point, observation_view=seer, observation_pixels=pixels[point, seer]
+    pixels = pixels[point, observer]
+    merged = scene.replace(
+        observation_point=point, observation_view=observer, observation_pixels=pixels
     )
-    few = with_views(one, kept)
-    carried = tuple(_with_leads(prior, scene.views.names, lead) for prior in few.views.priors)
-    views = few.views.replace(poses=None, priors=carried)
-    few = few.replace(views=views, unregistered=scene.unregistered)
-    return ViewPerPose(few, kept.nonzero()[:, 0], (kept.long().cumsum(dim=0) - 1)[lead])
+    kept_scene = with_views(merged, kept)
+    priors = tuple(_with_leads(x, scene.views.names, lead) for x in kept_scene.views.priors)
+    views = kept_scene.views.replace(poses=None, priors=priors)
+    kept_scene = kept_scene.replace(views=views, unregistered=scene.unregistered)
+    return ViewPerPose(kept_scene, kept.nonzero()[:, 0], (kept.long().cumsum(dim=0) - 1)[lead])
 
 
 def _with_leads(prior: Prior, names: Sequence[str], lead: Int[Tensor, " view"]) -> Prior:
-    """Carry silhouettes of a pose's photographs to its ``lead``, unless that has one of its own."""
+    """Move silhouettes of a pose's photographs to its ``lead``, unless that has one of its own."""
     if not isinstance(prior, SilhouettePrior):
         return prior
-    leads = dict(zip(names, (names[one] for one in lead.tolist()), strict=True))
+    leads = dict(zip(names, (names[i] for i in lead.tolist()), strict=True))
     maps = {
         leads[name]: index
         for index, name in reversed(list(enumerate(prior.names)))
@@ -135,7 +136,7 @@ def _with_leads(prior: Prior, names: Sequence[str], lead: Int[Tensor, " view"]) 
 
 
 def _texture(image: Float[Tensor, "channel _ _"], size: Int[Tensor, "2"]) -> Scalar:
-    """Compute the mean step of the square root of radiance between neighbouring pixels."""
+    """Return the mean step of the square root of radiance between horizontal neighbours."""
     wide, high = size.tolist()
-    one = image.detach().mean(dim=0).clamp(0, 1).sqrt()
-    return one[:high, 1:wide].sub(one[:high, : wide - 1]).abs().mean()
+    root = image.detach().mean(dim=0).clamp(0, 1).sqrt()
+    return root[:high, 1:wide].sub(root[:high, : wide - 1]).abs().mean()

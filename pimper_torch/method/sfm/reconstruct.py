@@ -1,4 +1,4 @@
-"""Structure from motion: photographs to cameras and a sparse cloud."""
+"""The stage from photographs to cameras and a sparse point cloud."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +10,8 @@ from pimper_torch.method.sfm.existing import existing_model, registered_views, s
 from pimper_torch.method.sfm.features import SMALLEST_PX, find_features, too_small, workspace
 from pimper_torch.method.sfm.lenses import choose_lenses
 from pimper_torch.method.sfm.model import SparseModel, select_views
-from pimper_torch.method.sfm.moved_object import series_in, with_series
-from pimper_torch.method.sfm.poses import of_photographs, pictures_of_poses
+from pimper_torch.method.sfm.moved_object import sessions_in, with_sessions
+from pimper_torch.method.sfm.poses import expand_to_photographs, mean_images
 from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.method.sfm.refine_tracks import refine_tracks
 from pimper_torch.method.sfm.registration import register
@@ -29,20 +29,20 @@ from pimper_torch.runtime.store.digest import code
 
 
 class Reconstruct(Stage):
-    """Find cameras and a sparse cloud, and undistort the photographs to pinholes.
+    """Estimate cameras and a sparse cloud, and undistort the photographs to pinholes.
 
-    The photographs are written as 8-bit sRGB files to a temporary folder, where COLMAP
-    finds SIFT features on the CPU, matches every pair and grows a model. Its points are then
-    found again in all views by aligning patches, and everything is adjusted to that, see
+    The photographs are written as 8-bit sRGB files to a temporary folder, where COLMAP detects SIFT
+    features on the CPU, matches pairs and maps. Points are then refined in all views by aligning
+    patches, and cameras and points are adjusted again, see
     :func:`~pimper_torch.method.sfm.refine_tracks.refine_tracks`. In the world frame y is up, see
-    :func:`~pimper_torch.method.sfm.upright.upright`; its scale is arbitrary. A model that is given
-    keeps its own.
+    :func:`~pimper_torch.method.sfm.upright.upright`; its scale is arbitrary. A given model keeps
+    its frame and scale.
 
-    A constant to autograd.
+    Not differentiable.
 
     Args:
-        cache: Folder where models are kept and looked for, see
-            :class:`~pimper_torch.runtime.store.Store`; without, every call finds its own.
+        cache: Folder of kept models, see :class:`~pimper_torch.runtime.store.Store`; without it,
+            every call estimates a model.
     """
 
     def __init__(
@@ -53,25 +53,24 @@ class Reconstruct(Stage):
         self.store = opened(cache)
 
     def forward(self, views: Views, sparse_model: Path | str | None = None) -> SparseScene:
-        """Place the photographs.
+        """Estimate or read the photographs' cameras, and return the scene.
 
         Args:
-            sparse_model: Folder of a COLMAP model, or a file of cameras (``transforms.json``,
-                Metashape, Meshroom, arrays), to take instead of running structure from motion.
-                Views are matched by file name; the cameras may have been made from photographs of
-                another size. Without observed points, these are triangulated with the cameras
-                held fixed.
+            sparse_model: Folder of a COLMAP model, or a camera file (``transforms.json``,
+                Metashape, Meshroom, arrays), instead of structure from motion. Views are matched by
+                file name; the cameras may be of images of a different size. Without observed
+                points, these are triangulated with the cameras held fixed.
 
         Raises:
-            ReconstructionError: Fewer than 3 views found their place, or the model split.
-            InputError: Radiance that is not finite, one camera is to be shared by photographs
-                of unlike sizes, or the given model does not belong to the photographs.
+            ReconstructionError: Fewer than 3 views registered, or the model split.
+            InputError: Radiance is not finite, photographs of one shared camera have different
+                sizes, or the given model does not belong to the photographs.
         """
         _require_finite(views)
-        bare = views.replace(priors=())  # which tell nothing of where cameras stand
+        bare = views.replace(priors=())  # priors do not affect cameras
         if sparse_model is None:
-            model, _ = find_model(pictures_of_poses(bare), self.config, self.store)
-            return placed_scene(views, of_photographs(model, views))
+            model, _ = find_model(mean_images(bare), self.config, self.store)
+            return placed_scene(views, expand_to_photographs(model, views))
         path = Path(sparse_model)
         model = existing_model(bare, path)
         if lacks_points(model):
@@ -79,12 +78,12 @@ class Reconstruct(Stage):
         return placed_scene(views, model)
 
     def with_points(self, scene: SparseScene) -> SparseScene:
-        """Triangulate points for a scene whose views observe hardly any, its cameras held fixed."""
+        """Triangulate points for a scene with hardly any observations, its cameras held fixed."""
         model = model_of_scene(scene)
         if not lacks_points(model) or not scene.lenses:
             return scene
-        found = self._triangulated(scene.views.replace(priors=()), model, "The scene")
-        return scene if found is model else with_model_points(scene, found)
+        result = self._triangulated(scene.views.replace(priors=()), model, "The scene")
+        return scene if result is model else with_model_points(scene, result)
 
     def _triangulated(self, views: Views, model: SparseModel, where: str) -> SparseModel:
         alone = replace(self.config, threads=0)
@@ -96,16 +95,16 @@ class Reconstruct(Stage):
 
 
 def placed_scene(views: Views, model: SparseModel) -> SparseScene:
-    """Put photographs beside their cameras and cloud.
+    """Return the scene of photographs, cameras and cloud.
 
-    Warns of those that the model lacks, and of a model that is doubtful.
+    Warns about unregistered photographs, and about an unreliable model.
     """
     missing = [name for name in views.names if name not in model.names]
     leave_out("sfm.missing", len(missing), total=views.num_views, names=missing)
     if missing:
         caution(
-            f"{model.num_views} of {views.num_views} photographs found their place; left "
-            f"out: {', '.join(missing)}.",
+            f"{model.num_views} of {views.num_views} photographs were registered; excluded: "
+            f"{', '.join(missing)}.",
             stacklevel=3,
         )
     reason = "" if lacks_points(model) else diagnose(model, views.num_views)
@@ -118,12 +117,12 @@ def placed_scene(views: Views, model: SparseModel) -> SparseScene:
 def find_model(
     views: Views, config: ReconstructConfig, store: Store | None
 ) -> tuple[SparseModel, float]:
-    """Take a model that was kept, or run :func:`structure_from_motion` and keep what it finds.
+    """Return a kept model, or run :func:`structure_from_motion` and keep its result.
 
-    The number of threads is no part of the key. What was warned of is warned of again.
+    The number of threads is not part of the key. Warnings are repeated.
 
     Returns:
-        The model, and the seconds of wall clock in which it was found.
+        The model, and the seconds of wall clock that its estimation took.
     """
     hashed = digest(code(), views, replace(config, threads=0)) if store else None
     key = f"reconstruct-{hashed}" if hashed else None
@@ -131,16 +130,16 @@ def find_model(
 
 
 def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseModel:
-    """Find features, match them, grow a model and find its points again in every view.
+    """Detect features, match them, map, and refine the points in every view.
 
     Returns:
-        The model of the registered views, in the photographs' order and under their names.
+        The model of the registered views, in the photographs' order and with their names.
 
     Raises:
-        ReconstructionError: Fewer than 3 views found their place, the model split, or nothing
-            moves from photograph to photograph.
-        InputError: One camera is to be shared by photographs of unlike sizes, or photographs are
-            too small to have features.
+        ReconstructionError: Fewer than 3 views registered, the model split, or nothing moves
+            between photographs.
+        InputError: Photographs of one shared camera have different sizes, or photographs are too
+            small for features.
     """
     if views.num_views < 3:
         raise ReconstructionError(
@@ -150,7 +149,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     if small := too_small(views):
         raise InputError(
             f"{some(small)}: have sides of fewer than {SMALLEST_PX} pixels; needed: photographs "
-            "in which there are features, of some hundred pixels at least."
+            "with features, of at least some hundred pixels."
         )
     model = _registered_model(views, config)
     model = refine_tracks(registered_views(views, model), model, config.track_iterations)
@@ -159,57 +158,57 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
 
 
 def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
-    """Grow models of photographs, and choose one.
+    """Map the photographs, and choose one model, with views in the photographs' order.
 
-    Its views are in the photographs' order, with maps to a room at rest and numbers of series.
+    It has maps to a static background and numbers of capture sessions, if any.
     """
     lenses = choose_lenses(views, shared=config.shared_camera, own=config.own_cameras)
-    focals_px = [one if 0 < one < float("inf") else None for one in views.focals_px.tolist()]
-    release_memory()  # that reading the photographs left: 145 MB with 30 of 1600x1200
+    focals_px = [f if 0 < f < float("inf") else None for f in views.focals_px.tolist()]
+    release_memory()  # from reading the photographs: 145 MB with 30 of 1600x1200
     with workspace(views, config.num_threads) as space:
         counts = find_features(space, config, focals_px, lenses)
-        bare = [name for count, name in zip(counts, views.names, strict=True) if count == 0]
-        if views.num_views - len(bare) < 3:
+        featureless = [name for count, name in zip(counts, views.names, strict=True) if count == 0]
+        if views.num_views - len(featureless) < 3:
             raise ReconstructionError(
-                f"No features were found in {len(bare)} of {views.num_views} photographs: "
-                f"{some(bare, most=20)}. At least 3 photographs with features are needed. Check "
-                "that they are not black, blank or masked out entirely, and expose them brighter."
+                f"No features were found in {len(featureless)} of {views.num_views} photographs: "
+                f"{some(featureless, most=20)}. At least 3 photographs with features are needed. "
+                "Check that they are not black, blank or fully masked out, and expose longer."
             )
         release_memory()
-        found = register(space, config)
+        result = register(space, config)
     release_memory()
-    # The largest of several models must hold most photographs, if they are not of several series.
-    min_fraction = 0.0 if found.around else 0.6
+    # The largest of several models must contain most photographs, unless there are sessions.
+    min_fraction = 0.0 if result.around else 0.6
     name_of = dict(zip(space.files, views.names, strict=True))
-    names = [tuple(name_of[file] for file in model.names) for model in found.models]
-    chosen = choose_component(names, found.spread, views.names, min_fraction)
-    model = found.models[chosen]
+    names = [tuple(name_of[file] for file in model.names) for model in result.models]
+    chosen = choose_component(names, result.spread, views.names, min_fraction)
+    model = result.models[chosen]
     order = sorted(range(model.num_views), key=model.names.__getitem__)  # files are numbered
     model = select_views(model.replace(names=names[chosen]), order)
     misplaced = [
         f"{name_of[file]} ({fraction:.0%} agree)"
-        for file, fraction in found.misplaced.items()
+        for file, fraction in result.misplaced.items()
         if name_of[file] in model.names
     ]
     leave_out("sfm.misplaced", len(misplaced), total=model.num_views)
     if misplaced:
         caution(
-            f"{len(misplaced)} of {model.num_views} photographs contradict most matches with those "
-            f"they share most with, and may be misplaced: {some(misplaced, most=20)}. Look "
-            "for sides that look alike; add photographs between these and their neighbours.",
+            f"{len(misplaced)} of {model.num_views} photographs contradict most matches with their "
+            f"closest neighbours, and may be misplaced: {some(misplaced, most=20)}. Check for "
+            "sides that look alike; add photographs between these and their neighbours.",
             stacklevel=4,
         )
-    if found.background:
-        maps = dict(zip(views.names, found.background, strict=True))
-        rests = torch.stack([maps[name] for name in model.names])
-        model = model.replace(background_from_view=rests)
-    if found.around:
-        model = with_series(model, series_in(model, views.names, found.around), views.names)
+    if result.background:
+        maps = dict(zip(views.names, result.background, strict=True))
+        background_from_view = torch.stack([maps[name] for name in model.names])
+        model = model.replace(background_from_view=background_from_view)
+    if result.around:
+        model = with_sessions(model, sessions_in(model, views.names, result.around), views.names)
     return model
 
 
 def _require_finite(views: Views) -> None:
-    """Refuse pixels that are no numbers, which resampling would spread over their neighbours."""
+    """Refuse NaN and infinity, which resampling would spread to neighbouring pixels."""
     odd = [
         f"{name} ({int((~image.isfinite()).any(dim=0).sum())} pixels)"
         for name, (image,) in zip(views.names, each(views.images), strict=True)
@@ -217,6 +216,6 @@ def _require_finite(views: Views) -> None:
     ]
     if odd:
         raise InputError(
-            f"NaN or infinity in the photographs {', '.join(odd)}; needed: radiance in numbers. "
-            "Set these pixels to 0 and leave them out by `masks`, or to 1 if they are saturated."
+            f"NaN or infinity in the photographs {', '.join(odd)}; needed: finite radiance. Set "
+            "these pixels to 0 and exclude them by `masks`, or to 1 if they are saturated."
         )

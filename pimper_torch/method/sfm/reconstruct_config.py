@@ -6,8 +6,8 @@ from typing import Annotated
 from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.cores import usable_cores
 
-# Verified matches below which a pair of photographs does not count, and points of the model that a
-# view must see to be added, and to stay in it: COLMAP's own.
+# Least verified matches of a pair of photographs, and least points of the model in a view for
+# registering and keeping it: COLMAP's own.
 MIN_MATCHES, MIN_POINTS = 15, 30
 
 CAMERA_MODELS = (
@@ -21,7 +21,7 @@ CAMERA_MODELS = (
     "RADIAL_FISHEYE",
     "OPENCV_FISHEYE",
 )
-"""COLMAP's camera models for ordinary lenses, written out to check settings without COLMAP."""
+"""COLMAP's camera models for ordinary lenses, listed to check settings without COLMAP."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,28 +30,27 @@ class ReconstructConfig:
 
     Attributes:
         camera_model: COLMAP's name of the lens model.
-        shared_camera: One camera took all photographs, with one lens at one focal length, whatever
-            EXIF says. By default lenses are told apart by EXIF's focal length and by size.
-        own_cameras: Each photograph has a lens of its own.
-        peak_threshold: Contrast below which a feature is dropped; in COLMAP's units, where
-            its own default is 0.0067. Lower finds the faint marks of smooth surfaces.
-        edge_threshold: Ratio of curvatures above which a feature counts as an edge.
-        max_features: In a photograph; those at coarse scales are kept, whole scales at a time, so
-            that up to twice as many are left.
+        shared_camera: All photographs share one lens at one focal length, whatever EXIF contains.
+            By default lenses are distinguished by EXIF's focal length and by size.
+        own_cameras: Each photograph has its own lens.
+        peak_threshold: Least contrast of a feature, in COLMAP's units, in which its own default is
+            0.0067. A lower value finds faint marks on smooth surfaces.
+        edge_threshold: Largest ratio of curvatures of a feature; above it is an edge.
+        max_features: Per photograph. Coarse scales are preferred, in complete scales, so up to
+            twice as many remain.
         affine_shape: Adapt features to slanted surfaces.
-        max_ratio: Of the distances to the best and the second best match.
-        guided_pairs: Of each photograph, those with most matches, in which more are looked for
-            along the epipolar lines.
-        max_error_px: Distance from the epipolar line up to which a match is verified.
-        starts: Most runs of the mapper after guided matching of more pairs, where photographs
-            stayed unregistered or contradict their matches; each has other random numbers, and
-            the last also counts points that only two views see. 0 is content with the first
-            model.
-        track_iterations: Of finding the points again in every view, by aligning what photographs
-            show round them, and adjusting cameras to that; 0 leaves the features' places.
-        threads: Of features and matches; 0 for all cores. The model grows and is adjusted on one
-            thread: on several, Ceres adds in another order in every run.
-        seed: Of everything random.
+        max_ratio: Largest ratio of the distances to the best and the second-best match.
+        guided_pairs: Number of pairs per photograph, those with most matches, that are matched
+            again along the epipolar lines.
+        max_error_px: Largest distance of a verified match from the epipolar line.
+        starts: Most additional runs of the mapper, after guided matching of more pairs, if
+            photographs are unregistered or contradict their matches. Runs differ in their random
+            numbers; one more run also uses points of only two views. 0 accepts the first model.
+        track_iterations: Rounds of refining points in every view by aligning the patches around
+            them, and adjusting the cameras; 0 keeps the pixels of features.
+        threads: For features and matches; 0 for all cores. Mapping and adjustment use one thread:
+            with several, Ceres sums in a different order in every run.
+        seed: Of all random numbers.
     """
 
     camera_model: str = "SIMPLE_RADIAL"
@@ -70,10 +69,10 @@ class ReconstructConfig:
     seed: Annotated[int, Range(least=0, most=2**31 - 1)] = 0
 
     def __post_init__(self) -> None:
-        known = "one of " + ", ".join(CAMERA_MODELS)
-        require(self.camera_model in CAMERA_MODELS, "camera_model", self.camera_model, known)
-        both = self.shared_camera and self.own_cameras
-        require(not both, "own_cameras", self.own_cameras, "false where shared_camera is true")
+        expected = "one of " + ", ".join(CAMERA_MODELS)
+        require(self.camera_model in CAMERA_MODELS, "camera_model", self.camera_model, expected)
+        valid = not (self.shared_camera and self.own_cameras)
+        require(valid, "own_cameras", self.own_cameras, "false if shared_camera is true")
         require_ranges(self)
 
     @property

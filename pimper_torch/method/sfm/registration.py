@@ -1,9 +1,9 @@
-"""Photographs registered in one model: the plain explanation first, others only where it fails.
+"""Registration of photographs in one model: the simplest hypothesis first, others only if it fails.
 
-The plain explanation is one rigid scene. A model of all photographs that explains nearly all
-verified matches is the result, whatever else pairs of photographs may show. Otherwise a room at
-rest before a turning object is looked for, and an object that was moved on its table; one of these
-is taken if it explains clearly more of its verified matches.
+The simplest hypothesis is one rigid scene. A model of all photographs that explains nearly all
+verified matches is the result, whatever else pairs of photographs may indicate. Otherwise, a static
+background behind a turning object and an object that was moved on its support are tested; one of
+these is chosen if it explains clearly more of its verified matches.
 """
 
 import shutil
@@ -43,16 +43,16 @@ from pimper_torch.runtime.progress import report
 
 
 def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list[SparseModel]:
-    """Grow models from the best pair of views on, until no view can be added.
+    """Grow models from the best pair of views, until no view can be added.
 
-    On one thread, so that the same matches give the same bits.
+    Runs on one thread, so that results are reproducible bit for bit.
 
     Args:
-        pairs_count: Points that only two views see take part, too: they tie views with
-            little overlap, less exactly.
+        pairs_count: Also use points of only two views: they link views with little overlap, less
+            exactly.
 
     Returns:
-        One model a component, the one with most views first. Names are files of ``space``.
+        One model per component, the one with most views first. Names are files of ``space``.
     """
     pycolmap = loaded()
 
@@ -62,7 +62,7 @@ def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list
     options.num_threads = 1
     options.random_seed = seed
     options.mapper.abs_pose_min_num_inliers = MIN_POINTS
-    # Short adjustments take half of the CPU s (docs/decisions.md): all is adjusted to tracks later.
+    # Short adjustments halve the CPU time (docs/decisions.md): tracks are adjusted later.
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.4
     options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
     options.ba_global_function_tolerance = options.ba_local_function_tolerance = 1e-4
@@ -71,22 +71,21 @@ def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list
     registered, total = count(3), len(space.files)  # the first call follows a model of two views
 
     def on_image() -> None:
-        report(min(next(registered), total), total)  # models that begin anew add views again
+        report(min(next(registered), total), total)  # models that start again add views again
 
     with tempfile.TemporaryDirectory(dir=space.folder) as output, quiet():
-        found = pycolmap.incremental_mapping(
+        reconstructions = pycolmap.incremental_mapping(
             space.database, space.images, output, options, next_image_callback=on_image
         )
-    models = [model_of(reconstruction) for reconstruction in found.values()]
+    models = [model_of(reconstruction) for reconstruction in reconstructions.values()]
     return sorted(models, key=lambda model: (-model.num_views, -len(model.points_world)))
 
 
-# Fraction of the verified matches that a plain model must explain. Right models of 12 potatoes on a
-# patterned table explain 0.99 to 1.00, with a time stamp in the corner or a zoom in EXIF, too, and
-# 0.95 where zoomed photographs share a lens; of a mug that was turned over, at most 0.73.
-_EXPLAINED = 0.9
-# What another explanation must explain beyond the plain one's fraction; a mug that was turned over
-# gains 0.25: a choice between.
+# Least inlier ratio of the first model. Correct models of 12 potatoes on a patterned table have
+# 0.99 to 1.00, also with a time stamp in the corner or a zoom in EXIF, and 0.95 if zoomed
+# photographs share a lens; those of a mug that was turned over at most 0.73.
+_MIN_INLIERS = 0.9
+# Least gain in inlier ratio of another hypothesis; a mug that was turned over gains 0.25: a choice.
 _MARGIN = 0.1
 
 
@@ -95,17 +94,17 @@ class Registration:
     """Result of one run of the mapper.
 
     Attributes:
-        models: One a component, the one with most views that see depth first.
-        spread: Views of each that see depth.
+        models: One per component, the one with most views that see depth first.
+        spread: Number of views of each that see depth.
         missing: Files that the first model lacks; all without a model.
         misplaced: Files of the first model whose strongest pairs contradict it, and the fraction of
-            the matches in those that agrees.
-        explained: Fraction of the verified matches that the first model explains; 0 where its
-            cameras are doubtful.
-        background: Map from each file's pixels to those where a static background is at rest, see
+            agreeing matches in those.
+        inlier_ratio: Fraction of the verified matches that agree with the first model; 0 if its
+            cameras are unreliable.
+        background: Map from each file's pixels to the frame in which the background is static, see
             :class:`~pimper_torch.method.sfm.static_background.StaticBackground`.
-        around: Matches of the surroundings on which the object was moved between series of files;
-            none where it was not.
+        around: Matches of the surroundings on which the object was moved between capture sessions;
+            empty if it was not.
     """
 
     models: tuple[SparseModel, ...]
@@ -118,17 +117,17 @@ class Registration:
 
     @property
     def complete(self) -> bool:
-        """True where every photograph is registered, none misplaced, and some see depth."""
+        """True if all photographs are registered, none is misplaced, and enough see depth."""
         return not self.missing and not self.misplaced and self.spread[0] >= FEWEST_VIEWS
 
     @property
     def sound(self) -> bool:
-        """True where nothing speaks against the model."""
-        return self.complete and self.inlier_ratio >= _EXPLAINED
+        """True if the model is complete and has enough inliers."""
+        return self.complete and self.inlier_ratio >= _MIN_INLIERS
 
     @property
     def rank(self) -> tuple[bool, int, int]:
-        """Order registrations: those that see depth, by views not misplaced, then points."""
+        """Sort key: whether enough views see depth, then views not misplaced, then points."""
         if not self.models:
             return False, 0, 0
         model = self.models[0]
@@ -137,20 +136,20 @@ class Registration:
 
 
 def register(space: Workspace, settings: ReconstructConfig) -> Registration:
-    """Match pairs and grow a model; look for another explanation only where that fails.
+    """Match pairs and map; test other hypotheses only if that fails.
 
-    Other explanations are a room at rest before which the object turns: its features are left out;
-    and an object that was moved between two series of photographs: between these only matches of
-    the object are used, see :mod:`pimper_torch.method.sfm.moved_object`.
+    These are a static background behind a turning object, whose features are removed, and an object
+    that was moved between capture sessions, between which only matches of the object are used, see
+    :mod:`pimper_torch.method.sfm.moved_object`.
 
-    Where a model stays incomplete or contradicts matches, the thorough pass matches along epipolar
-    lines: pairs of missing photographs, or all where some are misplaced. Then it starts the mapper
-    several times, with other random numbers, and at last lets points count that only two views see.
-    The first complete model ends it.
+    If a model stays incomplete or contradicts matches, the thorough pass matches along epipolar
+    lines: pairs of missing photographs, or all if some are misplaced. Then it starts the mapper
+    several times with different random numbers, and finally also with points of only two views. It
+    ends at the first complete model.
 
-    Of more than :data:`~pimper_torch.method.sfm.matching.MOST_PAIRED` photographs only pairs of
-    those that look alike are matched, see :mod:`pimper_torch.method.sfm.retrieval`; and in the
-    thorough pass those of missing or misplaced photographs with all others.
+    For more than :data:`~pimper_torch.method.sfm.matching.MOST_PAIRED` photographs, only pairs of
+    similar ones are matched, see :mod:`pimper_torch.method.sfm.retrieval`, and in the thorough pass
+    missing or misplaced photographs with all others.
     """
     match_pairs(space, pairs_to_match(space), settings)
     other = replace(space, database_name="other.db")  # for matches of another hypothesis
@@ -162,8 +161,8 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     if background.nothing_moves:
         raise ReconstructionError(
             f"Nothing moves in {len(space.files)} photographs: {background.static_fraction:.0%} of "
-            "the matches lie at the same pixel, and in no pair do enough others agree on a motion. "
-            "Camera and background were at rest, and an object that turned has too little "
+            "the matches are at the same pixel, and in no pair do enough others agree on a motion. "
+            "Camera and background were static, and the object, if it turned, has too little "
             f"texture. {MOVE}"
         )
     around = () if background.detected else link_sessions(other.database, settings)
@@ -171,14 +170,14 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
         return _thorough(space, plain, settings)
     rival = _registered(other, settings)
     if not rival.sound:
-        rival, plain = (_thorough(*one, settings) for one in ((other, rival), (space, plain)))
+        rival, plain = (_thorough(*run, settings) for run in ((other, rival), (space, plain)))
     if rival.inlier_ratio <= plain.inlier_ratio + _MARGIN:
         return plain
     if background.detected:
-        left, total = log_static_features(background)
+        static, total = log_static_features(background)
         caution(
-            f"{left} of {total} features lie still in the photographs while others move: they are "
-            "taken for those of a room before which the object turns, and are left out.",
+            f"{static} of {total} features are static while others move. They are treated as the "
+            "static background of a turning object, and removed.",
             stacklevel=2,
         )
     else:
@@ -198,22 +197,22 @@ def _registered(space: Workspace, settings: ReconstructConfig) -> Registration:
 
 
 def _thorough(space: Workspace, best: Registration, settings: ReconstructConfig) -> Registration:
-    """Match more pairs along epipolar lines and start the mapper again, if a model needs it."""
+    """Match more pairs along epipolar lines and map again, if the model is incomplete."""
     if best.complete or not settings.starts:
         return best
     small = len(space.files) <= MOST_PAIRED
-    apart = {space.files.index(file) for file in (*best.missing, *best.misplaced)}
-    again = all_pairs(len(space.files))
+    unreliable = {space.files.index(file) for file in (*best.missing, *best.misplaced)}
+    pairs = all_pairs(len(space.files))
     if not small or not best.misplaced:
-        again = [pair for pair in again if apart & set(pair)]
+        pairs = [pair for pair in pairs if unreliable & set(pair)]
     if not small:
-        match_pairs(space, again, settings)
-    match_guided(space, again, settings)
+        match_pairs(space, pairs, settings)
+    match_guided(space, pairs, settings)
     verified = verified_pairs(space)
     seeds = [settings.seed + start for start in range(settings.starts)]
     for seed, pairs_count in [*((seed, False) for seed in seeds), (settings.seed, True)]:
         rival = _mapped(space, verified, settings, seed, pairs_count=pairs_count)
-        best = max(best, rival, key=lambda one: one.rank)
+        best = max(best, rival, key=lambda run: run.rank)
         if best.complete:
             break
     return best
@@ -227,30 +226,30 @@ def _mapped(
     *,
     pairs_count: bool = False,
 ) -> Registration:
-    """Grow models, and judge the first.
+    """Grow models, and verify the first.
 
     Args:
-        pairs_count: Points that two views see make poses less exact where all views register
-            without them (median error 0.19 in place of 0.13 degrees on 24 photographs of a skull):
-            they come last.
+        pairs_count: Also use points of two views. If all views register without them, they make
+            poses less exact (median error 0.19 instead of 0.13 degrees on 24 photographs of a
+            skull), so they are the last resort.
     """
     grown = map_views(space, seed, pairs_count=pairs_count)
     strong = (drop_weak_views(model, MIN_POINTS) for model in grown)
-    found = [model for model in strong if model.num_views]
-    counted = list(zip(count_views_with_depth(found, MIN_POINTS), found, strict=True))
-    counted.sort(key=lambda one: (-one[0], -one[1].num_views, -len(one[1].points_world)))
+    kept = [model for model in strong if model.num_views]
+    counted = list(zip(count_views_with_depth(kept, MIN_POINTS), kept, strict=True))
+    counted.sort(key=lambda item: (-item[0], -item[1].num_views, -len(item[1].points_world)))
     models = tuple(model for _, model in counted)
     if not models:
         return Registration(
             models=(), spread=(), missing=space.files, misplaced={}, inlier_ratio=0.0
         )
-    # At twice the distance that verifies a match it still agrees: the lens is the model's.
+    # Twice the distance of verification: the lens is now that of the model.
     consistency = verify_model(models[0], space.files, verified, 2 * settings.max_error_px)
-    doubtful = bool(diagnose(models[0], len(space.files)))
+    unreliable = bool(diagnose(models[0], len(space.files)))
     return Registration(
         models=models,
         spread=tuple(spread for spread, _ in counted),
         missing=tuple(file for file in space.files if file not in models[0].names),
         misplaced=consistency.misplaced,
-        inlier_ratio=0.0 if doubtful else consistency.inlier_ratio,
+        inlier_ratio=0.0 if unreliable else consistency.inlier_ratio,
     )

@@ -1,9 +1,9 @@
-"""Pairs of photographs that are likely to match, by one descriptor of each photograph.
+"""Pairs of photographs that are likely to match, from one global descriptor per photograph.
 
 All pairs of a thousand photographs are half a million, of which some ten thousand matter. A vector
-of locally aggregated descriptors (VLAD) sums, word by word of a small vocabulary, how a
-photograph's features differ from the word; photographs that show the same have alike vectors. The
-vocabulary is learned from the photographs themselves, so that nothing is downloaded.
+of locally aggregated descriptors (VLAD) sums, for each word of a small vocabulary, the differences
+of a photograph's features from the word; photographs of the same surface have similar vectors. The
+vocabulary is learned from the photographs themselves, so nothing is downloaded.
 
 Source: Jégou, Douze, Schmid & Pérez, Aggregating local descriptors into a compact image
 representation, CVPR 2010; the square root of Jégou & Chum, Negative evidences and co-occurences in
@@ -22,21 +22,21 @@ from pimper_torch.method.sfm.features import Workspace, image_ids
 from pimper_torch.method.sfm.matching import MOST_PAIRED, PhotographPair, all_pairs, read_features
 from pimper_torch.runtime.parallel import on_one_thread
 
-# Words of the vocabulary, and neighbours of a photograph: see docs/decisions.md.
+# Words of the vocabulary, and neighbours per photograph: see docs/decisions.md.
 _WORDS, _NEIGHBOURS = 128, 20
 
 Descriptors = Float[Tensor, "feature length"]
 
 
 def pairs_to_match(space: Workspace) -> list[PhotographPair]:
-    """List all pairs of a small set; of a larger, each photograph with those most like it."""
+    """List all pairs of a small set; for a large one, each photograph with the most similar."""
     if len(space.files) <= MOST_PAIRED:
         return all_pairs(len(space.files))
-    with quiet(), loaded().Database.open(space.database) as stored, on_one_thread():
-        image_of = image_ids(stored, space)
+    with quiet(), loaded().Database.open(space.database) as database, on_one_thread():
+        image_of = image_ids(database, space)
 
         def descriptors(number: int) -> Descriptors:
-            return read_features(stored, image_of[number]).descriptors
+            return read_features(database, image_of[number]).descriptors
 
         return nearest_pairs(global_descriptors(descriptors, len(space.files)), _NEIGHBOURS)
 
@@ -44,21 +44,21 @@ def pairs_to_match(space: Workspace) -> list[PhotographPair]:
 def global_descriptors(
     descriptors: Callable[[int], Descriptors], count: int
 ) -> Float[Tensor, "photograph word_length"]:
-    """Return a vector of length 1 for each photograph; 0 for one without features."""
-    each = -(-40_000 // count)
-    learned = torch.cat([_some(descriptors(number), each) for number in range(count)])
+    """Return a unit vector for each photograph; 0 for one without features."""
+    most = -(-40_000 // count)
+    learned = torch.cat([_some(descriptors(number), most) for number in range(count)])
     words = vocabulary(learned, _WORDS)
     vectors = []
     for number in range(count):
-        own = descriptors(number)
-        word = _nearest(own, words)
-        sums = torch.zeros_like(words).index_add(0, word, own - words[word]).flatten()
+        features = descriptors(number)
+        word = _nearest(features, words)
+        sums = torch.zeros_like(words).index_add(0, word, features - words[word]).flatten()
         vectors.append(normalize(sums.sign() * sums.abs().sqrt(), dim=0))
     return torch.stack(vectors)
 
 
 def vocabulary(descriptors: Descriptors, count: int) -> Float[Tensor, "word length"]:
-    """Return the centres of clusters (k-means), first evenly spread among the descriptors."""
+    """Return cluster centres (k-means), initialized evenly among the descriptors."""
     words = _some(descriptors, count)
     for _ in range(10):
         word = _nearest(descriptors, words)
@@ -71,18 +71,18 @@ def vocabulary(descriptors: Descriptors, count: int) -> Float[Tensor, "word leng
 def nearest_pairs(
     vectors: Float[Tensor, "photograph length"], neighbours: int
 ) -> list[PhotographPair]:
-    """List, without repetition, the pairs of each vector with those most like it."""
-    found: set[PhotographPair] = set()
+    """List, without repetition, the pairs of each vector with the most similar ones."""
+    pairs: set[PhotographPair] = set()
     for number, vector in enumerate(vectors):
         likeness = vectors @ vector
         likeness[number] = -torch.inf
         for other in likeness.topk(min(neighbours, len(vectors) - 1)).indices.tolist():
-            found.add((min(number, other), max(number, other)))
-    return sorted(found)
+            pairs.add((min(number, other), max(number, other)))
+    return sorted(pairs)
 
 
 def _some(descriptors: Descriptors, most: int) -> Descriptors:
-    """Keep at most ``most``, evenly spread."""
+    """Return at most ``most`` descriptors, evenly sampled."""
     return descriptors[:: max(1, -(-len(descriptors) // most))]
 
 

@@ -1,4 +1,4 @@
-"""From a sparse model and the photographs to the scene, and back to COLMAP's files."""
+"""Conversion of a sparse model and photographs to the scene, and back to COLMAP's files."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from pimper_torch.runtime.mapped import each
 
 
 def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
-    """Undistort the registered photographs and priors, and put them beside cameras and cloud.
+    """Return the scene of undistorted registered photographs, priors, cameras and cloud.
 
     Returns:
         Views in the model's order. Device and dtype are those of the photographs. A model far from
@@ -61,9 +61,9 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
 
 
 def model_of_scene(scene: SparseScene) -> SparseModel:
-    """Return the cameras of a scene, as pinholes of its undistorted photographs, and its tracks.
+    """Return the model of a scene: pinholes of its undistorted photographs, points and tracks.
 
-    They are in the frame of the model that the scene came from.
+    It is in the frame of the model that the scene was made from.
     """
     poses = scene.cameras.cam_from_world.detach().cpu().double()
     offset = torch.tensor(scene.offset_world, dtype=torch.float64)
@@ -79,7 +79,7 @@ def model_of_scene(scene: SparseScene) -> SparseModel:
 
 
 def with_model_points(scene: SparseScene, model: SparseModel) -> SparseScene:
-    """Put points and tracks of :func:`model_of_scene` into the scene, its cameras untouched."""
+    """Replace points and tracks by those of a :func:`model_of_scene`; cameras stay."""
     like, offset = scene.points_world, torch.tensor(scene.offset_world, dtype=torch.float64)
     pixels = photographed(scene, model.observation_pixels, model.observation_view)
     return scene.replace(
@@ -92,68 +92,67 @@ def with_model_points(scene: SparseScene, model: SparseModel) -> SparseScene:
 
 
 def write_model(scene: SparseScene, folder: Path) -> None:
-    """Write the scene as a COLMAP model in the frame of the model that it came from.
+    """Write the scene as a COLMAP model in the frame of its original model.
 
-    The cameras are the photographs' own lenses, not the pinholes, and the observations are
-    where they were made: the model belongs to the photographs as they were loaded, and
-    reading it back with them gives the same scene.
+    Cameras have the photographs' own lenses, not pinholes, and observations are in distorted
+    pixels: the model belongs to the loaded photographs; reading it with them gives the same scene.
     """
     model = model_of_scene(scene).replace(lenses=scene.lenses)
     write_binary(model, point_colors(scene), folder)
 
 
 def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
-    """Average what the views that see a point show there, as 8-bit sRGB."""
+    """Return the mean colour of the views that observe a point, as 8-bit sRGB."""
     images = scene.views.images
     height, width = images.shape[-2:]
     total = images.new_zeros(len(scene.points_world), images.shape[1])
     for index in range(scene.views.num_views):
-        seen = scene.observation_point[scene.observation_view == index]
+        in_view = scene.observation_point[scene.observation_view == index]
         pose, K = scene.cameras.cam_from_world[index], scene.cameras.intrinsics[index]
-        pixels, _ = project(scene.points_world[seen], pose, K)
+        pixels, _ = project(scene.points_world[in_view], pose, K)
         grid = grid_from_pixels(pixels, width, height)[None, None]
         colors = grid_sample(images[index][None], grid, mode="bilinear", align_corners=False)
-        total = total.index_add(0, seen, colors[0, :, 0].T)
+        total = total.index_add(0, in_view, colors[0, :, 0].T)
     count = torch.bincount(scene.observation_point, minlength=len(total)).clamp_min(1)
     return to_bytes((total / count[:, None]).expand(-1, 3))
 
 
 @torch.no_grad()
 def sound(scene: SparseScene) -> SparseScene:
-    """Leave out views that show nothing or stand nowhere, and points that are nowhere.
+    """Remove views without usable pixels or with invalid cameras, and points that are not finite.
 
     Args:
-        scene: Photographs, cameras and cloud. Where all can be used, it is returned as it is.
+        scene: Photographs, cameras and cloud. If all can be used, it is returned itself.
     """
     finite = scene.points_world.isfinite().all(dim=1)
     leave_out("sfm.sound_points", ~finite)
     if not bool(finite.all()):
-        lost = f"{int((~finite).sum())} of {len(finite)}"
-        skipped(_failure("points", lost, "their coordinates are not finite", "They are left out"))
+        share = f"{int((~finite).sum())} of {len(finite)}"
+        skipped(_failure("points", share, "their coordinates are not finite", "They are skipped"))
         scene = with_points(scene, finite)
     reasons: dict[int, str] = {}
     masks = scene.views.masks
-    for view, (image, shown) in enumerate(each(scene.views.images, scene.views.inside)):
-        lit = ((image > 0) & (image < SATURATED)).any(dim=0) & shown  # false for NaN
+    for view, (image, valid) in enumerate(each(scene.views.images, scene.views.inside)):
+        lit = ((image > 0) & (image < SATURATED)).any(dim=0) & valid  # false for NaN
         reason = _nowhere(scene, view)
         if not reason and not bool(lit.any()):
-            reason = "it is black, saturated or not finite all over"
+            reason = "it is black, saturated or not finite everywhere"
         elif not reason and masks is not None and not bool((lit & masks[view]).any()):
-            reason = "its mask is empty, or shows nothing that is lit"
+            reason = "its mask is empty, or contains no lit pixel"
         if reason:
             reasons[view] = reason
     unusable = [scene.views.names[view] for view in reasons]
     leave_out("sfm.sound_views", len(unusable), total=scene.views.num_views, names=unusable)
     if not reasons:
         return scene
-    names, left = scene.views.names, scene.views.num_views - len(reasons)
-    if left < 3:  # the least that a sweep compares
+    names, usable = scene.views.names, scene.views.num_views - len(reasons)
+    if usable < 3:  # a sweep compares at least three
         listed = "; ".join(f"{names[view]}: {reason}" for view, reason in reasons.items())
         raise ReconstructionError(
-            f"{left} of {scene.views.num_views} views can be used; needed: 3. {listed}. Look at "
+            f"{usable} of {scene.views.num_views} views can be used; needed: 3. {listed}. Check "
             "these photographs, masks and cameras."
         )
-    done = "These views are left out, as if they had not been taken"
+    done = "These views are skipped, as if they did not exist"
     skipped(*(_failure("view", names[view], reason, done) for view, reason in reasons.items()))
     return with_views(scene, torch.tensor([view not in reasons for view in range(len(names))]))
 
@@ -163,7 +162,7 @@ def _failure(what: str, name: str, reason: str, done: str) -> Failure:
 
 
 def _nowhere(scene: SparseScene, view: int) -> str:
-    """State why a camera cannot be where it is said to be, if so."""
+    """Return why a camera is invalid, or an empty string."""
     pose, intrinsics = scene.cameras.cam_from_world[view], scene.cameras.intrinsics[view]
     if not bool(pose.isfinite().all() and intrinsics.isfinite().all()):
         return "its camera has numbers that are not finite"
@@ -174,6 +173,6 @@ def _nowhere(scene: SparseScene, view: int) -> str:
     size = scene.cameras.sizes_px[view]
     within = (pixels > -0.1 * size) & (pixels < 1.1 * size)
     share = float((within.all(dim=1) & (depth > 0)).float().mean())
-    if share >= 0.5:  # far below any camera of a model, whose points reproject within pixels
+    if share >= 0.5:  # far below that of any valid camera
         return ""
-    return f"its camera has {share:.0%} of the points that it observed in its frame"
+    return f"only {share:.0%} of the points that its camera observes are in its frame"

@@ -1,13 +1,13 @@
-r"""Features of a room that is at rest in front of the camera while the object turns.
+"""Features of the static background behind an object that turns in front of a fixed camera.
 
-Where camera and room do not move and the object turns, as on a turntable, two motions fit the
-photographs: the object's, and none at all. A match whose features lie at the same pixel is *still*.
-A rigid scene has still matches, too: points at infinity in front of a camera that only shifts, or
-points near the axis of a turn. But there one epipolar geometry explains them together with the
-matches that move. No geometry explains a room at rest together with an object that turns.
+If camera and background do not move and the object turns, such as on a turntable, two motions are
+in the photographs: the object's, and none. A match with both features at the same pixel is
+*static*. A rigid scene also has static matches: points at infinity seen by a camera that only
+shifts, or points near the axis of a turn. But there one epipolar geometry explains them together
+with the moving matches. No geometry explains a static background together with a turning object.
 
-A room that shifts, because the tripod was touched, is not found. A model that was registered on it
-is doubted, see :mod:`pimper_torch.method.sfm.diagnose`.
+A background that shifts, because the tripod was touched, is not detected. A model registered on it
+is unreliable, see :mod:`pimper_torch.method.sfm.diagnose`.
 """
 
 from collections.abc import Mapping
@@ -30,11 +30,12 @@ from pimper_torch.records import Record
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.progress import track
 
-# Of the moving matches. Simulated with 0.2 px of noise: 0.00 in rigid scenes; before a room at
-# rest 0.2 with the camera 2 degrees over the table's plane, 0.5 from 10, 0.8 from 25.
+# Least violating fraction of a detected background. Simulated with 0.2 px of noise: 0.00 in rigid
+# scenes; with a static background 0.2 if the camera is 2 degrees above the table's plane, 0.5 from
+# 10, 0.8 from 25.
 _CONTRADICTION = 0.1
-# Longest still match. Of 24 rendered photographs of 640x480, 99 % of the matches of a room at rest
-# are shorter, and 0.4 % of those of a turning mug.
+# Longest static match. In 24 rendered photographs of 640x480, 99 % of the matches of a static
+# background are shorter, and 0.4 % of those of a turning mug.
 _STATIC_PX = 1.0
 
 
@@ -43,11 +44,11 @@ class StaticBackground(Record):
     """Static background of photographs.
 
     Attributes:
-        features: True for those of a room at rest, one tensor a photograph.
-        still_fraction: Of all matches, those whose features lie at the same pixel.
-        moving_pairs: Pairs with still matches in which others move by one epipolar geometry.
-        violating_fraction: Of the moving matches in those, the ones that no geometry explains
-            together with the still ones; 0 without such pairs.
+        features: True for features of a static background, one tensor per photograph.
+        static_fraction: Fraction of all matches with both features at the same pixel.
+        moving_pairs: Number of pairs with static matches in which others fit one epipolar geometry.
+        violating_fraction: Fraction of the moving matches of these pairs that no geometry explains
+            together with the static ones; 0 without such pairs.
     """
 
     features: tuple[Bool[Tensor, " _"], ...]
@@ -57,50 +58,47 @@ class StaticBackground(Record):
 
     @property
     def detected(self) -> bool:
-        """True where something is at rest while something else moves."""
+        """True if the background is static while something else moves."""
         return self.violating_fraction > _CONTRADICTION
 
     @property
     def maps(self) -> list[Matrix3]:
-        """Maps from the pixels of each photograph to those where the room is at rest.
+        """Maps from the pixels of each photograph to the frame in which the background is static.
 
-        The identity; NaN where a photograph shows too little of it. None without a room.
+        The identity; NaN for a photograph that shows too little of it. Empty without a background.
         """
         identity = torch.eye(3).double()
-        enough = [int(one.sum()) >= MIN_MATCHES for one in self.features]
-        return (
-            [identity if one else identity * torch.nan for one in enough] if self.detected else []
-        )
+        scales = [1 if int(x.sum()) >= MIN_MATCHES else torch.nan for x in self.features]
+        return [identity * scale for scale in scales] if self.detected else []
 
     @property
     def nothing_moves(self) -> bool:
-        """True where most matches are still, and nowhere do enough others move."""
+        """True if most matches are static, and no pair has enough moving ones."""
         return self.static_fraction > 0.5 and self.moving_pairs == 0
 
 
 def remove_static_features(database: Path, settings: ReconstructConfig) -> StaticBackground:
-    """Find what is at rest while something else moves, and keep features and matches of the latter.
+    """Detect a static background, and remove its features and matches.
 
-    Pairs that were verified on what is at rest are verified anew.
+    Pairs that were verified on the background are verified again.
 
     Args:
-        database: With features, matches and verified pairs. Where nothing is at rest it stays
-            as it is.
+        database: With features, matches and verified pairs. Unchanged without a static background.
     """
-    with quiet(), loaded().Database.open(database) as stored:
-        matched = matching.read_matched(stored)
+    with quiet(), loaded().Database.open(database) as opened:
+        matched = matching.read_matched(opened)
         verifier = matching.Verifier(matched=matched, settings=settings)
         limit = settings.max_error_px
         background = find_static_background(matched.keypoints, matched.pairs, verifier, limit)
         if background.detected:
-            geometries = matching.read_geometries(stored, matched.ids) | verifier.geometries
-            _keep_moving(stored, matched, background, geometries)
+            geometries = matching.read_geometries(opened, matched.ids) | verifier.geometries
+            _keep_moving(opened, matched, background, geometries)
     return background
 
 
 def log_static_features(background: StaticBackground) -> tuple[int, int]:
-    """Enter in the ledger how many features rest with a room; return their and all numbers."""
-    static = sum(int(one.sum()) for one in background.features)
+    """Log the number of static features; return it and the number of all features."""
+    static = sum(int(x.sum()) for x in background.features)
     total = sum(map(len, background.features))
     leave_out("sfm.static_background", static, total=total)
     return static, total
@@ -111,29 +109,26 @@ def find_static_background(
 ) -> StaticBackground:
     """Separate features of the static background from those of the moving object.
 
-    Each pair that has both still matches and moving ones that one epipolar geometry explains
-    votes: a still match says that its features rest, a moving one that they move. Features rest
-    where more says so, unless one geometry explains still and moving matches together: then
-    the scene is rigid and all its features stay. Pairs of identical photographs have no moving
-    matches and do not vote.
+    Each pair with static matches, and with moving ones that fit one epipolar geometry, votes:
+    static matches for static features, moving ones for moving features. The majority decides,
+    unless one geometry explains static and moving matches together: then the scene is rigid and no
+    feature is static. Pairs of identical photographs have no moving matches and do not vote.
     """
-    votes = [torch.zeros(len(one), dtype=torch.long) for one in keypoints]  # for rest
+    votes = [torch.zeros(len(x), dtype=torch.long) for x in keypoints]  # for static
     num_moving = num_violating = moving_pairs = 0
     split = {pair: _split(keypoints, pair, rows) for pair, rows in pairs.items()}
-    shown = {pair: min(map(len, both)) for pair, both in split.items()}
-    order = sorted(split, key=shown.__getitem__, reverse=True)
-    informative = [pair for pair in order if shown[pair] >= MIN_MATCHES]
-    # The first pairs, which show most of both, must contradict one geometry: else no more are
-    # verified.
+    smaller = {pair: min(map(len, parts)) for pair, parts in split.items()}
+    order = sorted(split, key=smaller.__getitem__, reverse=True)
+    informative = [pair for pair in order if smaller[pair] >= MIN_MATCHES]
+    # The first pairs, with most matches of both kinds, must contradict one geometry. Otherwise no
+    # more are verified.
     for start in track(range(0, len(informative), 24)):
         group = informative[start : start + 24]
         for pair, moving in verify({pair: split[pair][1] for pair in group}).items():
             if len(moving) < MIN_MATCHES:
                 continue
             static_rows = split[pair][0]
-            static, ends = (
-                matching.pixels_of(keypoints, pair, some) for some in (static_rows, moving)
-            )
+            static, ends = (matching.pixels_of(keypoints, pair, x) for x in (static_rows, moving))
             geometry = shared_geometry(static, ends, max_error_px)
             moving_pairs += 1
             num_moving += len(moving)
@@ -145,7 +140,7 @@ def find_static_background(
     num_static = sum(len(static) for static, _ in split.values())
     fraction = num_violating / max(num_moving, 1)
     return StaticBackground(
-        features=tuple((one > 0) & (fraction > _CONTRADICTION) for one in votes),
+        features=tuple((vote > 0) & (fraction > _CONTRADICTION) for vote in votes),
         static_fraction=num_static / max(sum(map(len, pairs.values())), 1),
         moving_pairs=moving_pairs,
         violating_fraction=fraction,
@@ -155,33 +150,33 @@ def find_static_background(
 def moving_matches(
     keypoints: Keypoints, pair: PhotographPair, rows: Rows, background: StaticBackground
 ) -> Bool[Tensor, " match"]:
-    """Find matches that are neither still nor of a feature at rest."""
+    """Return the matches that are not static and have no static feature."""
     touched = background.features[pair[0]][rows[:, 0]] | background.features[pair[1]][rows[:, 1]]
     first, second = matching.pixels_of(keypoints, pair, rows)
     return ~touched & ((first - second).norm(dim=-1) >= _STATIC_PX)
 
 
 def _split(keypoints: Keypoints, pair: PhotographPair, rows: Rows) -> tuple[Rows, Rows]:
-    """Return a pair's still matches, and those that clearly move."""
+    """Return a pair's static matches, and those that clearly move."""
     first, second = matching.pixels_of(keypoints, pair, rows)
     length = (first - second).norm(dim=-1)
-    # Features at rest that were found less exactly do not show motion.
+    # Less exactly detected static features do not count as moving.
     return rows[length < _STATIC_PX], rows[length >= 4 * _STATIC_PX]
 
 
 def _keep_moving(
-    stored: Any,  # noqa: ANN401 - pycolmap is untyped
+    database: Any,  # noqa: ANN401 - pycolmap is untyped
     matched: matching.Matched,
     background: StaticBackground,
     geometries: Mapping[PhotographPair, Any],
 ) -> None:
-    described = [stored.read_descriptors(image) for image in matched.ids]
-    stored.clear_descriptors()
-    for image, static, one in zip(matched.ids, background.features, described, strict=True):
+    descriptors = [database.read_descriptors(image) for image in matched.ids]
+    database.clear_descriptors()
+    for image, static, old in zip(matched.ids, background.features, descriptors, strict=True):
         moves = (~static).numpy()
-        stored.update_keypoints(image, np.array(stored.read_keypoints(image))[moves])
-        kept = loaded().FeatureDescriptors(one.type, one.data[moves])
-        stored.write_descriptors(image, kept)
+        database.update_keypoints(image, np.array(database.read_keypoints(image))[moves])
+        kept = loaded().FeatureDescriptors(old.type, old.data[moves])
+        database.write_descriptors(image, kept)
     number = [torch.cumsum(~static, dim=0) - 1 for static in background.features]
 
     def moving(pair: PhotographPair, rows: Rows) -> np.ndarray:
@@ -189,13 +184,13 @@ def _keep_moving(
         ends = [number[view][rows[:, side]] for side, view in enumerate(pair)]
         return torch.stack(ends, dim=1).numpy().astype(np.uint32)
 
-    stored.clear_matches()
-    stored.clear_two_view_geometries()
+    database.clear_matches()
+    database.clear_two_view_geometries()
     for pair, rows in matched.pairs.items():
         ids = matched.ids[pair[0]], matched.ids[pair[1]]
-        stored.write_matches(*ids, moving(pair, rows))
+        database.write_matches(*ids, moving(pair, rows))
         if geometry := geometries.get(pair):
             inliers = moving(pair, matching.indices(geometry.inlier_matches))
             if len(inliers) >= MIN_MATCHES:
                 geometry.inlier_matches = inliers
-                stored.write_two_view_geometry(*ids, geometry)
+                database.write_two_view_geometry(*ids, geometry)

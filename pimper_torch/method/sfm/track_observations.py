@@ -1,14 +1,14 @@
-r"""Points found again in photographs, to a small fraction of a pixel, whatever the light.
+"""Track observations with errors of a small fraction of a pixel, under changing light.
 
-A view shows around a point the reference view's patch, moved along the point's tangent plane by a
-few numbers. To the logarithm of the radiance, light that changes from view to view adds a constant
-and, over a patch, about a slope; both are projected out of patch and template alike, and a common
-factor (contrast) is fitted. The rest is aligned by Gauss-Newton on the template's slopes, which are
+Around a point, a view shows the reference view's patch, warped by the point's tangent plane and
+shifted by a few pixels. In the logarithm of radiance, a change of light adds a constant and, over a
+patch, approximately a slope. Both are projected out of patch and template, and a common factor
+(contrast) is fitted. The shift is estimated by Gauss-Newton on the template's slopes, which are
 computed once for all views (inverse compositional).
 
-Source: Baker & Matthews, Lucas-Kanade 20 years on, IJCV 2004; that points of structure from motion
-deserve it, Lindenberger et al., Pixel-perfect structure-from-motion, ICCV 2021, with learned
-features in the place of the logarithm.
+Source: Baker & Matthews, Lucas-Kanade 20 years on, IJCV 2004; for points of structure from motion
+Lindenberger et al., Pixel-perfect structure-from-motion, ICCV 2021, with learned features instead
+of the logarithm.
 """
 
 from collections.abc import Iterable
@@ -33,12 +33,12 @@ from pimper_torch.runtime.parallel import side_by_side
 Seen = Bool[Tensor, "point view"]
 
 
-# Half the side of a patch, in steps of the plane, which are about pixels of the reference.
+# Half the side of a patch, in steps on the plane of about a pixel of the reference.
 _RADIUS = 8
-# Cosine between normal and ray down to which a view is worth asking.
+# Least cosine between normal and ray of a candidate view.
 _MIN_COSINE = 0.35
-# Iterations; the longest step; the step that ends them; iterations after which a patch is given up
-# whose correlation is below the next; bounds of the contrast against the template's.
+# Iterations; the longest step; the step that ends them; the iterations after which a patch with a
+# correlation below the next number is abandoned; bounds of the contrast relative to the template's.
 _LIMITS = (10, 1.5, 0.02, 4, 0.4, 0.3, 3.0)
 
 
@@ -47,11 +47,10 @@ class Tangents(Record):
     """Tangent planes of points, float64.
 
     Attributes:
-        steps_world: Two vectors along the plane, right-angled and equally long: about a pixel of
-            the reference view each.
-        reference: The view that shows the plane best among those that see the point.
-        candidates: Views in front of the plane that have the point in their image; not the
-            reference.
+        steps_world: Two orthogonal vectors of equal length in the plane: about a pixel of the
+            reference view each.
+        reference: The view with the sharpest image of the plane among those that observe the point.
+        candidates: Views in front of the plane with the point in their image, except the reference.
     """
 
     points_world: Points
@@ -61,38 +60,38 @@ class Tangents(Record):
 
 
 def tangents(points_world: Points, observed: Seen, cameras: Cameras) -> Tangents:
-    """Lay a plane through every point and choose the views to look for it in."""
+    """Fit a plane at every point, and choose the views in which to search for it."""
     at_once = max(1, 2**22 // cameras.num_views)  # 100 MB of rays
     points, seen = torch.split(points_world, at_once), torch.split(observed, at_once)
     towards = []
-    for some, by in zip(points, seen, strict=True):
-        rays = normalize(cameras.centers_world - some[:, None], dim=-1)
-        towards.append(normalize((rays * by[..., None]).sum(dim=1), dim=-1))
+    for batch, observers in zip(points, seen, strict=True):
+        rays = normalize(cameras.centers_world - batch[:, None], dim=-1)
+        towards.append(normalize((rays * observers[..., None]).sum(dim=1), dim=-1))
     normals = torch.split(plane_normals(points_world, torch.cat(towards)), at_once)
-    laid = zip(points, seen, normals, strict=True)
-    return Tangents.cat([_laid(some, by, across, cameras) for some, by, across in laid])
+    batches = zip(points, seen, normals, strict=True)
+    return Tangents.cat([_tangents(*batch, cameras) for batch in batches])
 
 
-def _laid(points_world: Points, observed: Seen, normals: Points, cameras: Cameras) -> Tangents:
+def _tangents(points_world: Points, observed: Seen, normals: Points, cameras: Cameras) -> Tangents:
     rays = cameras.centers_world - points_world[:, None]
     distance = rays.norm(dim=-1)
     cosine = (normalize(rays, dim=-1) * normals[:, None]).sum(dim=-1)
     focals = cameras.intrinsics[:, 0, 0]
     sharpness = torch.where(observed, cosine.clamp_min(1e-3) * focals / distance, 0)
     reference = sharpness.argmax(dim=1)
-    here = reference[:, None]
-    pixel = (distance / focals).gather(1, here)
-    # Foreshortened along one axis, a pixel covers more of the plane.
-    pixel = pixel / cosine.gather(1, here).clamp(_MIN_COSINE, 1).sqrt()
+    column = reference[:, None]
+    pixel = (distance / focals).gather(1, column)
+    # A pixel covers more of the plane if it is foreshortened along one axis.
+    pixel = pixel / cosine.gather(1, column).clamp(_MIN_COSINE, 1).sqrt()
     pixels, depth = project(points_world, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px[:, None].to(pixels)
     inside = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
-    candidates = (inside.mT & (cosine > _MIN_COSINE)).scatter(1, here, value=False)
+    candidates = (inside.mT & (cosine > _MIN_COSINE)).scatter(1, column, value=False)
     if cameras.num_views > MOST_PAIRED:
-        most = torch.full_like(here, 24)  # see docs/decisions.md
-        seen = evenly(candidates & observed, most)
-        left = most - seen.sum(dim=1, keepdim=True)
-        candidates = seen | evenly(candidates & ~observed, left)
+        limit = torch.full_like(column, 24)  # see docs/decisions.md
+        chosen = evenly(candidates & observed, limit)
+        remaining = limit - chosen.sum(dim=1, keepdim=True)
+        candidates = chosen | evenly(candidates & ~observed, remaining)
     return Tangents(
         points_world=points_world,
         steps_world=pixel[:, None] * _along(normals),
@@ -102,23 +101,23 @@ def _laid(points_world: Points, observed: Seen, normals: Points, cameras: Camera
 
 
 def evenly(candidates: Seen, most: Int[Tensor, "point 1"]) -> Seen:
-    """Keep at most ``most`` views of each point, evenly spread among the candidates."""
-    place = candidates.cumsum(dim=1) * most
+    """Keep at most ``most`` views per point, evenly spread among the candidates."""
+    rank = candidates.cumsum(dim=1) * most
     count = torch.maximum(candidates.sum(dim=1, keepdim=True), most).clamp_min(1)
-    return candidates & (place // count > (place - most) // count)
+    return candidates & (rank // count > (rank - most) // count)
 
 
 def plane_normals(points: Points, towards: Points) -> Points:
     """Return the unit normals of the planes through points and their nearest neighbours.
 
     Args:
-        towards: Unit; what a normal points to, and what it is where neighbours say otherwise.
+        towards: Unit vectors that normals point to; used as normals if neighbours contradict.
     """
-    places = points.detach().cpu().numpy()
-    count = min(16, len(places))
-    _, nearest = cKDTree(places).query(places, k=list(range(1, count + 1)))
-    around = points[torch.from_numpy(nearest).to(points.device)]
-    steps = around - around.median(dim=1, keepdim=True).values  # a stray neighbour shifts no median
+    positions = points.detach().cpu().numpy()
+    count = min(16, len(positions))
+    _, nearest = cKDTree(positions).query(positions, k=list(range(1, count + 1)))
+    neighbours = points[torch.from_numpy(nearest).to(points.device)]
+    steps = neighbours - neighbours.median(dim=1, keepdim=True).values  # robust to stray neighbours
     axes = torch.linalg.eigh(steps.mT @ steps).eigenvectors
     across = axes[:, :, 0]
     facing = (across * towards).sum(dim=-1, keepdim=True)
@@ -126,17 +125,17 @@ def plane_normals(points: Points, towards: Points) -> Points:
 
 
 def plane_homographies(
-    tangent: Tangents, cameras: Cameras, view: int, some: Int[Tensor, " chosen"]
+    tangent: Tangents, cameras: Cameras, view: int, chosen: Int[Tensor, " chosen"]
 ) -> Float[Tensor, "chosen 3 3"]:
     """Return the homographies from planes, in steps from the centre, to a view's pixels."""
-    steps = tangent.steps_world[some]
-    centre = transform(cameras.cam_from_world[view], tangent.points_world[some])
+    steps = tangent.steps_world[chosen]
+    centre = transform(cameras.cam_from_world[view], tangent.points_world[chosen])
     rotated = steps @ cameras.cam_from_world[view, :3, :3].mT
     return cameras.intrinsics[view] @ torch.cat([rotated, centre[:, None]], dim=1).mT
 
 
 def _along(normals: Points) -> Float[Tensor, "point 2 3"]:
-    """Return two unit vectors at right angles to each normal and to one another."""
+    """Return two orthogonal unit vectors that are perpendicular to each normal."""
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
     first = normalize(torch.linalg.cross(normals, axis), dim=-1)
     return torch.stack([first, torch.linalg.cross(normals, first)], dim=1)
@@ -144,7 +143,7 @@ def _along(normals: Points) -> Float[Tensor, "point 2 3"]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class LogPictures(Record):
-    """Photographs in which patches are looked up.
+    """Photographs for looking up patches.
 
     Attributes:
         unusable: 1 where a pixel cannot be used.
@@ -158,14 +157,14 @@ def log_pictures(
     photographs: Iterable[tuple[Float[Tensor, "_ _ _"], Bool[Tensor, "_ _"]]],
     raster: tuple[int, int, int],
 ) -> LogPictures:
-    """Take logarithms of photographs one by one, so that no others are held.
+    """Return the logarithms of photographs, computed one by one to save memory.
 
     Args:
-        raster: How many there are, and the height and width that they are padded to.
+        raster: Number of photographs, and the height and width to which they are padded.
 
     Returns:
-        On the CPU, float32, a constant to autograd. Pixels that are padding, invalid, not finite
-        or saturated in one channel are unusable.
+        On the CPU, float32, not differentiable. Pixels that are padding, invalid, not finite or
+        saturated in one channel are unusable.
     """
     log, unusable = zeros(raster), zeros(raster, torch.uint8).fill_(1)
     for index, (image, valid) in enumerate(photographs):
@@ -183,7 +182,7 @@ def log_pictures(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class TrackObservations(Record):
-    """Where views show points."""
+    """Pixels of points in views."""
 
     point: Int[Tensor, " sighting"]
     view: Int[Tensor, " sighting"]
@@ -192,11 +191,11 @@ class TrackObservations(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Templates(Record):
-    """Patches as the reference views show them.
+    """Patches in the reference views.
 
     Attributes:
-        values: Light taken out; the window's square root is in them.
-        usable: True where the reference shows nearly all of the patch, with texture.
+        values: Without light, multiplied by the square root of the window.
+        usable: True if the reference shows nearly all of the patch, with texture.
     """
 
     values: Float[Tensor, "point sample"]
@@ -206,21 +205,21 @@ class _Templates(Record):
 
 
 class _Window:
-    """The raster of a patch in steps of the plane, its weights, and what light may change."""
+    """The raster of a patch in steps on the plane, its weights, and the changes due to light."""
 
     def __init__(self, like: Tensor) -> None:
         side = torch.arange(-_RADIUS, _RADIUS + 1).to(like)
         v, u = torch.meshgrid(side, side, indexing="ij")
         self.side = 2 * _RADIUS + 1
-        self.places = torch.stack([u.flatten(), v.flatten(), torch.ones_like(u).flatten()])
+        self.raster = torch.stack([u.flatten(), v.flatten(), torch.ones_like(u).flatten()])
         weight = torch.exp(-(u.square() + v.square()).flatten() * 1.5 / _RADIUS**2)
         self.root, self.total = weight.sqrt(), float(weight.sum())
-        self.light = torch.linalg.qr((self.places * self.root).mT).Q
+        self.light = torch.linalg.qr((self.raster * self.root).mT).Q
 
     def freed(self, patches: Float[Tensor, "*batch sample"]) -> Float[Tensor, "*batch sample"]:
-        """Weigh patches, and project constant and slope out."""
-        heavy = patches * self.root
-        return heavy - heavy @ self.light @ self.light.mT
+        """Weight patches, and project constant and slope out."""
+        weighted = patches * self.root
+        return weighted - weighted @ self.light @ self.light.mT
 
 
 def observe_points(
@@ -230,21 +229,21 @@ def observe_points(
     max_shift_px: float = 3.0,
     at_once: int = 2**13,
 ) -> TrackObservations:
-    """Find points in all views that may show them.
+    """Search for points in all views that may show them.
 
-    A point's place in its reference view is where the cameras put it: there the template is
-    taken. In the other views it is where the same patch is found.
+    In its reference view a point is at the projection by the cameras, where its template is taken.
+    In the other views it is where this template is found.
 
     Returns:
-        Sorted by point, then view; the reference's own is there where another view found
-        the point. A constant to autograd.
+        Sorted by point, then view; the reference is included if another view found the point. Not
+        differentiable.
     """
     limits = torch.tensor([*_LIMITS, max_shift_px], dtype=torch.float64)
-    found = []
+    batches = []
     for first in range(0, max(len(tangents.points_world), 1), at_once):
-        part = _observed(pictures, cameras, tangents.take(slice(first, first + at_once)), limits)
-        found.append(part.replace(point=part.point + first))
-    return TrackObservations.cat(found)
+        batch = _observed(pictures, cameras, tangents.take(slice(first, first + at_once)), limits)
+        batches.append(batch.replace(point=batch.point + first))
+    return TrackObservations.cat(batches)
 
 
 @torch.no_grad()
@@ -257,32 +256,32 @@ def _observed(
     templates = _templates(pictures, cameras, tangents, window)
 
     def in_view(view: int) -> tuple[Tensor, Tensor, Tensor]:
-        mine = tangents.candidates[:, view] & templates.usable
-        (chosen,) = torch.nonzero(mine, as_tuple=True)
+        candidates = tangents.candidates[:, view] & templates.usable
+        (chosen,) = torch.nonzero(candidates, as_tuple=True)
         homographies = plane_homographies(tangents, cameras, view, chosen)
         shift = homographies.new_empty(len(homographies), 2)
         deviation, correlation = torch.empty_like(shift).mT.contiguous()
-        own = (templates.values, templates.slopes, templates.inverse)
-        given = (homographies, chosen, *own, window.places, window.root, window.light, limits)
-        found = (shift, deviation, correlation)  # written to: these are contiguous
-        align(*(one.contiguous().numpy() for one in (pictures.log[view], *given, *found)))
-        arrived = shift.isfinite().all(dim=1)
+        template = (templates.values, templates.slopes, templates.inverse)
+        given = (homographies, chosen, *template, window.raster, window.root, window.light, limits)
+        results = (shift, deviation, correlation)  # written to: these are contiguous
+        align(*(x.contiguous().numpy() for x in (pictures.log[view], *given, *results)))
+        valid = shift.isfinite().all(dim=1)
         axes = homographies[:, :, :2]
-        centre = homographies[:, :, 2:] + axes @ torch.where(arrived[:, None], shift, 0)[..., None]
+        centre = homographies[:, :, 2:] + axes @ torch.where(valid[:, None], shift, 0)[..., None]
         final = torch.cat([axes, centre], dim=2)
-        kept = arrived & (correlation >= 0.8) & (deviation <= 0.5)
+        kept = valid & (correlation >= 0.8) & (deviation <= 0.5)
         kept &= _complete(pictures.unusable[view], final, window)
-        shown = chosen[kept]
-        return shown, torch.full_like(shown, view), (final[:, :2, 2] / final[:, 2:, 2])[kept]
+        point = chosen[kept]
+        return point, torch.full_like(point, view), (final[:, :2, 2] / final[:, 2:, 2])[kept]
 
-    parts = side_by_side(in_view, range(len(pictures.log)))
-    point, view_, pixels = (torch.cat(part) for part in zip(*parts, strict=True))
-    own = torch.unique(point)
-    point = torch.cat([point, own])
-    view_ = torch.cat([view_, tangents.reference[own]])
-    there = cameras.take(tangents.reference[own])
-    mine, _ = project(tangents.points_world[own, None], there.cam_from_world, there.intrinsics)
-    pixels = torch.cat([pixels, mine[:, 0]])
+    views = side_by_side(in_view, range(len(pictures.log)))
+    point, view_, pixels = (torch.cat(values) for values in zip(*views, strict=True))
+    found = torch.unique(point)
+    point = torch.cat([point, found])
+    view_ = torch.cat([view_, tangents.reference[found]])
+    camera = cameras.take(tangents.reference[found])
+    own, _ = project(tangents.points_world[found, None], camera.cam_from_world, camera.intrinsics)
+    pixels = torch.cat([pixels, own[:, 0]])
     order = torch.argsort(point * len(pictures.log) + view_)
     return TrackObservations(point=point[order], view=view_[order], pixels=pixels[order])
 
@@ -291,26 +290,26 @@ def _templates(
     pictures: LogPictures, cameras: Cameras, tangents: Tangents, window: _Window
 ) -> _Templates:
     count = len(tangents.points_world)
-    patches = pictures.log.new_zeros(count, window.places.shape[1])
-    whole = torch.zeros(count, dtype=torch.bool, device=pictures.log.device)
+    patches = pictures.log.new_zeros(count, window.raster.shape[1])
+    complete = torch.zeros(count, dtype=torch.bool, device=pictures.log.device)
     for view in range(len(pictures.log)):
-        (some,) = torch.nonzero(tangents.reference == view, as_tuple=True)
-        homographies = plane_homographies(tangents, cameras, view, some)
-        patches[some] = _look_up(pictures.log[view], homographies, window)
-        whole[some] = _complete(pictures.unusable[view], homographies, window)
+        (chosen,) = torch.nonzero(tangents.reference == view, as_tuple=True)
+        homographies = plane_homographies(tangents, cameras, view, chosen)
+        patches[chosen] = _look_up(pictures.log[view], homographies, window)
+        complete[chosen] = _complete(pictures.unusable[view], homographies, window)
     square = patches.reshape(count, window.side, window.side)
     down, right = torch.gradient(square, dim=(1, 2))
     slopes = torch.stack([window.freed(right.flatten(1)), window.freed(down.flatten(1))], dim=-1)
     normal = slopes.mT @ slopes
     worst, best = torch.linalg.eigvalsh(normal).unbind(dim=1)
-    # Below, the patch is a stripe, and noise determines its place.
+    # Otherwise the patch is a stripe, and noise determines its position.
     textured = (best > 1e-9) & (worst > 0.01 * best)
     safe = torch.where(textured[:, None, None], normal, torch.eye(2).to(normal))
     return _Templates(
         values=window.freed(patches),
         slopes=slopes,
         inverse=torch.linalg.inv(safe),
-        usable=whole & textured,
+        usable=complete & textured,
     )
 
 
@@ -319,7 +318,7 @@ def _complete(
     homographies: Float[Tensor, "point 3 3"],
     window: _Window,
 ) -> Bool[Tensor, " point"]:
-    """Find whose patches a view shows nearly all of."""
+    """Return the points with nearly all of their patch visible in a view."""
     lacking = _look_up(unusable.float(), homographies, window, mode="nearest", outside=1.0)
     return (lacking * window.root.square()).sum(dim=1) / window.total <= 0.1
 
@@ -331,16 +330,16 @@ def _look_up(
     mode: str = "bilinear",
     outside: float | None = None,
 ) -> Float[Tensor, "point sample"]:
-    """Look patches up.
+    """Return the values of patches.
 
     Bilinear: torch's cubic kernel displaces patches by a twentieth of a pixel, this by a hundredth.
     """
     height, width = picture.shape
-    homogeneous = homographies @ window.places.to(homographies)
+    homogeneous = homographies @ window.raster.to(homographies)
     ahead = homogeneous[:, 2] > 0
     pixels = homogeneous[:, :2] / torch.where(ahead, homogeneous[:, 2], torch.inf)[:, None]
     grid = grid_from_pixels(pixels.mT, width, height).to(picture)
-    found = grid_sample(
+    values = grid_sample(
         picture[None, None],
         grid.clamp(-3, 3)[None],
         mode=mode,
@@ -348,5 +347,5 @@ def _look_up(
         align_corners=False,
     )[0, 0]
     if outside is None:
-        return found
-    return torch.where((grid.abs() <= 1).all(dim=-1) & ahead, found, outside)
+        return values
+    return torch.where((grid.abs() <= 1).all(dim=-1) & ahead, values, outside)

@@ -1,4 +1,4 @@
-"""Points of cameras that are known: matched along their epipolar lines, cameras held fixed."""
+"""Points for given cameras: matched along epipolar lines, with the cameras held fixed."""
 
 import tempfile
 from collections.abc import Sequence
@@ -24,34 +24,34 @@ from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
 
 # Observed points of the median view below which points are triangulated, and below which depth maps
-# help, too. In a model of COLMAP's or our own a view sees 30 at least; the other is half of it.
+# are also used. In a model of COLMAP's or our own a view has at least 30; the other is half of it.
 FEWEST_OBSERVED, FEW_OBSERVED = 15, 30
 
 
 def lacks_points(model: SparseModel | SparseScene, fewest: int = FEWEST_OBSERVED) -> bool:
-    """Return whether most views observe fewer points."""
+    """Return whether the median view observes fewer points than ``fewest``."""
     count = model.num_views if isinstance(model, SparseModel) else model.cameras.num_views
-    seen = torch.bincount(model.observation_view, minlength=count)
-    return float(seen.double().median()) < fewest
+    observed = torch.bincount(model.observation_view, minlength=count)
+    return float(observed.double().median()) < fewest
 
 
 def triangulate(
     views: Views, given: SparseModel, settings: ReconstructConfig, where: str
 ) -> SparseModel:
-    """Triangulate what photographs show, with cameras held fixed.
+    """Triangulate points from photographs, with cameras held fixed.
 
-    Features are found and matched as in structure from motion. What an epipolar geometry of its own
-    verifies shows whether the cameras belong to the photographs. Then features are matched anew
-    along the cameras' epipolar lines, triangulated, and found again in every view by aligning
-    patches. On one thread where the order of sums matters, so that bits repeat.
+    Features are detected and matched as in structure from motion. Inliers of the pairs' own
+    epipolar geometry show whether the cameras belong to the photographs. Then features are matched
+    again along the cameras' epipolar lines, triangulated, and refined in every view by aligning
+    patches. One thread is used where the order of sums matters, for reproducible bits.
 
     Args:
-        given: Cameras of the photographs, in their order. Points that they have are replaced where
-            more are found. Points without observations are a cloud, which is looked for, too.
+        given: Cameras of the photographs, in their order. Their points are replaced if more are
+            found. Points without observations are a cloud, which is also searched for.
 
     Returns:
-        Poses and lenses bit for bit as given. With the points as they were where no more are
-        found, which a :class:`~pimper_torch.runtime.errors.PimperWarning` says.
+        Given poses and lenses, bit for bit. If no more points are found, the given ones, with a
+        :class:`~pimper_torch.runtime.errors.PimperWarning`.
     """
     cloud = given.points_world
     if len(cloud) and not len(given.observation_point):
@@ -59,7 +59,7 @@ def triangulate(
     if features.too_small(views):
         _warn_of_no_points(0, where)
         return given
-    lenses = list(range(views.num_views))  # to COLMAP each has its own; they stay as they are
+    lenses = list(range(views.num_views))  # one per photograph for COLMAP; they stay unchanged
     with features.workspace(views, settings.num_threads) as space:
         counts = features.find_features(space, settings, [None] * views.num_views, lenses)
         release_memory()
@@ -71,69 +71,69 @@ def triangulate(
         offset = local_origin(given.cam_from_world, cloud)
         local = given.replace(cam_from_world=to_local(given.cam_from_world, offset))
         _match_along_lines(space, local, verified, settings)
-        found = local.with_points(_triangulated(space, local, settings.seed))
+        model = local.with_points(_triangulated(space, local, settings.seed))
     release_memory()
-    own = ""
+    from_cloud = ""
     if len(cloud) > len(given.points_world):
         shifted = cloud - cloud.new_tensor(offset)
         of_cloud = cloud_tracks(views, local.replace(points_world=shifted))
-        found = found.joined(of_cloud)
-        own = f", {len(of_cloud.points_world):,} of them found from the cloud that it names"
-    if len(found.points_world):
-        found = refine_tracks(views, found, settings.track_iterations, cameras=False)
-    points = found.points_world + found.points_world.new_tensor(offset)
-    found = given.with_points(found.replace(points_world=points))
-    if len(found.observation_point) <= len(given.observation_point) or not len(found.points_world):
-        _warn_of_no_points(len(found.points_world), where)
+        model = model.joined(of_cloud)
+        from_cloud = f", {len(of_cloud.points_world):,} of them found from the cloud that it names"
+    if len(model.points_world):
+        model = refine_tracks(views, model, settings.track_iterations, cameras=False)
+    points = model.points_world + model.points_world.new_tensor(offset)
+    model = given.with_points(model.replace(points_world=points))
+    if len(model.observation_point) <= len(given.observation_point) or not len(model.points_world):
+        _warn_of_no_points(len(model.points_world), where)
         return given
     caution(
-        f"{where}: hardly any of its views observes points. {len(found.points_world):,} points "
-        f"were triangulated from the photographs with the cameras held fixed{own}, observed "
-        f"{len(found.observation_point):,} times; median reprojection error "
-        f"{float(observation_errors(found).median()):.2f} px.",
+        f"{where}: hardly any of its views observes points. {len(model.points_world):,} points "
+        f"were triangulated from the photographs with the cameras held fixed{from_cloud}, observed "
+        f"{len(model.observation_point):,} times; median reprojection error "
+        f"{float(observation_errors(model).median()):.2f} px.",
         stacklevel=3,
     )
-    return found
+    return model
 
 
-# Fraction of the matches that right cameras explain: 0.97 to 1.00 at 2 px in five scenes (the
-# skull, three rendered ones of 240 to 400 px, a ball in closed form). Cameras of a mirrored relief
-# explain up to 0.83 along an arc.
-_MIN_AGREEMENT, _DOUBTFUL = 0.5, 0.9
+# Least fraction of inliers, and that of reliable cameras. Correct cameras have 0.97 to 1.00 at 2 px
+# in five scenes (the skull, three rendered ones of 240 to 400 px, a ball in closed form). Cameras
+# of a mirrored relief have up to 0.83 along an arc.
+_MIN_AGREEMENT, _RELIABLE = 0.5, 0.9
 
 
 def require_agreement(
     model: SparseModel, verified: Sequence[matching.VerifiedPair], max_error_px: float, where: str
 ) -> None:
-    """Refuse cameras that explain too few of the matches, and warn of doubtful ones.
+    """Refuse cameras with too few inliers among the matches, and warn of unreliable ones.
 
-    Matches that an epipolar geometry of their own explains are found without the cameras. With the
-    right cameras most of them lie on these cameras' epipolar lines and in front of both; with wrong
-    ones a few do by chance.
+    Inliers of a pair's own epipolar geometry are found without the cameras. With correct cameras
+    most of them are on these cameras' epipolar lines and in front of both; with wrong ones a few
+    are by chance.
 
     Raises:
-        InputError: Half of the matches are not explained.
+        InputError: Fewer than half of the matches are inliers.
     """
     total = sum(pair.num_matches for pair in verified)
     pairs, cameras = epipolar.undistorted_pairs(model, verified), epipolar.pinholes_of(model)
-    right = sum(int(epipolar.inliers(cameras, pair, max_error_px).sum()) for pair in pairs)
-    if total < 2 * MIN_MATCHES or right >= _DOUBTFUL * total:
+    consistent = sum(int(epipolar.inliers(cameras, pair, max_error_px).sum()) for pair in pairs)
+    if total < 2 * MIN_MATCHES or consistent >= _RELIABLE * total:
         return
     found = (
-        f"{right / total:.0%} of {total} matches in {len(verified)} pairs of photographs are "
+        f"{consistent / total:.0%} of {total} matches in {len(verified)} pairs of photographs are "
         f"within {max_error_px:g} px of the cameras' epipolar lines and in front of both cameras"
     )
     advice = (
         "Needed are cam_from_world, not its inverse, with camera axes x right, y down, z forward, "
-        "and the names, order, sizes and lens of these photographs, resized at most; or leave the "
-        "cameras out to find them by structure from motion."
+        "and the names, order, sizes and lens of these photographs, resized at most; or omit the "
+        "cameras to find them by structure from motion."
     )
-    if right < _MIN_AGREEMENT * total:
+    if consistent < _MIN_AGREEMENT * total:
         raise InputError(
             f"{where}: these cameras and the photographs do not belong together: {found}; needed: "
             f"at least {_MIN_AGREEMENT:.0%}. {advice}"
         )
-    caution(f"{where}: its cameras are doubtful: {found}. {advice}", stacklevel=4)
+    caution(f"{where}: its cameras are unreliable: {found}. {advice}", stacklevel=4)
 
 
 def _match_along_lines(
@@ -142,30 +142,30 @@ def _match_along_lines(
     verified: Sequence[matching.VerifiedPair],
     settings: ReconstructConfig,
 ) -> None:
-    """Replace what was verified by matches along the cameras' epipolar lines."""
+    """Replace verified matches by matches along the cameras' epipolar lines."""
     cameras, limit = epipolar.pinholes_of(model), settings.max_error_px
-    # Pairs are chosen by matches that the cameras explain, then by the angle between their axes.
+    # Pairs are chosen by inliers of the cameras, then by the angle between their axes.
     axes = model.cam_from_world[:, 2, :3]
     angles = torch.rad2deg((axes @ axes.mT).clamp(-1, 1).acos())
     weights = {
         (first, second): 1 - float(angles[first, second]) / 60
         for first, second in combinations(range(model.num_views), 2)
-        if float(angles[first, second]) < 60  # degrees; beyond, photographs have nothing to match
+        if float(angles[first, second]) < 60  # degrees; beyond, hardly any feature matches
     }
-    for known in epipolar.undistorted_pairs(model, verified):
-        if count := int(epipolar.inliers(cameras, known, limit).sum()):
-            weights[known.views] = weights.get(known.views, 0.0) + count
+    for checked in epipolar.undistorted_pairs(model, verified):
+        if count := int(epipolar.inliers(cameras, checked, limit).sum()):
+            weights[checked.views] = weights.get(checked.views, 0.0) + count
     pairs = matching.strongest(weights, model.num_views, max(settings.guided_pairs, 1))
-    with quiet(), loaded().Database.open(space.database) as stored:
-        image_of = features.image_ids(stored, space)
-        bent = [matching.read_features(stored, image) for image in image_of]
-        straight = [
-            its.replace(pixels=epipolar.undistorted_pixels(model, view, its.pixels))
-            for view, its in enumerate(bent)
+    with quiet(), loaded().Database.open(space.database) as database:
+        image_of = features.image_ids(database, space)
+        detected = [matching.read_features(database, image) for image in image_of]
+        undistorted = [
+            x.replace(pixels=epipolar.undistorted_pixels(model, view, x.pixels))
+            for view, x in enumerate(detected)
         ]
 
         def matches(pair: matching.PhotographPair) -> Tensor:
-            first, second = (straight[number] for number in pair)
+            first, second = (undistorted[number] for number in pair)
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
             near = matching.Near(epipolar.epipolar_geometry(cameras, pair), limit)
@@ -175,13 +175,13 @@ def _match_along_lines(
             )
             return found[epipolar.inliers(cameras, ends, limit)]
 
-        stored.clear_two_view_geometries()
+        database.clear_two_view_geometries()
         for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
             geometry = loaded().TwoViewGeometry()
             geometry.config = loaded().TwoViewGeometryConfiguration.CALIBRATED
             geometry.F = epipolar.epipolar_geometry(cameras, pair).numpy()
             geometry.inlier_matches = found.numpy().astype(np.uint32)
-            stored.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
+            database.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
 
 
 def _triangulated(space: features.Workspace, model: SparseModel, seed: int) -> SparseModel:

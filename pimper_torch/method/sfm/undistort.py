@@ -1,4 +1,4 @@
-"""Photographs as a pinhole would have taken them."""
+"""Undistortion of photographs and priors to pinhole cameras."""
 
 from collections.abc import Iterator, Mapping
 from typing import TypeVar
@@ -38,14 +38,14 @@ def undistort(
 ) -> tuple[Views, Float[Tensor, "view 3 3"]]:
     """Resample photographs so that straight lines in space are straight in the image.
 
-    The pinholes are those of :func:`pinhole_for`, of the photographs' sizes.
+    The pinholes are those of :func:`pinhole_for`, with the photographs' sizes.
 
     Returns:
-        The views, and ``K`` of each. A pixel that looks past the photograph's edge is zero
-        and false in the masks, which come to be for that; where there are none and nothing
-        looks past, they stay ``None``. Radiance is interpolated bilinearly, masks at one
-        half; what touches a saturated pixel is saturated. Differentiable in the radiance. A
-        view without distortion is left untouched.
+        The views, and ``K`` of each. A pixel from outside the photograph is zero and false in the
+        masks, which are created if needed; without masks and without such pixels, they stay
+        ``None``. Radiance is interpolated bilinearly, masks at one half; a pixel that touches a
+        saturated one is saturated. Differentiable in the radiance. A view without distortion is
+        left untouched.
     """
     pinholes = pinholes_for(lenses).to(views.images)
     if all(map(lens_models.is_pinhole, lenses)):
@@ -53,19 +53,19 @@ def undistort(
     shape, device = views.images.shape, views.images.device
     images = zeros(shape, views.images.dtype, device)
     valid = zeros((shape[0], *shape[2:]), torch.bool, device)
-    whole = views.masks is None
+    is_covered = views.masks is None
     for index, (image, inside) in enumerate(undistorted(views, lenses)):
         height, width = inside.shape
         images[index, :, :height, :width], valid[index, :height, :width] = image, inside
-        whole = whole and bool(inside.all())
-    return views.replace(images=images, masks=None if whole else valid), pinholes
+        is_covered = is_covered and bool(inside.all())
+    return views.replace(images=images, masks=None if is_covered else valid), pinholes
 
 
 def undistorted(views: Views, lenses: tuple[CameraModel, ...]) -> Iterator[tuple[Picture, Mask]]:
     """Undistort photographs one by one, as :func:`undistort` does, without padding."""
     shared = source_grid(lenses[0], like=views.images) if len(set(lenses)) == 1 else None
 
-    def one(index: int) -> tuple[Picture, Mask]:
+    def resample(index: int) -> tuple[Picture, Mask]:
         lens = lenses[index]
         image = views.images[index, :, : lens.height, : lens.width]
         mask = None if views.masks is None else views.masks[index, : lens.height, : lens.width]
@@ -76,43 +76,43 @@ def undistorted(views: Views, lenses: tuple[CameraModel, ...]) -> Iterator[tuple
         radiance = _sampled(image, places).masked_fill_(~inside, 0)
         saturated = image >= SATURATED
         if bool(saturated.any()):
-            touched = _sampled(saturated.to(image), places) > 1e-3  # the rounding of weights
+            touched = _sampled(saturated.to(image), places) > 1e-3  # tolerates rounded weights
             radiance = torch.where(touched & inside, radiance.clamp_min(1), radiance)
         if mask is not None:
             inside = inside & (_sampled(mask[None].to(image), places)[0] > 0.5)
         return radiance, inside
 
-    yield from side_by_side(one, range(views.num_views))
-    release_memory()  # of the photographs, and of their grids
+    yield from side_by_side(resample, range(views.num_views))
+    release_memory()  # of photographs and grids
 
 
 def pinholes_for(lenses: tuple[CameraModel, ...]) -> Float[Tensor, "view 3 3"]:
     """Return ``K`` of each lens's :func:`pinhole_for`, in float64."""
-    found = {lens: pinhole_for(lens) for lens in dict.fromkeys(lenses)}
-    return torch.stack([found[lens] for lens in lenses])
+    pinholes = {lens: pinhole_for(lens) for lens in dict.fromkeys(lenses)}
+    return torch.stack([pinholes[lens] for lens in lenses])
 
 
 def source_grid(
     lens: CameraModel, like: Tensor, width: int = 0, height: int = 0
 ) -> tuple[Places, Mask] | None:
-    """Return where pixels of the pinhole image are in the photograph, and which are in it at all.
+    """Return the positions in the photograph of the pinhole image's pixels, and which are inside.
 
     Args:
-        like: Of the grid's device and type.
+        like: With the grid's device and dtype.
         width: Of a map that covers the photograph, in its own pixels; the photograph's by default.
 
     Returns:
-        Places for ``grid_sample``; nothing for a lens without distortion.
+        Positions for ``grid_sample``; ``None`` for a lens without distortion.
     """
     if lens_models.is_pinhole(lens):
         return None
     width, height = width or lens.width, height or lens.height
     sources = photograph_pixels(lens, width, height).to(like)
     size = sources.new_tensor([width, height])
-    within = ((sources >= 0) & (sources <= size)).all(dim=-1)  # false for NaN
-    # Half a pixel from the edge on, the edge's own pixel continues.
-    sources = torch.where(within[..., None], sources, 0.5).clamp_min(0.5)
-    return grid_from_pixels(torch.minimum(sources, size - 0.5), width, height)[None], within
+    inside = ((sources >= 0) & (sources <= size)).all(dim=-1)  # false for NaN
+    # Within half a pixel of the edge, the edge's pixel is repeated.
+    sources = torch.where(inside[..., None], sources, 0.5).clamp_min(0.5)
+    return grid_from_pixels(torch.minimum(sources, size - 0.5), width, height)[None], inside
 
 
 def _sampled(raster: Picture, grid: Places) -> Picture:
@@ -120,12 +120,11 @@ def _sampled(raster: Picture, grid: Places) -> Picture:
 
 
 def pinhole_for(lens: CameraModel) -> Matrix3:
-    """Choose the pinhole that a photograph is undistorted to; ``K`` in float64.
+    """Choose the pinhole to which a photograph is undistorted; ``K`` in float64.
 
-    It keeps the lens's principal point and, for a lens that bulges (barrel), its focal
-    length: a rim of the photograph is lost, the centre keeps its scale. For a lens that
-    pulls the corners out (pincushion) the focal length grows until no pixel looks past the
-    photograph's edge, but never by more than a quarter.
+    It keeps the lens's principal point and, for barrel distortion, its focal length: a rim of the
+    photograph is lost, the centre keeps its scale. For pincushion distortion the focal length is
+    increased until no pixel is outside the photograph, but at most by a quarter.
     """
     K = lens_models.pinhole_of(lens)
     if lens_models.is_pinhole(lens):
@@ -147,7 +146,7 @@ def pinhole_for(lens: CameraModel) -> Matrix3:
 def photograph_pixels(
     lens: CameraModel, width: int = 0, height: int = 0
 ) -> Float[Tensor, "height width 2"]:
-    """Find where in the photograph each pixel of its pinhole image comes from.
+    """Return the position in the photograph of each pixel of its pinhole image.
 
     Returns:
         In pixels of the map, float64; NaN where the lens cannot image the direction.
@@ -156,13 +155,13 @@ def photograph_pixels(
     K = pinhole_for(lens)
     scale = K.new_tensor([lens.width / width, lens.height / height])
     pixels = pixel_centers(width, height, like=K).reshape(-1, 2)
-    found = torch.empty_like(pixels)
-    parts = torch.split(pixels, 2**17), torch.split(found, 2**17)  # rays take memory
-    for some, into in zip(*parts, strict=True):
-        plane = (some * scale - K[:2, 2]) / K.diagonal()[:2]
+    sources = torch.empty_like(pixels)
+    batches = torch.split(pixels, 2**17), torch.split(sources, 2**17)  # rays need memory
+    for batch, into in zip(*batches, strict=True):
+        plane = (batch * scale - K[:2, 2]) / K.diagonal()[:2]
         rays = torch.cat([plane, torch.ones_like(plane[:, :1])], dim=1)
         into.copy_(lens_models.distort(lens, rays) / scale)
-    return found.reshape(height, width, 2)
+    return sources.reshape(height, width, 2)
 
 
 _VALUES: dict[type[MapPrior], str] = {
@@ -177,18 +176,18 @@ AnyMap = TypeVar("AnyMap", bound=MapPrior)
 
 
 def with_undistorted_priors(scene: SparseScene) -> SparseScene:
-    """Resample the priors of the original photographs as these were undistorted.
+    """Resample priors of the original photographs to the undistorted ones.
 
-    Means of what a pixel touches count by their precision; its variance is theirs and that of the
-    values among them, so that it is large at edges. What looks past the photograph's edge is not
-    known: variance is infinite, and probability one half. Maps keep their sizes. A photograph
-    without distortion keeps its map bit for bit. Differentiable in values and variances.
+    Values are averaged by precision; the variance includes the spread of the averaged values, so it
+    is large at edges. Pixels from outside the photograph are unknown: variance is infinite, and
+    probability one half. Maps keep their sizes. A photograph without distortion keeps its map bit
+    for bit. Differentiable in values and variances.
 
     Args:
-        scene: Where it has no lenses, its photographs came without distortion.
+        scene: Without lenses, its photographs were loaded without distortion.
 
     Returns:
-        With maps of the scene's own views; the scene itself where there is nothing to do.
+        With maps of the scene's own views; the scene itself if nothing needs to be resampled.
     """
     priors = scene.views.priors
     if all(isinstance(prior, LightPrior) or prior.undistorted for prior in priors):
@@ -211,32 +210,32 @@ def _undistorted(prior: AnyMap, lenses: Mapping[str, CameraModel | None]) -> Any
     return type(prior).cat(straight or [prior.take([])]).replace(undistorted=True)
 
 
-def _straight(one: AnyMap, lens: CameraModel | None) -> AnyMap:
-    """Resample one map; the rest of its raster stays as it is."""
-    width, height = one.sizes_px[0].tolist()
-    grid = source_grid(lens, one.sizes_px.double(), width, height) if lens else None
+def _straight(prior: AnyMap, lens: CameraModel | None) -> AnyMap:
+    """Resample one map; the rest of its raster is unchanged."""
+    width, height = prior.sizes_px[0].tolist()
+    grid = source_grid(lens, prior.sizes_px.double(), width, height) if lens else None
     if grid is None:
-        return one
-    field = _VALUES[type(one)]
-    before, is_normals = getattr(one, field), isinstance(one, NormalPrior)
+        return prior
+    field = _VALUES[type(prior)]
+    before, is_normals = getattr(prior, field), isinstance(prior, NormalPrior)
     raster = before.movedim(-1, 1) if is_normals else before.reshape(1, -1, *before.shape[-2:])
     values = raster[..., :height, :width].double()
     changes = {}
-    if isinstance(one, NormalPrior | DepthPrior | AlbedoPrior):
-        known = one.variance[:, :height, :width].double()
-        values, error, spread = _weighted(values, known, *grid)
+    if isinstance(prior, NormalPrior | DepthPrior | AlbedoPrior):
+        variance = prior.variance[:, :height, :width].double()
+        values, error, spread = _weighted(values, variance, *grid)
         values = normalize(values, dim=1) if is_normals else values
         error = error + (spread.sum(dim=1) if is_normals else spread.mean(dim=1))
-        changes["variance"] = _filled(one.variance, error)
+        changes["variance"] = _filled(prior.variance, error)
     else:
-        values = torch.where(grid[1], _sampled(values[0], grid[0])[None], 0.5)  # says nothing
-    found = _filled(raster, values)
-    changes[field] = found.movedim(1, -1) if is_normals else found.reshape(before.shape)
-    return one.replace(**changes)
+        values = torch.where(grid[1], _sampled(values[0], grid[0])[None], 0.5)  # no information
+    after = _filled(raster, values)
+    changes[field] = after.movedim(1, -1) if is_normals else after.reshape(before.shape)
+    return prior.replace(**changes)
 
 
 def _filled(raster: Tensor, values: Tensor) -> Tensor:
-    """Put values into the upper left corner of a copy."""
+    """Return a copy of a raster with values in its upper left corner."""
     after = raster.clone()
     after[..., : values.shape[-2], : values.shape[-1]] = values.to(raster)
     return after
