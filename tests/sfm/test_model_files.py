@@ -100,7 +100,7 @@ SHORT = b"\xff" * 4096, struct.pack("<Q", 2**40), b"", b"\1"
 )
 def test_files_that_are_cut_short_or_none_of_colmaps_are_refused(folder, damage):
     damage(folder)
-    with pytest.raises(InputError, match="cannot be read: truncated or in another format"):
+    with pytest.raises(InputError, match="cannot be read: truncated or malformed"):
         read_model(folder)
 
 

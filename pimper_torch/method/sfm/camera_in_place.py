@@ -76,9 +76,9 @@ def least_squares_map(
     """
     size = first.std().clamp_min(1e-9)
     x, y = (first - centre) / size, (second - centre) / size
-    one, zero = torch.ones_like(x[:, :1]), torch.zeros_like(x[:, :1])
+    ones, zeros = torch.ones_like(x[:, :1]), torch.zeros_like(x[:, :1])
     u, v = x[:, :1], x[:, 1:]
-    linear = [torch.cat([u, -v, one, zero], dim=1), torch.cat([v, u, zero, one], dim=1)]
+    linear = [torch.cat([u, -v, ones, zeros], dim=1), torch.cat([v, u, zeros, ones], dim=1)]
     rows = torch.cat(
         [torch.cat([terms, -y[:, axis, None] * x], dim=1) for axis, terms in enumerate(linear)]
     )

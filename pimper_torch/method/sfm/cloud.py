@@ -26,7 +26,7 @@ def cloud_tracks(views: Views, model: SparseModel) -> SparseModel:
     """Return the model with tracks of its cloud.
 
     A point is expected in the views from which no other point hides it, and is kept where its patch
-    is found: points of another scene or frame are not found anywhere.
+    is found: points of a different scene or frame are not found anywhere.
 
     Args:
         model: Cameras, held fixed, and points without observations.

@@ -71,7 +71,7 @@ def choose_component(
 
     Args:
         spread: Number of views of each that see depth, see :func:`count_spread_views`.
-        min_fraction: Least fraction of the photographs in the chosen component if another one
+        min_fraction: Least fraction of the photographs in the chosen component if a different one
             contains at least 3 views that it lacks.
 
     Returns:
@@ -99,13 +99,13 @@ def choose_component(
             f"static background. {MOVE}"
         )
     rivals = [
-        part
-        for part, depth in zip(components, spread, strict=True)
-        if depth >= FEWEST_VIEWS and len(set(part) - set(chosen)) >= 3
+        group
+        for group, depth in zip(components, spread, strict=True)
+        if depth >= FEWEST_VIEWS and len(set(group) - set(chosen)) >= 3
     ]
     if rivals and len(chosen) < min_fraction * len(names):
         parts = "; ".join(
-            f"{len(part)} photographs ({some(part, most=12)})" for part in (chosen, *rivals)
+            f"{len(group)} photographs ({some(group, most=12)})" for group in (chosen, *rivals)
         )
         raise ReconstructionError(
             f"Structure from motion split {len(names)} photographs into {1 + len(rivals)} models "
@@ -147,7 +147,7 @@ def count_views_with_depth(models: Sequence[SparseModel], fewest: int) -> list[i
 
     Returns:
         As :func:`count_spread_views`, but 0 for a model whose points move as if the camera only
-        rotated, if another model remains.
+        rotated, if other models remain.
     """
     spread = [count_spread_views(model, fewest) for model in models]
     only = len(models) == 1

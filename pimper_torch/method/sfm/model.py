@@ -110,7 +110,7 @@ def select_views(model: SparseModel, chosen: Sequence[int]) -> SparseModel:
 
 
 def drop_weak_views(model: SparseModel, fewest: int) -> SparseModel:
-    """Remove views with too few points for a reliable pose, repeatedly."""
+    """Remove views with too few points for a reliable pose, until all have enough."""
     while model.num_views:
         counts = torch.bincount(model.observation_view, minlength=model.num_views)
         strong = torch.nonzero(counts >= fewest)[:, 0].tolist()

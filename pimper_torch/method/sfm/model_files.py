@@ -86,7 +86,7 @@ def read_model(folder: Path) -> SparseModel:
         images = sorted((_text_images if text else _binary_images)(data[1]), key=itemgetter(0))
         points = sorted((_text_points if text else _binary_points)(data[2]), key=itemgetter(0))
     except (OSError, struct.error, ValueError, LookupError, OverflowError) as error:
-        reason = (isinstance(error, OSError) and error.strerror) or "truncated or in another format"
+        reason = (isinstance(error, OSError) and error.strerror) or "truncated or malformed"
         raise InputError(
             f"The COLMAP model in {folder} cannot be read: {reason}. Export it again with COLMAP's "
             "model_converter, or omit it to run structure from motion."
@@ -153,9 +153,9 @@ def _binary_images(data: bytes) -> Iterator[_Image]:
         end = data.index(b"\0", offset + 64)
         name = data[offset + 64 : end].decode("utf-8", "surrogateescape")
         (features,) = struct.unpack_from("<Q", data, end + 1)
-        seen = np.frombuffer(data, _POINT2D, features, end + 9)
-        yield _Image(image, tuple(pose), camera, name, np.stack([seen["x"], seen["y"]], axis=1))
-        offset = end + 9 + seen.nbytes
+        points = np.frombuffer(data, _POINT2D, features, end + 9)
+        yield _Image(image, tuple(pose), camera, name, np.stack([points["x"], points["y"]], axis=1))
+        offset = end + 9 + points.nbytes
 
 
 def _binary_points(data: bytes) -> Iterator[_Point]:

@@ -204,13 +204,9 @@ def link_sessions(database: Path, settings: ReconstructConfig) -> tuple[matching
             if pair in verified
         }
         verifier = matching.Verifier(matched=matched, settings=settings)
+        sizes = torch.tensor([(camera.width, camera.height) for camera in matched.cameras]).float()
         moved = find_moved_object(
-            matched.keypoints,
-            torch.tensor([(camera.width, camera.height) for camera in matched.cameras]).float(),
-            verified,
-            outside,
-            verifier,
-            settings.max_error_px,
+            matched.keypoints, sizes, verified, outside, verifier, settings.max_error_px
         )
         for pair, rows in moved.tying.items():
             if not torch.equal(rows, verified[pair]):

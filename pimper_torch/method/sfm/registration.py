@@ -85,7 +85,7 @@ def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list
 # 0.99 to 1.00, also with a time stamp in the corner or a zoom in EXIF, and 0.95 if zoomed
 # photographs share a lens; those of a mug that was turned over at most 0.73.
 _MIN_INLIERS = 0.9
-# Least gain in inlier ratio of another hypothesis; a mug that was turned over gains 0.25: a choice.
+# Least gain in inlier ratio of an alternative; a mug that was turned over gains 0.25: a choice.
 _MARGIN = 0.1
 
 
@@ -152,7 +152,7 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     missing or misplaced photographs with all others.
     """
     match_pairs(space, pairs_to_match(space), settings)
-    other = replace(space, database_name="other.db")  # for matches of another hypothesis
+    other = replace(space, database_name="other.db")  # for an alternative hypothesis
     shutil.copyfile(space.database, other.database)
     plain = _registered(space, settings)
     if plain.sound:

@@ -31,8 +31,8 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.progress import track
 
 # Least violating fraction of a detected background. Simulated with 0.2 px of noise: 0.00 in rigid
-# scenes; with a static background 0.2 if the camera is 2 degrees above the table's plane, 0.5 from
-# 10, 0.8 from 25.
+# scenes; with a background 0.2 if the camera is 2 degrees above the table, 0.5 from 10, 0.8 from
+# 25.
 _CONTRADICTION = 0.1
 # Longest static match. In 24 rendered photographs of 640x480, 99 % of the matches of a static
 # background are shorter, and 0.4 % of those of a turning mug.

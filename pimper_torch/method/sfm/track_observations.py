@@ -62,13 +62,13 @@ class Tangents(Record):
 def tangents(points_world: Points, observed: Seen, cameras: Cameras) -> Tangents:
     """Fit a plane at every point, and choose the views in which to search for it."""
     at_once = max(1, 2**22 // cameras.num_views)  # 100 MB of rays
-    points, seen = torch.split(points_world, at_once), torch.split(observed, at_once)
+    points, observers_of = torch.split(points_world, at_once), torch.split(observed, at_once)
     towards = []
-    for batch, observers in zip(points, seen, strict=True):
+    for batch, observers in zip(points, observers_of, strict=True):
         rays = normalize(cameras.centers_world - batch[:, None], dim=-1)
         towards.append(normalize((rays * observers[..., None]).sum(dim=1), dim=-1))
     normals = torch.split(plane_normals(points_world, torch.cat(towards)), at_once)
-    batches = zip(points, seen, normals, strict=True)
+    batches = zip(points, observers_of, normals, strict=True)
     return Tangents.cat([_tangents(*batch, cameras) for batch in batches])
 
 
@@ -276,12 +276,12 @@ def _observed(
 
     views = side_by_side(in_view, range(len(pictures.log)))
     point, view_, pixels = (torch.cat(values) for values in zip(*views, strict=True))
-    found = torch.unique(point)
-    point = torch.cat([point, found])
-    view_ = torch.cat([view_, tangents.reference[found]])
-    camera = cameras.take(tangents.reference[found])
-    own, _ = project(tangents.points_world[found, None], camera.cam_from_world, camera.intrinsics)
-    pixels = torch.cat([pixels, own[:, 0]])
+    ids = torch.unique(point)
+    point = torch.cat([point, ids])
+    view_ = torch.cat([view_, tangents.reference[ids]])
+    camera = cameras.take(tangents.reference[ids])
+    pixel, _ = project(tangents.points_world[ids, None], camera.cam_from_world, camera.intrinsics)
+    pixels = torch.cat([pixels, pixel[:, 0]])
     order = torch.argsort(point * len(pictures.log) + view_)
     return TrackObservations(point=point[order], view=view_[order], pixels=pixels[order])
 

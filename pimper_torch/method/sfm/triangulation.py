@@ -119,7 +119,7 @@ def require_agreement(
     consistent = sum(int(epipolar.inliers(cameras, pair, max_error_px).sum()) for pair in pairs)
     if total < 2 * MIN_MATCHES or consistent >= _RELIABLE * total:
         return
-    found = (
+    finding = (
         f"{consistent / total:.0%} of {total} matches in {len(verified)} pairs of photographs are "
         f"within {max_error_px:g} px of the cameras' epipolar lines and in front of both cameras"
     )
@@ -130,10 +130,10 @@ def require_agreement(
     )
     if consistent < _MIN_AGREEMENT * total:
         raise InputError(
-            f"{where}: these cameras and the photographs do not belong together: {found}; needed: "
-            f"at least {_MIN_AGREEMENT:.0%}. {advice}"
+            f"{where}: these cameras and the photographs do not belong together: {finding}; "
+            f"needed: at least {_MIN_AGREEMENT:.0%}. {advice}"
         )
-    caution(f"{where}: its cameras are unreliable: {found}. {advice}", stacklevel=4)
+    caution(f"{where}: its cameras are unreliable: {finding}. {advice}", stacklevel=4)
 
 
 def _match_along_lines(
@@ -169,18 +169,18 @@ def _match_along_lines(
             if not len(first.pixels) or not len(second.pixels):
                 return torch.zeros(0, 2, dtype=torch.long)
             near = matching.Near(epipolar.epipolar_geometry(cameras, pair), limit)
-            found = matching.guided_matches(first, second, near, settings.max_ratio)
+            rows = matching.guided_matches(first, second, near, settings.max_ratio)
             ends = matching.VerifiedPair(
-                views=pair, first=first.pixels[found[:, 0]], second=second.pixels[found[:, 1]]
+                views=pair, first=first.pixels[rows[:, 0]], second=second.pixels[rows[:, 1]]
             )
-            return found[epipolar.inliers(cameras, ends, limit)]
+            return rows[epipolar.inliers(cameras, ends, limit)]
 
         database.clear_two_view_geometries()
-        for pair, found in zip(pairs, side_by_side(matches, pairs), strict=True):
+        for pair, rows in zip(pairs, side_by_side(matches, pairs), strict=True):
             geometry = loaded().TwoViewGeometry()
             geometry.config = loaded().TwoViewGeometryConfiguration.CALIBRATED
             geometry.F = epipolar.epipolar_geometry(cameras, pair).numpy()
-            geometry.inlier_matches = found.numpy().astype(np.uint32)
+            geometry.inlier_matches = rows.numpy().astype(np.uint32)
             database.write_two_view_geometry(*(image_of[number] for number in pair), geometry)
 
 
@@ -200,10 +200,10 @@ def _triangulated(space: features.Workspace, model: SparseModel, seed: int) -> S
         with pycolmap.Database.open(space.database) as stored:
             for camera in cameras.cameras.values():
                 stored.update_camera(camera)
-        found = pycolmap.triangulate_points(
+        reconstruction = pycolmap.triangulate_points(
             cameras, space.database, space.images, output, True, options
         )
-    return model_of(found)
+    return model_of(reconstruction)
 
 
 def _warn_of_no_points(count: int, where: str) -> None:

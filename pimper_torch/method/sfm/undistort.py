@@ -245,13 +245,13 @@ def _weighted(
     values: _Raster, variance: Float[Tensor, "1 height width"], places: Places, inside: Mask
 ) -> tuple[_Raster, Float[Tensor, "1 height width"], _Raster]:
     """Return means by precision, one over the mean precision, and variances about the means."""
-    known = variance.isfinite()
-    precision = torch.where(known, 1 / torch.where(known, variance, 1), 0)[:, None]
-    values = torch.where(known[:, None], values, 0)
+    valid = variance.isfinite()
+    precision = torch.where(valid, 1 / torch.where(valid, variance, 1), 0)[:, None]
+    values = torch.where(valid[:, None], values, 0)
     stacked = torch.cat([precision, precision * values, precision * values.square()], dim=1)
     sums = _sampled(stacked[0], places)[None]
-    known = inside & (sums[:, :1] > 0)
-    weight = torch.where(known, sums[:, :1], 1)
+    valid = inside & (sums[:, :1] > 0)
+    weight = torch.where(valid, sums[:, :1], 1)
     mean, square = (sums[:, 1:] / weight).chunk(2, dim=1)
-    error = torch.where(known, 1 / weight, torch.inf)[:, 0]
+    error = torch.where(valid, 1 / weight, torch.inf)[:, 0]
     return mean, error, (square - mean.square()).clamp_min(0)

@@ -90,7 +90,7 @@ def soft_masks_of(views: Views, sizes_px: Int[Tensor, "view 2"]) -> SoftMasks | 
             if points_at(inside):
                 seeds[view, :high, :wide] |= small[0, 0] > 0.5 + _NEUTRAL
             else:
-                # 8 bits hold no finer probabilities.
+                # 8-bit maps contain no finer probabilities.
                 odds[view, :high, :wide] += torch.logit(small[0, 0].clamp(1e-3, 1 - 1e-3))
                 given[view] = True
     if not priors:
@@ -271,8 +271,8 @@ def _region(scene: SparseScene, corners: tuple[float, ...]) -> Float[Tensor, "2 
     cameras = scene.cameras
     samples = (box[0] + steps * (box[1] - box[0])).to(cameras.cam_from_world)
     pixels, depth = project(samples, cameras.cam_from_world, cameras.intrinsics)
-    shown = (pixels > 0) & (pixels < cameras.sizes_px[:, None])
-    if not bool(inside.any()) and not bool((shown.all(dim=-1) & (depth > 0)).any()):
+    in_frame = (pixels > 0) & (pixels < cameras.sizes_px[:, None])
+    if not bool(inside.any()) and not bool((in_frame.all(dim=-1) & (depth > 0)).any()):
         around = torch.stack([points.quantile(q, dim=0) for q in (0.05, 0.95)]) + offset
         usual_box = ", ".join(f"{value:.4g}" for value in around.flatten().tolist())
         raise InputError(
@@ -333,5 +333,5 @@ def pixels_of(
     """
     pixels, _ = project(scene.points_world, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px.to(pixels)[:, None]
-    shown = scene.observed.mT if observed else ((pixels > 0) & (pixels < sizes)).all(dim=-1)
-    return tuple(pixels[view, chosen & shown[view]] for view in range(cameras.num_views))
+    visible = scene.observed.mT if observed else ((pixels > 0) & (pixels < sizes)).all(dim=-1)
+    return tuple(pixels[view, chosen & visible[view]] for view in range(cameras.num_views))

@@ -33,7 +33,7 @@ from pimper_torch.runtime.parallel import side_by_side
 # choices.
 _SMALL_PX, _POINTS, _PLACES = 320, 4000, 64
 _FEWEST = 50  # pairs of points and views needed as evidence
-# Most contradiction of another reading, relative to that of the files and absolute; and the
+# Most contradiction of an alternative reading, relative to that of the files and absolute; and the
 # contradiction below which the files are accepted: docs/decisions.md, "Masks that are turned,
 # inverted or of other photographs".
 _CLEARLY, _MOST, _LEAST = 1 / 3, 0.05, 0.0025

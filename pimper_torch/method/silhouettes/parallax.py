@@ -91,10 +91,9 @@ def of_views(work: Callable[[int], Tensor], count: int) -> Tensor:
     return stacked(side_by_side(work, range(count)), count)
 
 
-# A background is static if the shifted photographs correlate with one of them by more than the
-# first number, and agree with it by more than the second on more than the third of the background,
-# all in the median. A turntable in a room has 0.26 and a fraction of 0.58; arcs and orbits have at
-# most 0.5 and 0.05.
+# A background is static if shifted photographs correlate with one of them by more than the first,
+# and agree with it by more than the second on more than the third of the background, in the median.
+# A turntable: 0.26 and 0.58 of the background; arcs and orbits: at most 0.5 and 0.05.
 _ALIKE, _SHOWN, _AT_REST = 0.2, 0.75, 0.25
 
 DISPUTED = 0.5  # agreement where views disagree about the texture of the background
