@@ -211,9 +211,12 @@ def most_similar(first: Features, second: Features, near: Near) -> tuple[Alike, 
     counts = len(first.pixels), len(second.pixels)
     products = [torch.full((count, 2), -1.0) for count in counts]
     best = [torch.full((count,), -1) for count in counts]
-    inputs = (first.pixels, second.pixels, first.descriptors, second.descriptors, near.matrix)
     most_alike(
-        *(x.contiguous().numpy() for x in inputs),
+        first.pixels.contiguous().numpy(),
+        second.pixels.contiguous().numpy(),
+        first.descriptors.contiguous().numpy(),
+        second.descriptors.contiguous().numpy(),
+        near.matrix.contiguous().numpy(),
         near.planar,
         near.max_error_px,
         *(x.numpy() for x in (*products, *best)),

@@ -178,10 +178,10 @@ AnyMap = TypeVar("AnyMap", bound=MapPrior)
 def with_undistorted_priors(scene: SparseScene) -> SparseScene:
     """Resample priors of the original photographs to the undistorted ones.
 
-    Values are averaged by precision; the variance includes the spread of the averaged values, so it
-    is large at edges. Pixels from outside the photograph are unknown: variance is infinite, and
-    probability one half. Maps keep their sizes. A photograph without distortion keeps its map bit
-    for bit. Differentiable in values and variances.
+    Values are averaged by precision. The variance is one over the mean precision plus the spread of
+    the averaged values, so it is large at edges. Pixels from outside the photograph are unknown:
+    variance is infinite, and probability one half. Maps keep their sizes. A photograph without
+    distortion keeps its map bit for bit. Differentiable in values and variances.
 
     Args:
         scene: Without lenses, its photographs were loaded without distortion.
