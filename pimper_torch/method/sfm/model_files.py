@@ -8,7 +8,6 @@ process on broken ones; nothing is allocated for a count before the file has the
 import struct
 from collections.abc import Iterator
 from functools import cache
-from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -83,8 +82,8 @@ def read_model(folder: Path) -> SparseModel:
     try:
         data = [(folder / f"{part}{ending}").read_bytes() for part in _PARTS]
         lenses = {x.camera: x for x in (_text_cameras if text else _binary_cameras)(data[0])}
-        images = sorted((_text_images if text else _binary_images)(data[1]), key=itemgetter(0))
-        points = sorted((_text_points if text else _binary_points)(data[2]), key=itemgetter(0))
+        images = sorted((_text_images if text else _binary_images)(data[1]), key=lambda x: x[0])
+        points = sorted((_text_points if text else _binary_points)(data[2]), key=lambda x: x[0])
     except (OSError, struct.error, ValueError, LookupError, OverflowError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or "truncated or malformed"
         raise InputError(
