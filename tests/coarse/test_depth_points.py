@@ -28,7 +28,7 @@ def test_points_lie_on_the_surface_before_the_views_that_show_them_beside_those_
         scene.views.images, scene.cameras.intrinsics, scene.cameras.cam_from_world, points_world=own
     )
     assert lacks_points(given)
-    with pytest.warns(PimperWarning, match="points were taken from depth maps"):
+    with pytest.warns(PimperWarning, match="points come from depth maps"):
         found = depth_points(given)
     assert not lacks_points(found, FEW_OBSERVED)
     assert torch.equal(found.points_world[:2], own)
@@ -47,7 +47,7 @@ def test_masks_confine_them(scene):
     height, width = scene.views.images.shape[-2:]
     column = torch.arange(width).expand(height, width)
     masks = (column > 0.4 * width).expand(scene.cameras.num_views, -1, -1)
-    with pytest.warns(PimperWarning, match="points were taken"):
+    with pytest.warns(PimperWarning, match="points come"):
         found = depth_points(scene.replace(views=scene.views.replace(masks=masks)))
     assert float(found.observation_pixels[:, 0].min()) > 0.39 * width
 

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.method.coarse.densify import DepthMaps
-from pimper_torch.method.coarse.oriented import denied, fitted_planes
+from pimper_torch.method.coarse.oriented import count_contradictions, fitted_planes
 from pimper_torch.method.coarse.window_matching import MatchingLevel
 
 
@@ -69,7 +69,7 @@ def test_points_are_denied_by_the_views_that_look_through_them():
     )
     # Some outside every picture, some behind cameras.
     points = 3 * torch.randn(5000, 3, generator=generator)
-    found = denied(maps, 1, points)
+    found = count_contradictions(maps, 1, points)
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
     expected = torch.zeros_like(found)
     for view in (0, 2, 3, 4):

@@ -1,4 +1,4 @@
-"""Settings of the coarse surface, and of remeshing between passes."""
+"""Settings of the coarse surface and of remeshing between passes."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,10 +11,10 @@ class CoarseSurfaceConfig:
     """The reference view and the size of the coarse mesh.
 
     Attributes:
-        reference: Name or stem of the frontal photograph; empty chooses it.
-        num_facets: About so many are left after simplification.
-        levels: Resolutions of the depth maps, the longer side of the first about 100 pixels, each
-            other one twice that before.
+        reference: Name or stem of the frontal photograph; empty selects it automatically.
+        num_facets: Approximate number of facets after simplification.
+        levels: Number of resolutions of the depth maps. The longer side of the first has about 100
+            pixels, and each next one twice as many.
     """
 
     reference: str = ""
@@ -27,18 +27,17 @@ class CoarseSurfaceConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemeshConfig:
-    """Which facets are split, and which dropped.
+    """Criteria for splitting and dropping facets.
 
     Attributes:
-        max_departure: Distance, in samples, that nine in ten of a facet's subdivided mesh vertices
-            may lie off its plane.
-        max_spread_deg: Root mean square angle of the surface's normals within a facet.
-        min_samples: A facet with fewer across (side of the equilateral triangle of its area) is
-            never split.
-        max_facets: The worst facets are split first, as long as there are no more than so many
-            afterwards.
-        max_hole: Facets without data stay when neighbours enclose them and they have no more
-            than this fraction of the mesh's area together.
+        max_departure: Largest 90th percentile of the distances, in samples, between a facet's plane
+            and its subdivided mesh vertices. Facets above it are split.
+        max_spread_deg: Largest root mean square angle of the surface's normals within a facet.
+        min_samples: Facets with fewer samples across (side of the equilateral triangle of equal
+            area) are never split.
+        max_facets: The worst facets are split first, up to this number of facets in total.
+        max_hole: Facets without data stay if neighbours enclose them and a connected group has at
+            most this fraction of the mesh's area.
     """
 
     max_departure: Annotated[float, Range(above=0)] = 2.0

@@ -1,4 +1,4 @@
-"""Depth maps of all views from windows that match, coarse to fine."""
+"""Depth maps of all views by window matching, coarse to fine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,43 +27,44 @@ from pimper_torch.runtime.mapped import stacked, zeros
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
 
-# Longer side of the photographs, about, where the whole range of depths is searched.
+# Approximate longer side of the photographs when the full range of depths is searched.
 _COARSEST_PX = 100
 
-# Hypotheses of the search of the whole range, at most.
-_MOST_HYPOTHESES = 160
+# Largest number of depth hypotheses for the full range.
+_MAX_HYPOTHESES = 160
 
-# Views that a view is matched with. A choice.
+# Number of views that a view is matched with. A choice.
 _NUM_SOURCES = 5
 
-# Fraction by which the whole range searched exceeds the points' inverse depths, on either side, as
-# the surface reaches beyond its sparse points.
+# Fraction by which the full range exceeds the points' range of inverse depths on either side: the
+# surface extends beyond its sparse points.
 _RANGE_MARGIN = 0.15
 
-# Angle between rays that match best, the top of a bell curve: below about 5 degrees depth is poorly
+# Best angle between rays, the top of a bell curve: below about 5 degrees depth is poorly
 # determined, above about 25 windows look different.
 _BEST_ANGLE_DEG = 12.0
 
-# Of a valid depth: correlation of its windows; other views that agree, and their reprojection
-# error. Choices: two views seldom agree by chance; a pixel is what the finest step resolves.
+# Requirements for a valid depth: correlation of its windows; number of other views that agree, and
+# their reprojection error. Choices: two views seldom agree by chance; the finest step resolves a
+# pixel.
 _MIN_SCORE, _MIN_AGREEING, _MAX_ERROR_PX = 0.5, 2, 1.0
 
-# Steps between hypotheses, in pixels that they move by in the sources. Choices: correlation of
-# windows has a peak a pixel or two wide. Over the whole range; around a field from the coarser
-# resolution; around the best of either.
-_WHOLE_STEP, _NEAR_STEP, _LAST_STEP = 0.7, 0.8, 0.5
+# Steps between hypotheses, in pixels of the sources: over the full range; around the field from the
+# coarser resolution; around the best of either. Choices: the peak of the correlation of windows is
+# a pixel or two wide.
+_FULL_STEP, _NEAR_STEP, _LAST_STEP = 0.7, 0.8, 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DepthMaps(Record):
-    """Depths of all views at one resolution.
+    """Depth maps of all views at one resolution.
 
     Attributes:
-        factor: Pixels of the photographs along a side of one here.
-        agreed: How many other views agree; 0 where the windows do not match.
-        valid: True where enough of them agree, and the windows match.
-        step: Change of inverse depth that moves a pixel by one in the sources; one a view.
-        sources: The views each was matched with, -1 for none.
+        factor: Reduction of the photographs: their pixels along a side of a pixel here.
+        agreed: Number of other views that agree; 0 where the windows do not match.
+        valid: True where enough of them agree and the windows match.
+        step: Per view, the change of inverse depth that moves a pixel by one in the sources.
+        sources: Views that each view was matched with, padded with -1.
     """
 
     factor: int
@@ -76,7 +77,7 @@ class DepthMaps(Record):
 
 
 def factors(longest_px: int, levels: int) -> tuple[int, ...]:
-    """Return by how much photographs of that size are reduced, the coarsest first."""
+    """Return the reduction factors of photographs of this size, the coarsest first."""
     coarsest = max(1, round(longest_px / _COARSEST_PX))
     return tuple(dict.fromkeys(max(1, coarsest >> rank) for rank in range(levels)))
 
@@ -84,28 +85,28 @@ def factors(longest_px: int, levels: int) -> tuple[int, ...]:
 def depth_maps(
     scene: SparseScene, points: Int[Tensor, " chosen"], levels: int
 ) -> tuple[DepthMaps, ...]:
-    """Search every view's depths: the whole range at low resolution, then near what was found.
+    """Compute depth maps of all views: the full range at low resolution, then near the last depth.
 
     Args:
-        levels: How often the resolution doubles from a longer side of about 100 pixels, that
-            included.
+        levels: Number of resolutions; each doubles the one before, from a longer side of about 100
+            pixels.
 
     Returns:
         The maps of every resolution, the coarsest first.
 
     Source: Schönberger et al., Pixelwise view selection for unstructured multi-view stereo, ECCV
-    2016, for windows, sources and consistency; planes are swept in place of random search.
+    2016, for windows, sources and consistency; planes are swept instead of a random search.
     """
     maps: list[DepthMaps] = []
     chosen = [choose_sources(scene, points, view) for view in range(scene.cameras.num_views)]
     for factor in factors(max(scene.views.images.shape[-2:]), levels):
         level = level_of(scene, factor)
         search = partial(_search, scene, points, level, chosen, maps[-1] if maps else None)
-        # Small results among what threads free would keep their memory from being used again.
+        # Allocated in advance: small results between freed blocks would fragment the memory.
         fields = zeros((2, *level.tone.shape), level.tone.dtype, level.tone.device)
         steps = []
-        for view, (found, score, step) in enumerate(side_by_side(search, range(len(chosen)))):
-            fields[0, view], fields[1, view] = found, score
+        for view, (field, score, step) in enumerate(side_by_side(search, range(len(chosen)))):
+            fields[0, view], fields[1, view] = field, score
             steps.append(step)
         maps.append(_checked(factor, level, fields, steps, chosen))
         release_memory()
@@ -122,66 +123,66 @@ def _search(
 ) -> tuple[Map, Map, float]:
     """Return a view's inverse depths, their scores, and the step that moves a pixel by one."""
     sources = chosen[view]
-    here, cameras = points[scene.observed[points, view]], level.cameras
+    observed, cameras = points[scene.observed[points, view]], level.cameras
     pixels, depth = project(
-        scene.points_world[here], cameras.cam_from_world[view], cameras.intrinsics[view]
+        scene.points_world[observed], cameras.cam_from_world[view], cameras.intrinsics[view]
     )
     within = ((pixels > 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
-    pixels, known = pixels[within], 1 / depth[within]
+    pixels, values = pixels[within], 1 / depth[within]
     blank = torch.zeros_like(level.tone[view])
-    if len(sources) == 0 or len(known) < 3:
+    if len(sources) == 0 or len(values) < 3:
         return blank, blank, 0.0
     pairing = pair(level, view, sources)
     matcher = Matcher(level, pairing)
-    step = step_for_one_pixel(pairing, pixels, known)
+    step = step_for_one_pixel(pairing, pixels, values)
     if before is None:
-        found, _ = _whole_range(matcher, pixels, known, blank, step)
+        field, _ = _full_range(matcher, pixels, values, blank, step)
     else:
         field = filled(before, view)
         field = interpolate(field[None, None], blank.shape, mode="bilinear", align_corners=False)
-        found, _ = _near(matcher, field[0, 0], step)
+        field, _ = _near(matcher, field[0, 0], step)
     offsets = [_LAST_STEP * step * rank for rank in (-2, -1, 0, 1, 2)]
-    median = torch.stack(shifted(found, 1, "replicate")).median(dim=0).values
+    median = torch.stack(shifted(field, 1, "replicate")).median(dim=0).values
     return *sweep(matcher, median, offsets), step
 
 
-def _whole_range(
-    matcher: Matcher, pixels: Pixels, known: Float[Tensor, " point"], blank: Map, step: float
+def _full_range(
+    matcher: Matcher, pixels: Pixels, values: Float[Tensor, " point"], blank: Map, step: float
 ) -> tuple[Map, Map]:
-    """Search planes parallel to the image, then offsets of a smooth surface through the points."""
-    low, high = torch.quantile(known.double(), known.new_tensor([0.01, 0.99]).double()).tolist()
+    """Sweep planes parallel to the image, then offsets of a smooth surface through the points."""
+    low, high = torch.quantile(values.double(), values.new_tensor([0.01, 0.99]).double()).tolist()
     low, high = low - _RANGE_MARGIN * (high - low), high + _RANGE_MARGIN * (high - low)
     low = max(low, 0.1 * high)
-    count = min(_MOST_HYPOTHESES, max(3, round((high - low) / (_WHOLE_STEP * step))))
-    found, score = sweep(matcher, blank, np.linspace(low, high, count).tolist())
-    points = _splatted(pixels, known, blank)
-    along = push_pull(points, points > 0)
+    count = min(_MAX_HYPOTHESES, max(3, round((high - low) / (_FULL_STEP * step))))
+    planes, score = sweep(matcher, blank, np.linspace(low, high, count).tolist())
+    points = _splatted(pixels, values, blank)
+    smooth = push_pull(points, points > 0)
     reach = min(10, count)
-    offsets = [_WHOLE_STEP * step * rank for rank in range(-reach, reach + 1)]
-    return _better(found, score, *sweep(matcher, along, offsets))
+    offsets = [_FULL_STEP * step * rank for rank in range(-reach, reach + 1)]
+    return _better(planes, score, *sweep(matcher, smooth, offsets))
 
 
 def _near(matcher: Matcher, field: Map, step: float) -> tuple[Map, Map]:
-    """Search near a field, and near the larger and smaller depths on either side of its steps."""
+    """Sweep near a field, and near the larger and smaller depths on either side of its steps."""
     offsets = [_NEAR_STEP * step * rank for rank in range(-3, 4)]
-    found, score = sweep(matcher, field, offsets)
-    highest, lowest = (max_pool2d(one[None, None], 5, 1, 2)[0, 0] for one in (field, -field))
+    best, score = sweep(matcher, field, offsets)
+    highest, lowest = (max_pool2d(side[None, None], 5, 1, 2)[0, 0] for side in (field, -field))
     for side in (highest, -lowest):
-        found, score = _better(found, score, *sweep(matcher, side, offsets[2:-2]))
-    return found, score
+        best, score = _better(best, score, *sweep(matcher, side, offsets[2:-2]))
+    return best, score
 
 
-def _better(one: Map, score: Map, other: Map, other_score: Map) -> tuple[Map, Map]:
+def _better(field: Map, score: Map, other: Map, other_score: Map) -> tuple[Map, Map]:
     """Return the field of the higher score at every pixel, and that score."""
-    return torch.where(other_score > score, other, one), torch.maximum(other_score, score)
+    return torch.where(other_score > score, other, field), torch.maximum(other_score, score)
 
 
 def sweep(matcher: Matcher, field: Map, offsets: Sequence[float]) -> tuple[Map, Map]:
-    """Find the best of some evenly spaced offsets of a field at every pixel.
+    """Return the best inverse depth at every pixel among evenly spaced offsets of a field.
 
     Returns:
-        Inverse depth, between the offsets by the parabola through the best and its
-        neighbours, and the best score.
+        Inverse depth, interpolated by the parabola through the best offset and its neighbours, and
+        the best score.
     """
     smallest = torch.finfo(field.dtype).tiny
     scores = matcher.scores(field, offsets)
@@ -192,8 +193,8 @@ def sweep(matcher: Matcher, field: Map, offsets: Sequence[float]) -> tuple[Map, 
     inner = (best > 0) & (best < len(offsets) - 1) & (bend < 0)
     shift = torch.where(inner, (before - after) / (2 * torch.where(inner, bend, -1)), 0)
     spacing = offsets[1] - offsets[0] if len(offsets) > 1 else 0.0
-    at = field.new_tensor(offsets)[best] + spacing * shift.clamp(-0.5, 0.5)
-    return (field + at).clamp_min(smallest), score
+    offset = field.new_tensor(offsets)[best] + spacing * shift.clamp(-0.5, 0.5)
+    return (field + offset).clamp_min(smallest), score
 
 
 def _checked(
@@ -203,11 +204,11 @@ def _checked(
     steps: Sequence[float],
     chosen: Sequence[Int[Tensor, " _"]],
 ) -> DepthMaps:
-    """Find as valid the depths whose windows match and that other views agree with."""
+    """Return depth maps; depths are valid if their windows match and other views agree."""
     inverse_depth, score = fields
     sources = torch.full((len(chosen), _NUM_SOURCES), -1, device=score.device)
-    for view, some in enumerate(chosen):
-        sources[view, : len(some)] = some
+    for view, views in enumerate(chosen):
+        sources[view, : len(views)] = views
     good = (score >= _MIN_SCORE) & level.usable & (inverse_depth > 0)
 
     def counted(view: int) -> Int[Tensor, "height width"]:
@@ -228,54 +229,55 @@ def _checked(
 def agreeing(
     level: MatchingLevel, inverse_depth: Maps, good: Masks, view: int, others: Int[Tensor, " other"]
 ) -> Int[Tensor, "height width"]:
-    """Count the views whose depths agree: there and back ends on the same pixel.
+    """Count the other views whose depths agree: reprojection there and back ends on the same pixel.
 
-    0 where the view's own depth is not good.
+    The count is 0 where the view's own depth is not good.
     """
     height, width = inverse_depth.shape[-2:]
     count = torch.zeros_like(good[view], dtype=torch.long)
     if len(others) == 0:
         return count
-    chosen, known = good[view], inverse_depth[view][good[view]]
-    forth = pair(level, view, others)
-    pixels, ratio = forth.replace(ray=forth.ray[:, :, chosen]).look(known)
+    chosen, values = good[view], inverse_depth[view][good[view]]
+    pairing = pair(level, view, others)
+    pixels, ratio = pairing.replace(ray=pairing.ray[:, :, chosen]).look(values)
     grid = grid_from_pixels(pixels.movedim(1, -1), width, height)
-    there = nearest_pixels(inverse_depth[others], grid)
-    valid = nearest_pixels(good[others].to(there), grid) > 0.5
-    expected = known / ratio.clamp_min(1e-6)
-    # Pixels that an error of inverse depth moves by, to first order, so that rounding to the
-    # source's nearest pixel does not count.
+    measured = nearest_pixels(inverse_depth[others], grid)
+    valid = nearest_pixels(good[others].to(measured), grid) > 0.5
+    expected = values / ratio.clamp_min(1e-6)
+    # Reprojection error to first order in the error of inverse depth: without the rounding to the
+    # source's nearest pixel.
     rotation, shift = pixels_from_pixels(level.cameras, view, others)
     shift = shift.to(pixels)[:, :, None]
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
-    at = torch.einsum("oij,ojp->oip", rotation.to(pixels), homogeneous) + there[:, None] * shift
-    depth = at[:, 2:].clamp_min(1e-6)
-    rate = (shift[:, :2] - at[:, :2] / depth * shift[:, 2:]) / depth
+    back = torch.einsum("oij,ojp->oip", rotation.to(pixels), homogeneous)
+    back = back + measured[:, None] * shift
+    depth = back[:, 2:].clamp_min(1e-6)
+    rate = (shift[:, :2] - back[:, :2] / depth * shift[:, 2:]) / depth
     # The norm over an inner axis takes twenty times as long.
-    error = (there - expected).abs() * torch.hypot(rate[:, 0], rate[:, 1])
+    error = (measured - expected).abs() * torch.hypot(rate[:, 0], rate[:, 1])
     count[chosen] = (valid & (ratio > 0) & (error <= _MAX_ERROR_PX)).sum(dim=0)
     return count
 
 
 def filled(maps: DepthMaps, view: int) -> Map:
-    """Fill a view's inverse depths where they are not valid.
+    """Return a view's inverse depths, filled where they are not valid.
 
     First by the nearest of its sources' points, then smoothly from the neighbours.
     """
-    field, known = maps.inverse_depth[view], maps.valid[view]
+    field, valid = maps.inverse_depth[view], maps.valid[view]
     sources = maps.sources[view]
-    splat, one = torch.zeros_like(field), torch.tensor([view], device=field.device)
+    splat, index = torch.zeros_like(field), torch.tensor([view], device=field.device)
     for source in sources[sources >= 0].tolist():
-        pixels, ratio = pair(maps.level, source, one).look(maps.inverse_depth[source])
+        pixels, ratio = pair(maps.level, source, index).look(maps.inverse_depth[source])
         chosen = maps.valid[source] & (ratio[0] > 0)
         value = (maps.inverse_depth[source] / ratio[0].clamp_min(1e-6))[chosen]
         splat = torch.maximum(splat, _splatted(pixels[0][:, chosen].mT, value, field))
-    field = torch.where(known, field, splat)
-    return push_pull(field, known | (splat > 0))
+    field = torch.where(valid, field, splat)
+    return push_pull(field, valid | (splat > 0))
 
 
 def _splatted(pixels: Pixels, values: Float[Tensor, " point"], like: Map) -> Map:
-    """Draw the inverse depths of points: the nearest of each pixel, 0 for none."""
+    """Return a map of inverse depths of the points: the nearest in each pixel, 0 without any."""
     height, width = like.shape
     column, row = pixels.floor().long().unbind(dim=1)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
@@ -285,7 +287,7 @@ def _splatted(pixels: Pixels, values: Float[Tensor, " point"], like: Map) -> Map
 
 
 def push_pull(values: Map, known: Mask) -> Map:
-    """Fill holes smoothly from a pyramid of averages; known values stay.
+    """Return values with holes filled smoothly from a pyramid of averages; known values stay.
 
     Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.3.
     """
@@ -302,21 +304,21 @@ def push_pull(values: Map, known: Mask) -> Map:
 def nearest_pixels(
     maps: Float[Tensor, "other height width"], grid: Float[Tensor, "other point 2"]
 ) -> Float[Tensor, "other point"]:
-    """Look maps up in the pixel that each place lies in."""
+    """Return the maps' values in the pixels that contain the grid positions."""
     return grid_sample(maps[:, None], grid[:, None], mode="nearest", align_corners=False)[:, 0, 0]
 
 
 def choose_sources(
     scene: SparseScene, points: Int[Tensor, " chosen"], view: int
 ) -> Int[Tensor, " source"]:
-    """Choose the views to match a view with by shared points and the angles at them.
+    """Return the views to match a view with, by shared points and the angles at them.
 
     Returns:
-        The best five first; fewer if the others share nothing.
+        At most five views that share points, the best first.
     """
     observed = scene.observed[points]
-    here = observed[:, view]
-    points_world, shared = scene.points_world[points[here]], observed[here]
+    own = observed[:, view]
+    points_world, shared = scene.points_world[points[own]], observed[own]
     rays = normalize(points_world[:, None] - scene.cameras.centers_world, dim=-1)
     angle = torch.rad2deg((rays * rays[:, view, None]).sum(dim=-1).clamp(-1, 1).acos())
     away = angle - _BEST_ANGLE_DEG
@@ -332,13 +334,13 @@ def step_for_one_pixel(
 ) -> float:
     """Return the change of inverse depth that moves points by one pixel in the sources.
 
-    The median over points and sources: cameras around an object have about the same base.
+    The median over points and sources: cameras around an object have about the same baseline.
     """
     height, width = pairing.ray.shape[-2:]
     column = pixels[:, 0].long().clamp(0, width - 1)
     row = pixels[:, 1].long().clamp(0, height - 1)
-    there = pairing.replace(ray=pairing.ray[:, :, row, column])
+    at_points = pairing.replace(ray=pairing.ray[:, :, row, column])
     change = 0.01 * inverse_depth.median()
-    before, after = (there.look(inverse_depth + sign * change)[0] for sign in (-1, 1))
+    before, after = (at_points.look(inverse_depth + sign * change)[0] for sign in (-1, 1))
     moved = (after - before).norm(dim=1).median()
     return float(2 * change / moved.clamp_min(1e-6))

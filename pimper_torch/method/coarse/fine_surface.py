@@ -1,4 +1,4 @@
-"""The coarse surface: points where there is texture, contours at silhouettes, smooth between."""
+"""The coarse surface: through points and contours, smooth between them."""
 
 import math
 from dataclasses import dataclass
@@ -30,13 +30,12 @@ from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view, each, zeros
 
-# Lengths in pixels are those of the finest depth maps, at the cloud's median depth. Choices,
-# those of the surface through points and contours (rims) that benchmarks/README.md measures: how
-# far points and surface may lie outside the visual hull; how near a face is to the points or
-# contour points that support it.
+# In pixels of the finest depth maps, at the cloud's median depth. Largest distance of points and
+# surface outside the visual hull; largest distance of a face to the points or contour points that
+# support it. Choices of the surface through points and contours (rims) in benchmarks/README.md.
 TOLERANCE_PX, REACH_PX = 4.0, 4.0
 
-# Barycentric coordinates, times 6, of the points of a facet that vote for its support.
+# Barycentric coordinates, times 6, of the points in a facet that vote for its support.
 _VOTES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
 
 
@@ -45,8 +44,8 @@ class FineSurface(Record):
     """The surface before it is simplified to facets.
 
     Attributes:
-        support: Of each, a value of :class:`~pimper_torch.records.Support`.
-        pixel: Size of a pixel of the finest depth maps there, scene units.
+        support: Value of :class:`~pimper_torch.records.Support` of each face.
+        pixel: Size of a pixel of the finest depth maps on the surface, scene units.
     """
 
     vertices_world: Vertices
@@ -55,13 +54,13 @@ class FineSurface(Record):
     pixel: float
 
     def support_of(self, corners: Float[Tensor, "facet 3 3"]) -> Int[Tensor, " facet"]:
-        """Assign facets the support that this surface has nearest to most of their points."""
+        """Return the support of each facet: the most frequent of the faces nearest to it."""
         centre = self.vertices_world[self.faces].mean(dim=1)
         points = torch.einsum("pk,fkc->fpc", corners.new_tensor(_VOTES) / 6, corners)
         tree = cKDTree(centre.detach().cpu().numpy())
         _, nearest = tree.query(points.flatten(0, 1).detach().cpu().numpy())
-        found = self.support[torch.from_numpy(nearest).to(self.support.device)]
-        return found.reshape(len(corners), len(_VOTES)).mode(dim=1).values
+        votes = self.support[torch.from_numpy(nearest).to(self.support.device)]
+        return votes.reshape(len(corners), len(_VOTES)).mode(dim=1).values
 
 
 def fine_surface(
@@ -71,35 +70,35 @@ def fine_surface(
     levels: int,
     more: OrientedPoints | None = None,
 ) -> FineSurface:
-    """Put a surface through matched points and contours, smooth where there are neither.
+    """Compute a surface through matched points and contours, smooth where there are neither.
 
-    It is closed except where no view sees it, and where views look into an opening. Where
-    silhouettes constrain nothing, faces without points have to be near to some, and
-    illuminated in two views.
+    It is closed except where no view sees it, and where views look into an opening. If the
+    silhouettes constrain nothing, faces without points must be near points and illuminated in
+    two views.
 
     Args:
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
         contours: Rays and visual hull of the silhouettes.
-        levels: Resolutions of the depth maps.
+        levels: Number of resolutions of the depth maps.
         more: See :class:`~pimper_torch.method.coarse.surface.CoarseSurface`.
 
     Raises:
         ReconstructionError: Silhouettes and photographs support no surface.
     """
-    part = cropped(scene, contours.silhouettes)
+    crop = cropped(scene, contours.silhouettes)
     centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
     cloud, maps = oriented.no_points(centre), None
     if len(reliable) >= 16 or not contours.confine:
-        found, maps, pixel = oriented.matched_cloud(part, reliable, levels)
-        near = contours.hull.depth_of(found.points_world) > -TOLERANCE_PX * pixel
-        leave_out("coarse.matched", ~near, at=found.points_world)
-        cloud = found.take(near)
+        matched, maps, pixel = oriented.matched_cloud(crop, reliable, levels)
+        near = contours.hull.depth_of(matched.points_world) > -TOLERANCE_PX * pixel
+        leave_out("coarse.matched", ~near, at=matched.points_world)
+        cloud = matched.take(near)
         level = maps.level
     else:
-        factor = factors(max(part.views.images.shape[-2:]), levels)[-1]
+        factor = factors(max(crop.views.images.shape[-2:]), levels)[-1]
         distance = (scene.cameras.centers_world - centre).norm(dim=1)
         pixel = factor * float((distance / scene.cameras.intrinsics[:, 0, 0]).median())
-        level = level_of(part, factor)
+        level = level_of(crop, factor)
     if more is not None:
         cloud = OrientedPoints.cat([cloud, oriented.thinned(more, pixel)])
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
@@ -113,14 +112,14 @@ def fine_surface(
         near = trim.near_points(faces, centres, cloud, support, counts, pixel)
         leave_out("coarse.far", inside & ~near, at=centres)
         inside &= near
-    # Points from light cover all of the visible surface: a piece without any is in the air.
+    # Points from light cover all of the visible surface: components without any float in the air.
     least = Support.CONTOUR if more is None else Support.POINTS
     fraction = trim.min_fraction(contours)
     kept = trim.seen_surface(vertices, faces, support, counts, inside, pixel, fraction, least)
     if not bool(kept.any()):
         raise ReconstructionError(
-            f"coarse mesh: none of {len(faces)} faces is seen by the photographs inside the "
-            "silhouettes. Look at the masks, leave them out, or give a mesh of your own."
+            f"coarse mesh: no photograph sees any of {len(faces)} faces inside the silhouettes. "
+            "Check the masks, omit them, or give a mesh."
         )
     used, faces = torch.unique(faces[kept], return_inverse=True)
     return FineSurface(
@@ -131,17 +130,17 @@ def fine_surface(
 def closed_surface(
     cloud: OrientedPoints, contours: Contours, pixel: float
 ) -> tuple[Vertices, Faces, ContourPoints]:
-    """Put a closed surface through points, tangent to the rays through the silhouettes.
+    """Compute a closed surface through points, tangent to the rays through the silhouettes.
 
-    Where each ray touches it follows from the surface, and the surface from where rays touch
-    it: they are found in turn, from the points on. Parts that no camera sees do not count:
-    behind an object seen from one side the hull is deep, and the surface fills it.
+    Contour points follow from the surface, and the surface from the contour points: they are
+    computed in turn, starting from the points. Surface that no camera sees is ignored, because
+    the surface fills the deep hull behind an object seen from one side.
 
     Returns:
-        Vertices, faces, and the contour points that the surface goes through.
+        Vertices, faces, and the contour points on the surface.
     """
     points, normals = cloud.points_world, cloud.normals_world
-    # The first time on the points, then each time on the surface before.
+    # Contour points are first near the points, then near the surface of the previous iteration.
     for _ in range(3):
         touched = contours.touching(points, normals)
         contour = OrientedPoints(
@@ -153,10 +152,9 @@ def closed_surface(
             raise ReconstructionError(
                 f"coarse mesh: {len(cloud.points_world)} points were matched inside the "
                 f"silhouettes, and {len(touched.ray)} rays touch the surface there; some hundreds "
-                "are needed. Take photographs that overlap more, look at the masks, or give a "
-                "mesh of your own."
+                "are needed. Take photographs that overlap more, check the masks, or give a mesh."
             )
-        # Points are denser than contours: without these an octree's cell is two of their grid's.
+        # Points are denser than contours: without contours, an octree cell is two of their cells.
         cell = (trim.CELL_PX if len(touched.ray) else 2.0) * pixel
         vertices, faces = poisson(OrientedPoints.cat([cloud, contour]), cell)
         if not len(touched.ray):
@@ -166,23 +164,23 @@ def closed_surface(
         for center in contours.cameras.centers_world.to(vertices):
             towards = normalize(center - vertices, dim=1)
             facing = ((towards * normals).sum(dim=1) > 0.1) & ~front
-            # Surface in front of a vertex occludes it only from a cell away.
+            # Surface less than a cell in front of a vertex does not occlude it.
             front[facing] = ~caster.occluded(vertices[facing], center, trim.CELL_PX * pixel)
         points, normals = vertices[front], normals[front]
     return vertices, faces, touched
 
 
 def poisson(cloud: OrientedPoints, cell: float) -> tuple[Vertices, Faces]:
-    """Put a closed surface through points with outward normals.
+    """Return vertices and faces of a closed surface through points with outward normals.
 
     Args:
         cell: Side of the octree's cells, scene units.
     """
     points = cloud.points_world
-    # COLMAP works in single precision: a cloud far from the origin is brought there.
+    # COLMAP works in single precision: the cloud is moved to the origin.
     centre = points.median(dim=0).values
     extent = float((points.amax(dim=0) - points.amin(dim=0)).max())
-    # 1024 cells along a side bound the octree's memory.
+    # At most 1024 cells along a side, which bounds the octree's memory.
     depth = min(10, round(math.log2(extent / cell)))
     vertices, faces = poisson_surface(
         points - centre, cloud.normals_world, depth=depth, point_weight=1.0
@@ -191,16 +189,16 @@ def poisson(cloud: OrientedPoints, cell: float) -> tuple[Vertices, Faces]:
 
 
 def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
-    """Cut every photograph to its silhouette's bounding box, and mask it and what hides it.
+    """Return the scene cropped to the silhouettes, with them and occluders as masks.
 
-    The photographs share one raster: the largest box's. Views without a silhouette keep their
-    left upper corner, masked. Cameras follow; priors are left out, as their maps cover whole
-    photographs; observations keep their pixels, which are those of the photographs before
-    undistortion.
+    The images share one size, that of the largest bounding box. Views without a silhouette keep
+    their upper left corner, masked. Cameras are adjusted. Priors are removed, because their maps
+    cover the full photographs. Observations keep their pixels, which are those of the photographs
+    before undistortion.
 
     Args:
-        silhouettes: Of all views; unreliable ones mask their photographs too. Silhouettes that
-            constrain nothing give the scene as it is.
+        silhouettes: Of all views; unreliable ones mask their photographs, too. If they constrain
+            nothing, the scene is returned unchanged.
     """
     if silhouettes.source == "everything":
         return scene
@@ -213,7 +211,7 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
         (*views.images.shape[:2], height, width), views.images.dtype, views.images.device
     )
     shown = zeros((views.num_views, height, width), torch.bool, images.device)
-    leave_out("coarse.cropping", by_view(lambda one, mask: one & ~mask, views.inside, masks))
+    leave_out("coarse.cropping", by_view(lambda inside, mask: inside & ~mask, views.inside, masks))
     intrinsics = scene.cameras.intrinsics.clone()
     for view, (image, mask) in enumerate(each(views.images, masks)):
         (left, top), (w, h) = low[view].tolist(), size[view].tolist()
@@ -228,7 +226,7 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
 
 
 def _boxes(silhouettes: Silhouettes, sizes_px: Int[Tensor, "view 2"]) -> Int[Tensor, "view 2 2"]:
-    """Return the corners of boxes round the silhouettes, first inside, then outside."""
+    """Return the corners of the silhouettes' bounding boxes: inclusive, then exclusive."""
     masks = silhouettes.masks
     ends = []
     for axis in range(2):  # columns, then rows

@@ -1,4 +1,4 @@
-"""A mesh that the user gives, prepared for the chain."""
+"""Preparation of a mesh that the user provides."""
 
 import numpy as np
 import torch
@@ -18,79 +18,78 @@ from pimper_torch.runtime.errors import InputError, caution
 def prepared(
     mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes
 ) -> tuple[Mesh, dict[str, int | float]]:
-    """Weld a mesh, drop faces that are none, and compare it with the scene.
+    """Weld a mesh, remove degenerate and duplicate faces, and compare it with the scene.
 
     Returns:
-        The mesh, of the scene's floating-point type and device, and figures of how far off it is.
-        Warns of what was dropped, and of a mesh that is off.
+        The mesh, of the scene's floating-point type and device, and measures of its deviation from
+        the scene. Warns of removed faces, and of a mesh that deviates.
     """
-    found, dropped = cleaned(mesh.to(scene.points_world.device))
-    if dropped:
-        caution(f"Of the given mesh's {len(mesh.faces)} faces {dropped} were left out.")
-    figures = compare_with_scene(found, scene, silhouettes)  # in the precision that it came in
-    found = found.replace(vertices_world=found.vertices_world.to(scene.cameras.cam_from_world))
-    return found, {"faces": len(found.faces), **figures}
+    clean, removed = cleaned(mesh.to(scene.points_world.device))
+    if removed:
+        caution(f"Removed from the given mesh of {len(mesh.faces)} faces: {removed}.")
+    figures = compare_with_scene(clean, scene, silhouettes)  # in the precision of the mesh
+    clean = clean.replace(vertices_world=clean.vertices_world.to(scene.cameras.cam_from_world))
+    return clean, {"faces": len(clean.faces), **figures}
 
 
 def cleaned(mesh: Mesh) -> tuple[Mesh, str]:
-    """Weld vertices at the same place; drop faces without area and those that stand twice.
+    """Weld coincident vertices; remove faces without area and duplicate faces.
 
     Returns:
-        Its surface, and how many of which faces were dropped, in words.
+        The mesh, and the numbers of removed faces, in words; empty if none was.
     """
     vertices, faces = welded(mesh.vertices_world.detach(), mesh.faces)
     if len(faces) == 0:
         raise InputError(
             f"coarse mesh: the given mesh has {len(mesh.vertices_world)} vertices and no faces; "
-            "needed: triangles. Make a mesh of the cloud first, or leave it out."
+            "needed: triangles. Convert the point cloud to a mesh, or omit it."
         )
     longest = side_lengths(vertices[faces]).amax(dim=1)
     area = face_normals(vertices, faces).norm(dim=-1)
-    # Single precision does not tell the normal of a lower face.
+    # Single precision does not determine the normal of a flatter face.
     flat = ~(area > 1e-6 * longest.square())
     if bool(flat.all()):
         raise InputError(
             f"coarse mesh: none of the given mesh's {len(faces)} faces has an area; needed: a "
-            "surface. Look at the file, and export it again."
+            "surface. Check the file, and export it again."
         )
     faces = faces[~flat]
     first = first_of_each(faces.sort(dim=1).values)
-    twice = len(faces) - len(first)
-    counts = ((int(flat.sum()), "without area"), (twice, "that stand twice"))
+    counts = ((int(flat.sum()), "without area"), (len(faces) - len(first), "duplicated"))
     used, faces = torch.unique(faces[first], return_inverse=True)
-    dropped = " and ".join(f"{count} {what}" for count, what in counts if count)
-    return Mesh(vertices_world=vertices[used], faces=faces), dropped
+    removed = ", ".join(f"{count} {kind}" for count, kind in counts if count)
+    return Mesh(vertices_world=vertices[used], faces=faces), removed
 
 
 def oriented_outward(mesh: Mesh, cameras: Cameras) -> tuple[Vertices, Faces]:
-    """Wind the faces of a mesh consistently, with the front of each component to the cameras.
+    """Return the vertices and consistently wound faces, each component's front to the cameras.
 
-    Vertices at the same place become one first, see :func:`cleaned`.
+    Coincident vertices are welded first, see :func:`cleaned`.
 
     Args:
-        mesh: World frame; files give it in double precision.
-        cameras: They see it; the result has their floating-point type and device.
+        mesh: World frame; double precision if read from a file.
+        cameras: They see the mesh. The result has their floating-point type and device.
     """
     like = cameras.cam_from_world
-    found, _ = cleaned(mesh.to(like.device, like.dtype))
-    vertices, faces = found.vertices_world, found.faces
+    clean, _ = cleaned(mesh.to(like.device, like.dtype))
+    vertices, faces = clean.vertices_world, clean.faces
     import trimesh
 
-    plain = trimesh.Trimesh(
+    wound = trimesh.Trimesh(
         vertices.cpu().double().numpy(), faces.cpu().numpy(), process=False, validate=False
     )
-    trimesh.repair.fix_winding(plain)
-    faces = torch.from_numpy(np.array(plain.faces, dtype=np.int64)).to(faces.device)
+    trimesh.repair.fix_winding(wound)
+    faces = torch.from_numpy(np.array(wound.faces, dtype=np.int64)).to(faces.device)
     return vertices, _fronts_outward(vertices, faces, cameras)
 
 
 def _fronts_outward(vertices: Vertices, faces: Faces, cameras: Cameras) -> Faces:
-    """Flip components of which the cameras see more back than front."""
+    """Return the faces, with components flipped of which the cameras see more back than front."""
     caster, normals = RayCaster(vertices, faces), face_normals(vertices, faces)
     balance, num_hits = torch.zeros_like(normals[:, 0]), 0
     for view in range(cameras.num_views):
         width, height = (int(side) for side in cameras.sizes_px[view])
-        # Some 20,000 rays see every component that is not smaller than a hundredth.
+        # Some 20,000 rays hit every component larger than a hundredth of the object.
         stride = max(1, max(width, height) // 160)
         pixels = pixel_centers(width, height, like=vertices)[::stride, ::stride].reshape(-1, 2)
         intrinsics, frame = cameras.intrinsics[view], cameras.cam_from_world[view]
@@ -102,8 +101,8 @@ def _fronts_outward(vertices: Vertices, faces: Faces, cameras: Cameras) -> Faces
         balance = balance.index_add(0, face[hit], towards)
     if not num_hits:
         raise InputError(
-            "coarse mesh: no photograph shows the given mesh. It has to be in the frame and the "
-            "unit of the cameras; align it with the sparse model first."
+            "coarse mesh: no photograph shows the given mesh. It must be in the frame and unit of "
+            "the cameras: align it with the sparse model first."
         )
     component = face_components(faces)
     total = torch.zeros_like(balance).index_add(0, component, balance)[component]

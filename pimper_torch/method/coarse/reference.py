@@ -1,14 +1,14 @@
-"""The reference view: the frontal one, or the one that a setting names."""
+"""The reference view: the frontal one, or the one given by name."""
 
 from pimper_torch.records import SparseScene
 from pimper_torch.runtime.file_names import view_named
 
 
 def reference_view(scene: SparseScene, name: str = "") -> int:
-    """Choose the view that shares the most points with the others, or find one by name.
+    """Return the view that shares the most points with the others, or the one with a name.
 
-    Each other view counts with the square root of the number of points shared, so that many
-    views at the side weigh more than one close twin.
+    Each other view counts with the square root of the number of shared points, so that many views
+    on the sides have more weight than one nearly identical view.
     """
     if not name:
         observed = scene.observed.to(scene.points_world.dtype)

@@ -1,4 +1,4 @@
-"""Remeshing: facets that the surface departs from are split, unseen ones dropped."""
+"""Remeshing: facets that deviate from the surface are split, and those without data dropped."""
 
 from bisect import bisect_right
 
@@ -19,37 +19,37 @@ from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
-# Barycentric coordinate below which a subdivided mesh vertex lies on an edge: subdivided meshes
-# have far fewer than a million parts.
+# Barycentric coordinate below which a subdivided mesh vertex is on an edge: edges have far fewer
+# than a million parts.
 _ON_EDGE = 1e-6
 
-# A facet whose corners would move stays where its area falls below this fraction, or its longest
-# side grows so many times: it collapses, or has an outlier for a corner. Choices.
+# The corners of a facet do not move if its area would shrink below this fraction, or its longest
+# side grow by this factor: the facet collapses, or a corner is an outlier. Choices.
 _MIN_AREA, _MAX_STRETCH = 0.05, 4.0
 
 
 class Remesh(Stage):
-    """Fit the coarse mesh to a surface. See :func:`remesh`."""
+    """Fit the coarse mesh to a surface; see :func:`remesh`."""
 
     def __init__(self, config: RemeshConfig | None = None) -> None:
         super().__init__()
         self.config = config or RemeshConfig()
 
     def forward(self, swept: SweptPatches, surface: Surface, contours: Contours) -> CoarseMesh:
-        """Remesh the patches' coarse mesh to the surface that was reconstructed on it.
+        """Return the patches' coarse mesh fitted to the surface that was reconstructed on it.
 
-        Lengths count in samples of these patches; the residual is their photometry's. Inside a
-        visual hull all facets stay, seen or not: the coarse surface is closed as far as it should
-        be. Without a hull a facet that two views see has data, illuminated or not.
+        Lengths are in sample spacings of these patches. Inside a visual hull all facets stay, seen
+        or not, because the coarse surface is already trimmed. Without a hull, a facet has data if
+        two views see it, lit or not.
         """
         patches = swept.patches
         residual = surface.information.new_full((patches.num_patches,), torch.nan)
         seen = torch.full_like(residual, contours.confine, dtype=torch.bool)
-        for templates, found, heights in zip(
+        for templates, solution, heights in zip(
             patches.buckets, swept.photometric.buckets, swept.buckets, strict=True
         ):
-            known = torch.where(found.determined, found.convergence.residual, torch.nan)
-            residual[templates.facet] = known.detach().to(residual)
+            values = torch.where(solution.determined, solution.convergence.residual, torch.nan)
+            residual[templates.facet] = values.detach().to(residual)
             seen[templates.facet] |= heights.num_views >= 2
         return remesh(
             patches.coarse,
@@ -72,34 +72,33 @@ def remesh(
 ) -> CoarseMesh:
     """Fit the coarse mesh to the surface that was reconstructed on it.
 
-    Every facet is split in four at most, neighbours are cut so that the mesh stays conforming
+    Every facet is split into at most four, neighbours are cut so that the mesh stays conforming
     (see :mod:`~pimper_torch.method.coarse.splitting`), and all vertices, old and new, move onto the
-    surface. Where that would fold, flatten or stretch a facet, its vertices stay on the old
-    mesh.
+    surface. If this would fold, flatten or stretch a facet, its vertices stay on the old mesh.
 
     Args:
-        coarse: The facets that ``surface`` is the subdivided mesh of.
-        surface: Subdivided mesh vertices on shared edges shared.
-        spacing: Of the samples that the next templates will have, scene units: the unit of the
-            settings.
-        residual: Of the photometry, one a facet, in any unit; NaN for none.
-        seen: True for facets that have data even where the surface has no support.
+        coarse: Facets that ``surface`` subdivides.
+        surface: Subdivided mesh; facets share its vertices on their common edges.
+        spacing: Sample spacing of the next templates, scene units: the unit of the settings.
+        residual: Photometric residual of each facet, in any unit; NaN for none.
+        seen: True for facets that have data even if the surface has no support there.
 
     Returns:
-        The new mesh. Its normals are the piecewise linear fit to the surface's; points of the
-        cloud follow :func:`~pimper_torch.method.coarse.splitting.with_points`. Unused vertices are
-        dropped, and parts of the mesh that met in a vertex alone have a copy of it each.
+        The new mesh. Its normals are the piecewise linear fit to the surface's; for points of the
+        cloud see :func:`~pimper_torch.method.coarse.splitting.with_points`. Unused vertices are
+        dropped, and parts of the mesh that are joined only at a vertex get a copy of it each.
 
-    A surface without support anywhere drops no facet. Vertices and normals are differentiable in
-    the surface's and the old mesh's; which facets are split, dropped or moved is constant.
+    If the surface has no support at all, no facet is dropped. Vertices and normals are
+    differentiable in those of the surface and the old mesh. Which facets are split, dropped or
+    moved is constant.
     """
     config = config or RemeshConfig()
     old, faces = coarse.mesh.vertices_world, coarse.mesh.faces
-    found = int(surface.facet.max()) + 1 if len(surface.facet) else 0
-    if found == 0 or found > len(faces):
+    count = int(surface.facet.max()) + 1 if len(surface.facet) else 0
+    if count == 0 or count > len(faces):
         raise InputError(
-            f"remesh: the surface is on {found} facets, the coarse mesh has {len(faces)}; needed: "
-            "the surface that was made on this mesh. Give the two of the same round."
+            f"remesh: the surface is on {count} facets, but the coarse mesh has {len(faces)}; "
+            "needed: the surface reconstructed on this mesh. Give both from the same pass."
         )
     edges, face_edge = face_edges(faces)
     corners, centres = _on_surface(old, faces, edges, face_edge, surface)
@@ -113,7 +112,7 @@ def remesh(
             typical = residual.nanmedian()
             relative = residual / torch.where(typical > 0, typical, torch.inf) / 3.0
             severity = torch.maximum(severity, relative.nan_to_num(nan=0.0).to(severity))
-        # Of the equilateral triangle of each facet's area.
+        # Side of the equilateral triangle of each facet's area.
         side = (2 / 3**0.5 * face_normals(corners, faces).norm(dim=1)).sqrt() / spacing
         small = (side < config.min_samples) | ~kept
         marked = _worst_first(old, faces, severity, small, kept, config.max_facets)
@@ -133,25 +132,25 @@ def remesh(
 def _on_surface(
     vertices: Vertices, faces: Faces, edges: Edges, face_edge: Faces, surface: Surface
 ) -> tuple[Vertices, Float[Tensor, "edge 3"]]:
-    """Find vertices and midpoints of edges on the surface; these interpolate along the edge."""
+    """Return positions on the surface of the vertices and, interpolated, the edges' midpoints."""
     zeros = surface.barycentric < _ON_EDGE
     count = zeros.sum(dim=1)
-    (at,) = torch.nonzero(count == 2, as_tuple=True)
-    corner = surface.barycentric[at].argmax(dim=1, keepdim=True)
-    name = faces[surface.facet[at]].gather(1, corner)[:, 0]
+    (at_corner,) = torch.nonzero(count == 2, as_tuple=True)
+    corner = surface.barycentric[at_corner].argmax(dim=1, keepdim=True)
+    vertex = faces[surface.facet[at_corner]].gather(1, corner)[:, 0]
     moved = vertices.clone()
-    moved[name] = surface.vertices_world[at].to(moved)
+    moved[vertex] = surface.vertices_world[at_corner].to(moved)
 
-    (on,) = torch.nonzero(count == 1, as_tuple=True)
-    facet, opposite = surface.facet[on], zeros[on].long().argmax(dim=1, keepdim=True)
+    (on_edge,) = torch.nonzero(count == 1, as_tuple=True)
+    facet, opposite = surface.facet[on_edge], zeros[on_edge].long().argmax(dim=1, keepdim=True)
     edge = face_edge[facet].gather(1, opposite)[:, 0]
     far_slot = (faces[facet] == edges[edge, 1, None]).long().argmax(dim=1, keepdim=True)
-    along = surface.barycentric[on].gather(1, far_slot)[:, 0]
+    along = surface.barycentric[on_edge].gather(1, far_slot)[:, 0]
     below, above = along <= 0.5, along >= 0.5
     low = along.new_zeros(len(edges)).scatter_reduce(0, edge[below], along[below], "amax")
     high = along.new_ones(len(edges)).scatter_reduce(0, edge[above], along[above], "amin")
     start, end = moved[edges[:, 0]], moved[edges[:, 1]]
-    cut = surface.vertices_world[on].to(moved)
+    cut = surface.vertices_world[on_edge].to(moved)
     first, last = below & (along == low[edge]), above & (along == high[edge])
     start[edge[first]], end[edge[last]] = cut[first], cut[last]
     gap = high - low
@@ -162,29 +161,29 @@ def _on_surface(
 def _with_data(
     vertices: Vertices, faces: Faces, surface: Surface, seen: FaceMask | None, max_hole: float
 ) -> FaceMask:
-    everything = torch.ones_like(faces[:, 0], dtype=torch.bool)
+    """Return the facets with data or enclosed by such; all if none has data."""
     supported = surface.supported
     inner = (surface.barycentric >= _ON_EDGE).all(dim=1)
     if not bool(supported.any()):
-        return everything
+        return torch.ones_like(faces[:, 0], dtype=torch.bool)
     inside = torch.bincount(surface.facet[inner], minlength=len(faces))
-    known = torch.bincount(surface.facet[inner & supported], minlength=len(faces)) > 0
-    # A facet too small to have vertices inside has data when all its corners have.
+    data = torch.bincount(surface.facet[inner & supported], minlength=len(faces)) > 0
+    # A facet too small to have vertices inside has data if all its corners have.
     at_corner = (surface.barycentric > 1 - _ON_EDGE).any(dim=1) & supported
     slot = surface.barycentric[at_corner].argmax(dim=1, keepdim=True)
     at_vertex = torch.zeros(len(vertices), dtype=torch.bool, device=faces.device)
     at_vertex[faces[surface.facet[at_corner]].gather(1, slot)[:, 0]] = True
-    known = torch.where(inside > 0, known, at_vertex[faces].all(dim=1))
+    data = torch.where(inside > 0, data, at_vertex[faces].all(dim=1))
     if seen is not None:
-        known = known | seen
-    if not bool(known.any()):
-        return everything
+        data = data | seen
+    if not bool(data.any()):
+        return ~data
     area = face_normals(vertices, faces).norm(dim=1) / 2
-    return known | enclosed_holes(vertices, faces, known, max_hole * float(total(area)))
+    return data | enclosed_holes(vertices, faces, data, max_hole * float(total(area)))
 
 
 def departures(vertices: Vertices, faces: Faces, surface: Surface) -> Float[Tensor, " face"]:
-    """Return the 90th percentile of the surface's distances from each facet's plane."""
+    """Return the 90th percentile of the surface's distances to each facet's plane."""
     normals = unit_face_normals(vertices, faces)
     centre = vertices[faces].mean(dim=1)
     offset = surface.vertices_world.to(vertices) - centre[surface.facet]
@@ -203,7 +202,7 @@ def normal_spreads(count: int, surface: Surface) -> Float[Tensor, " {count}"]:
     summed = sum_at(surface.facet, weight[:, None] * surface.normals_world, count)
     mass = sum_at(surface.facet, weight, count)
     length = summed.norm(dim=1) / torch.where(mass > 0, mass, 1)
-    # Of small angles a from the mean, 1 - cos(a) is a^2 / 2.
+    # For small angles a to the mean, 1 - cos(a) is a^2 / 2.
     return torch.where(mass > 0, (2 * (1 - length)).clamp_min(0).sqrt(), 0)
 
 
@@ -215,7 +214,7 @@ def _worst_first(
     kept: FaceMask,
     max_facets: int,
 ) -> Bool[Tensor, " edge"]:
-    """Find the edges of as many of the worst facets as the limit allows, by bisection."""
+    """Return the edges to halve for as many of the worst facets as the limit allows."""
     _, face_edge = face_edges(faces)
     wanted = torch.where(small, 0, severity)
     order = wanted.argsort(descending=True, stable=True)
@@ -235,7 +234,7 @@ def _worst_first(
 
 
 def _without_folds(flat: Vertices, onto: Vertices, faces: Faces) -> Vertices:
-    """Move vertices onto the surface, except where that folds, flattens or stretches facets."""
+    """Return vertices moved onto the surface unless this folds, flattens or stretches facets."""
     before = face_normals(flat, faces)
     size = before.square().sum(dim=1)
     longest = _MAX_STRETCH * side_lengths(flat[faces]).amax(dim=1)

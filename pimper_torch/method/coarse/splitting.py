@@ -1,11 +1,11 @@
-"""Red-green splitting: some edges of a triangle mesh are halved, and it stays conforming.
+"""Red-green splitting: halve edges of a triangle mesh and keep it conforming.
 
-A face with three halved edges becomes four of its own shape (red); with one or two it is cut
-through to the new vertices (green). What an edge's two faces do follows from the edge alone, so
-no face ever has a vertex of its neighbour on its edge.
+A face with three halved edges becomes four similar ones (red); with one or two it is cut through to
+the new vertices (green). Both faces of an edge are split at the same vertex, so no face has a
+vertex of its neighbour on its edge.
 
-Source: of red and green, Bank, Sherman & Weiser, Scientific Computing, 1983; of halving longest
-edges so that angles stay away from 0, Rivara, Int. J. Numer. Meth. Eng. 20, 1984.
+Source: Bank, Sherman & Weiser, Scientific Computing, 1983, for red and green; Rivara, Int. J.
+Numer. Meth. Eng. 20, 1984, for halving longest edges so that angles stay away from 0.
 """
 
 import math
@@ -33,12 +33,13 @@ _RED = ((0, 5, 4), (5, 1, 3), (4, 3, 2), (3, 4, 5))
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Split(Record):
-    """A mesh, some of whose edges have been halved.
+    """The faces of a mesh after edges were halved.
 
     Attributes:
-        faces: Old vertices keep their indices; the new ones follow, one for each of ``halved``.
-        parent: The face that each face is a part of, ascending.
-        corners: Barycentric coordinates of each face's corners in its parent, row by row.
+        faces: Old vertices keep their indices; one new vertex for each of ``halved`` follows.
+        halved: Indices of the halved edges.
+        parent: Old face that contains each new face, ascending.
+        corners: Barycentric coordinates of each face's corners in its parent, a row per corner.
     """
 
     faces: Int[Tensor, "child 3"]
@@ -49,28 +50,28 @@ class Split(Record):
     def relocate(
         self, parent: Int[Tensor, " point"], barycentric: Points
     ) -> tuple[Int[Tensor, " point"], Points]:
-        """Return the child that each point of a face lies in or nearest to, and its coordinates."""
+        """Return the child that contains each point or is nearest, and coordinates in it."""
         inverse = torch.linalg.inv(self.corners).to(barycentric)
         first = torch.searchsorted(self.parent, parent)
         last = torch.searchsorted(self.parent, parent, right=True) - 1
         child, inner = first, (barycentric[:, None] @ inverse[first])[:, 0]
         for slot in range(1, len(_RED)):
-            (more,) = torch.nonzero(first + slot <= last, as_tuple=True)
-            other = first[more] + slot
-            there = (barycentric[more, None] @ inverse[other])[:, 0]
-            better = there.amin(dim=1) > inner[more].amin(dim=1)
-            child = child.index_copy(0, more[better], other[better])
-            inner = inner.index_copy(0, more[better], there[better])
+            (index,) = torch.nonzero(first + slot <= last, as_tuple=True)
+            other = first[index] + slot
+            candidate = (barycentric[index, None] @ inverse[other])[:, 0]
+            better = candidate.amin(dim=1) > inner[index].amin(dim=1)
+            child = child.index_copy(0, index[better], other[better])
+            inner = inner.index_copy(0, index[better], candidate[better])
         return child, inner
 
 
 def mark_edges(
     vertices: Vertices, faces: Faces, wanted: FaceMask, forbidden: FaceMask
 ) -> Bool[Tensor, " edge"]:
-    """Choose the edges to halve, in the order of :func:`face_edges`.
+    """Return the mask of edges to halve, in the order of :func:`face_edges`.
 
-    All edges of the wanted faces; and of every face that has one of these its longest too, so
-    that no angle shrinks below half of the smallest there was, however often this is done.
+    These are all edges of the wanted faces, and the longest edge of every face with a marked edge,
+    so that no angle falls below half of the smallest original one, however often this is done.
 
     Args:
         forbidden: Faces that keep all their edges, even if angles of others shrink.
@@ -94,79 +95,78 @@ def mark_edges(
 
 
 def split_edges(vertices: Vertices, faces: Faces, marked: Bool[Tensor, " edge"]) -> Split:
-    """Halve the marked edges, in the order of :func:`face_edges`; faces keep their orientation."""
+    """Halve the marked edges, in the order of :func:`face_edges`. Faces keep their orientation."""
     _, face_edge = face_edges(faces)
     halved = marked.nonzero()[:, 0]
     midpoint = torch.full_like(marked, -1, dtype=torch.long)
     midpoint[halved] = len(vertices) + torch.arange(len(halved), device=faces.device)
-    names = torch.cat([faces, midpoint[face_edge]], dim=1)
+    indices = torch.cat([faces, midpoint[face_edge]], dim=1)
     corners = vertices[faces]
     nodes = torch.tensor(_NODES, dtype=vertices.dtype, device=vertices.device)
     positions = nodes @ corners
-    here = marked[face_edge]
-    children, parents, inside = [], [], []
-    for some, table in _cases(here, positions):
-        if not len(some):
+    children, parents, coordinates = [], [], []
+    for face, table in _cases(marked[face_edge], positions):
+        if not len(face):
             continue
         local = torch.tensor(table, device=faces.device)
-        children.append(names[some][:, local].flatten(0, 1))
-        parents.append(some.repeat_interleave(len(table)))
-        inside.append(nodes[local].repeat(len(some), 1, 1))
+        children.append(indices[face][:, local].flatten(0, 1))
+        parents.append(face.repeat_interleave(len(table)))
+        coordinates.append(nodes[local].repeat(len(face), 1, 1))
     parent = torch.cat(parents)
     order = parent.argsort(stable=True)
     return Split(
         faces=torch.cat(children)[order],
         halved=halved,
         parent=parent[order],
-        corners=torch.cat(inside)[order],
+        corners=torch.cat(coordinates)[order],
     )
 
 
 def _cases(
     marked: Bool[Tensor, "face 3"], positions: Float[Tensor, "face 6 3"]
-) -> list[tuple[Int[Tensor, " some"], tuple[tuple[int, int, int], ...]]]:
-    """List the faces that are cut in the same way, and their children's corners."""
+) -> list[tuple[Int[Tensor, " face"], tuple[tuple[int, int, int], ...]]]:
+    """Return groups of faces that are cut alike, each with its children's corners in ``_NODES``."""
     count = marked.sum(dim=1)
-    cases: list[tuple[Int[Tensor, " some"], tuple[tuple[int, int, int], ...]]] = [
+    cases: list[tuple[Int[Tensor, " face"], tuple[tuple[int, int, int], ...]]] = [
         ((count == 0).nonzero()[:, 0], ((0, 1, 2),)),
         ((count == 3).nonzero()[:, 0], _RED),
     ]
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         centre = 3 + a
-        one = (count == 1) & marked[:, a]
-        cases.append((one.nonzero()[:, 0], ((a, b, centre), (a, centre, c))))
-        p, q = 3 + c, 3 + b  # the midpoints of ab and ac, where bc is whole
-        two = (count == 2) & ~marked[:, a]
+        single = (count == 1) & marked[:, a]
+        cases.append((single.nonzero()[:, 0], ((a, b, centre), (a, centre, c))))
+        p, q = 3 + c, 3 + b  # midpoints of ab and ac; bc is not halved
+        double = (count == 2) & ~marked[:, a]
         # The shorter diagonal of the quadrangle is the median to the longer edge: larger angles.
         from_b = (positions[:, b] - positions[:, q]).norm(dim=1)
         from_c = (positions[:, c] - positions[:, p]).norm(dim=1)
         near = from_b <= from_c
-        cases.append(((two & near).nonzero()[:, 0], ((a, p, q), (p, b, q), (b, c, q))))
-        cases.append(((two & ~near).nonzero()[:, 0], ((a, p, q), (p, b, c), (p, c, q))))
+        cases.append(((double & near).nonzero()[:, 0], ((a, p, q), (p, b, q), (b, c, q))))
+        cases.append(((double & ~near).nonzero()[:, 0], ((a, p, q), (p, b, c), (p, c, q))))
     return cases
 
 
-# Standard error of the normals that a facet blends from those of its corners, and the weight of a
-# surface's normals that follow from their neighbours alone, over that of the best: choices.
+# Standard error of normals interpolated from a facet's corners; relative weight of surface normals
+# that follow only from their neighbours. Choices.
 _MODEL_ERROR_DEG, _MIN_WEIGHT = 8.0, 0.05
 
 
 def normal_weights(information: PerVertex) -> PerVertex:
-    """Return inverse variances of normals about those that facets blend, relative to the best.
+    """Return weights of normals relative to the best: inverse variance about interpolated ones.
 
     Args:
         information: Inverse variance of the normals, one over squared radians.
     """
-    known = math.radians(_MODEL_ERROR_DEG) ** 2 * information
-    return known / (1 + known) + _MIN_WEIGHT
+    ratio = math.radians(_MODEL_ERROR_DEG) ** 2 * information
+    return ratio / (1 + ratio) + _MIN_WEIGHT
 
 
 def fitted_normals(mesh: Mesh, surface: Surface, split: Split, index: Children) -> Vertices:
-    """Fit vertex normals whose blend over the facets is nearest to the surface's normals.
+    """Fit vertex normals so that their interpolation is nearest to the surface's normals.
 
-    Least squares over the subdivided mesh, weighted by inverse variances; where that has no
-    vertex, the facets' own normals.
+    Least squares over the subdivided mesh, weighted by inverse variances. A facet without vertices
+    of the subdivided mesh keeps the normals of the mesh.
 
     Args:
         index: Of each child among the mesh's faces; -1 for a dropped one.
@@ -178,7 +178,7 @@ def fitted_normals(mesh: Mesh, surface: Surface, split: Split, index: Children) 
     face, barycentric = face[kept], barycentric[kept].double()
     weight = normal_weights(surface.information[kept].double())[:, None] * barycentric
     normals = surface.normals_world[kept].double()
-    # Facet by facet first: a million subdivided mesh vertices are a few thousand blocks.
+    # Sums per facet first: a million subdivided mesh vertices are a few thousand blocks.
     blocks = sum_at(face, weight[:, :, None] * barycentric[:, None], len(faces))
     sums = sum_at(face, weight[:, :, None] * normals[:, None], len(faces))
     squares = blocks.diagonal(dim1=1, dim2=2).flatten()
@@ -186,7 +186,7 @@ def fitted_normals(mesh: Mesh, surface: Surface, split: Split, index: Children) 
     rhs = sum_at(faces.flatten(), sums.flatten(0, 1), len(vertices))
     # Negligible except where there is no data.
     damping = (0.01 * average(diagonal)).clamp_min(1e-12).expand(len(vertices))
-    own = vertex_normals(vertices, faces)
+    initial = vertex_normals(vertices, faces)
     every = torch.arange(len(vertices), device=faces.device)
     fitted = SparseCholesky(
         torch.cat([faces[:, :, None].expand(-1, -1, 3).flatten(), every]),
@@ -194,21 +194,21 @@ def fitted_normals(mesh: Mesh, surface: Surface, split: Split, index: Children) 
         torch.cat([blocks.flatten(), damping]),
         size=len(vertices),
         what="the coarse mesh's normals",
-    ).solve(rhs + damping[:, None] * own)
-    facing = (fitted * own).sum(dim=1, keepdim=True) > 0
-    return normalize(torch.where(facing, fitted, own), dim=1).to(mesh.vertices_world)
+    ).solve(rhs + damping[:, None] * initial)
+    facing = (fitted * initial).sum(dim=1, keepdim=True) > 0
+    return normalize(torch.where(facing, fitted, initial), dim=1).to(mesh.vertices_world)
 
 
 def with_points(
     coarse: CoarseMesh, mesh: Mesh, split: Split, index: Children, source: Int[Tensor, " vertex"]
 ) -> CoarseMesh:
-    """Return the new mesh the points of the cloud on its facets, and the support of its facets.
+    """Return the coarse mesh of a new mesh, with the cloud's points and support of its facets.
 
-    A vertex that was a point of the cloud and has moved is none any more: the point lies on a
-    facet, at its own position with its own covariance.
+    A vertex that was a point of the cloud and has moved becomes a free vertex. The point becomes
+    one on a facet, with its position and covariance unchanged.
 
     Args:
-        source: The old vertex that each vertex is or is a copy of; new ones follow the old.
+        source: Old vertex that each vertex is a copy of; indices of new vertices follow.
     """
     old, points, covariance = coarse.mesh.vertices_world, coarse.points, coarse.covariance_world
     origin = source.clamp_max(len(old) - 1)
@@ -217,10 +217,10 @@ def with_points(
     if points is not None:
         points = _relocated(coarse, points, split, index)
     if covariance is not None:
-        (left,) = torch.nonzero(was_point & ~is_point, as_tuple=True)
-        once = torch.ones_like(left, dtype=torch.bool)  # a vertex parted in two leaves one point
-        once[1:] = origin[left][1:] != origin[left][:-1]
-        left = left[once]
+        (freed,) = torch.nonzero(was_point & ~is_point, as_tuple=True)
+        first = torch.ones_like(freed, dtype=torch.bool)  # copies of a vertex leave one point
+        first[1:] = origin[freed][1:] != origin[freed][:-1]
+        freed = freed[first]
         first_face = mesh.faces.new_full((len(source),), len(mesh.faces)).scatter_reduce(
             0,
             mesh.faces.flatten(),
@@ -228,9 +228,9 @@ def with_points(
             "amin",
         )
         moved = FacetPoints(
-            points_world=old[origin[left]],
-            covariance_world=covariance[origin[left]],
-            facet=first_face[left],
+            points_world=old[origin[freed]],
+            covariance_world=covariance[origin[freed]],
+            facet=first_face[freed],
         )
         points = moved if points is None else FacetPoints.cat([points, moved])
         covariance = torch.where(is_point[:, None, None], covariance[origin], 0)
@@ -247,7 +247,7 @@ def with_points(
 def _relocated(
     coarse: CoarseMesh, points: FacetPoints, split: Split, index: Children
 ) -> FacetPoints:
-    """Assign the points on facets to the children that they project into, along the old normal."""
+    """Assign points to the child facets that they project into along the old normal."""
     corners = coarse.mesh.vertices_world[coarse.mesh.faces[points.facet]]
     origin, along = corners[:, 0], corners[:, 1] - corners[:, 0]
     normal = torch.linalg.cross(along, corners[:, 2] - origin)

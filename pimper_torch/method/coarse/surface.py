@@ -1,4 +1,4 @@
-"""The coarse mesh: a surface through the cloud and the contours, simplified to facets."""
+"""The coarse mesh: a surface through the point cloud and the contours, simplified to facets."""
 
 import torch
 from jaxtyping import Float, Int
@@ -31,17 +31,17 @@ from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
-# Pixels of the finest depth maps between a facet and the points of the cloud on it. A choice.
+# Largest distance of a cloud's point to its facet, in pixels of the finest depth maps. A choice.
 _ON_FACET_PX = 4.0
 
-# Of a reliable point of the cloud: views, mean reprojection error, widest angle between its rays.
-# Choices: two views of a wrong match always agree, three seldom; narrower angles leave depth
+# Requirements for a reliable point: views, mean reprojection error, widest angle between its rays.
+# Choices: two views of a wrong match always agree, three seldom; with a narrower angle the depth is
 # uncertain.
 _MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 3, 1.5, 4.0
 
 
 class CoarseSurface(Stage):
-    """Compute the coarse surface of the object, a few thousand facets; not differentiable."""
+    """Compute the coarse mesh of the object, a few thousand facets. Not differentiable."""
 
     def __init__(self, config: CoarseSurfaceConfig | None = None) -> None:
         super().__init__()
@@ -55,14 +55,14 @@ class CoarseSurface(Stage):
         mesh: Mesh | None = None,
         more: OrientedPoints | None = None,
     ) -> CoarseMesh:
-        """Make the coarse mesh of depth maps and silhouettes, or of a given mesh.
+        """Compute the coarse mesh from depth maps and silhouettes, or from a given mesh.
 
         Args:
             contours: Of the silhouettes: all of the object gets facets, and nothing else does.
-                Where they constrain nothing, surface far from all points gets none.
-            mesh: A surface in the scene's frame, used in place of the photographs' own.
-            more: Points of the surface beside those that are matched. They are on every piece of
-                it: pieces without points go.
+                Silhouettes that constrain nothing: surface far from all points gets no facets.
+            mesh: A surface in the scene's frame, used instead of reconstructing one.
+            more: Points of the surface in addition to the matched ones. They cover all of the
+                object: connected components without points are removed.
 
         Raises:
             InputError: No registered photograph has the reference's name, or no camera sees the
@@ -74,8 +74,8 @@ class CoarseSurface(Stage):
         reliable, count = reliable_points(scene), self.config.num_facets
         if mesh is not None:
             vertices, faces = oriented_outward(mesh, scene.cameras)
-            few = reduced(Mesh(vertices_world=vertices, faces=faces), count)
-            vertices, faces = few.vertices_world, few.faces
+            simple = reduced(Mesh(vertices_world=vertices, faces=faces), count)
+            vertices, faces = simple.vertices_world, simple.faces
             pixel = pixel_size(scene, reliable) if len(reliable) else float("inf")
             support = None
         else:
@@ -85,49 +85,49 @@ class CoarseSurface(Stage):
             if len(reliable) < 4 and not contours.confine:
                 raise ReconstructionError(
                     f"coarse mesh: {len(reliable)} of {len(scene.points_world)} sparse points are "
-                    f"reliable ({_MIN_TRACK} views, {_MAX_ERROR_PX} px, {_MIN_ANGLE_DEG} "
-                    "degrees), and at least 4 are needed. Take more photographs."
+                    f"reliable (at least {_MIN_TRACK} views and {_MIN_ANGLE_DEG} degrees, at most "
+                    f"{_MAX_ERROR_PX} px); needed: at least 4. Take more photographs."
                 )
             fine = fine_surface(scene, reliable, contours, self.config.levels, more)
-            few = reduced(Mesh(vertices_world=fine.vertices_world, faces=fine.faces), count)
-            vertices, crowded = few.vertices_world, len(few.faces)
-            faces = two_faces_an_edge(vertices, few.faces)
-            leave_out("coarse.crowded", crowded - len(faces), total=crowded)
-            whole = torch.ones_like(faces[:, 0], dtype=torch.bool)
-            kept = supported_components(vertices, faces, whole, min_fraction(contours))
+            simple = reduced(Mesh(vertices_world=fine.vertices_world, faces=fine.faces), count)
+            vertices, total = simple.vertices_world, len(simple.faces)
+            faces = two_faces_an_edge(vertices, simple.faces)
+            leave_out("coarse.crowded", total - len(faces), total=total)
+            supported = torch.ones_like(faces[:, 0], dtype=torch.bool)
+            kept = supported_components(vertices, faces, supported, min_fraction(contours))
             leave_out("coarse.pieces", ~kept)
             used, faces = torch.unique(faces[kept], return_inverse=True)
             vertices = vertices[used]
             pixel, support = fine.pixel, fine.support_of(vertices[faces])
-        near = _ON_FACET_PX * pixel
-        coarse = _with_points(scene, reliable, reference, vertices, faces, near)
+        tolerance = _ON_FACET_PX * pixel
+        coarse = _with_points(scene, reliable, reference, vertices, faces, tolerance)
         return coarse.replace(support=support)
 
 
 @torch.no_grad()
 def facets_of(mesh: Mesh, scene: SparseScene, reference: str = "") -> CoarseMesh:
-    """Take the faces of a mesh for facets, with the points of the cloud that lie on them.
+    """Return a coarse mesh with the faces of a mesh as facets, and the cloud's points on them.
 
-    Vertices at one place are welded, faces without area or that stand twice are left out, fronts
-    turned to the cameras. The number of faces stays: a chain wants some hundreds to thousands.
+    Coincident vertices are welded, faces without area and duplicate faces are removed, and fronts
+    face the cameras. Nothing is simplified: chains expect some hundreds to thousands of faces.
 
     Args:
-        reference: Name or stem of the frontal photograph; empty chooses it.
+        reference: Name or stem of the frontal photograph; empty selects it automatically.
 
     Raises:
-        InputError: The mesh is no surface, in another frame than the cameras, or seen by none; no
-            one photograph has the reference's name.
+        InputError: The mesh is not a surface, is not in the cameras' frame, or is seen by no
+            camera; or not exactly one photograph has the reference's name.
     """
     view = reference_view(scene, reference)
     mesh, _ = prepared(mesh, scene, Silhouettes.everything(scene.views))
     vertices, faces = oriented_outward(mesh, scene.cameras)
     reliable = reliable_points(scene)
-    near = _ON_FACET_PX * pixel_size(scene, reliable) if len(reliable) else 0.0
-    return _with_points(scene, reliable, view, vertices, faces, near)
+    tolerance = _ON_FACET_PX * pixel_size(scene, reliable) if len(reliable) else 0.0
+    return _with_points(scene, reliable, view, vertices, faces, tolerance)
 
 
 def reliable_points(scene: SparseScene) -> Int[Tensor, " reliable"]:
-    """List the points of the cloud with enough views, small residuals and wide angles."""
+    """Return the indices of points with enough views, small residuals and wide angles."""
     observed = scene.observed
     angle = triangulation_angles(scene.points_world, observed, scene.cameras.centers_world)
     reliable = (
@@ -140,7 +140,7 @@ def reliable_points(scene: SparseScene) -> Int[Tensor, " reliable"]:
 
 
 def smoothed_normals(vertices: Vertices, faces: Faces) -> Vertices:
-    """Average each vertex normal with the mean of those of its neighbours; unit."""
+    """Return unit vertex normals, each averaged with the mean normal of its neighbours."""
     normals = vertex_normals(vertices, faces)
     source = half_edges(faces[:, [2, 0, 1]])  # summed from each face's first edge on
     target = source.flip(1).flatten()
@@ -149,7 +149,7 @@ def smoothed_normals(vertices: Vertices, faces: Faces) -> Vertices:
 
 
 def two_faces_an_edge(vertices: Vertices, faces: Faces) -> Int[Tensor, "kept 3"]:
-    """Drop the smallest face of edges with three or more until each has two at most."""
+    """Return faces, at most two per edge: of others the smallest is dropped, repeatedly."""
     while True:
         _, face_edge = face_edges(faces)
         counts = face_counts(face_edge)
@@ -169,10 +169,10 @@ def _with_points(
     faces: Faces,
     max_distance: float,
 ) -> CoarseMesh:
-    """Put the reliable points of the cloud that lie near a facet beside the facets."""
+    """Return the coarse mesh with the reliable points up to ``max_distance`` from a facet."""
     mesh = Mesh(vertices_world=vertices, faces=faces)
-    found = NearestSurface(mesh).query(scene.points_world[reliable])
-    near = found.distance <= max_distance
+    nearest = NearestSurface(mesh).query(scene.points_world[reliable])
+    near = nearest.distance <= max_distance
     return CoarseMesh(
         mesh=mesh.replace(normals_world=smoothed_normals(vertices, faces)),
         reference=reference,
@@ -181,7 +181,7 @@ def _with_points(
         points=FacetPoints(
             points_world=scene.points_world[reliable[near]],
             covariance_world=point_covariances(scene, reliable[near]),
-            facet=found.face[near],
+            facet=nearest.face[near],
         ),
     )
 
@@ -193,12 +193,11 @@ def point_covariances(
 
     .. math:: C = \sigma^2 \Big( \sum_{views} J^T J \Big)^{-1}
 
-    with J the derivative of the pixel by the point: a point is uncertain along its rays, the
-    more so the farther it is and the narrower the angle between them. The pixel's noise
+    with J the derivative of the pixel with respect to the point. A point is uncertain along its
+    rays, more so if it is far away or the angle between them is narrow. The pixel noise
     :math:`\sigma` is estimated from the point's mean reprojection error :math:`e` over n
-    views, :math:`\sigma^2 = (2 e^2 / \pi) \, 2n / (2n - 3)` for Gaussian noise, blended with
-    the median of the cloud, as a short track says little about its own noise. Cameras are
-    taken as exact.
+    views, :math:`\sigma^2 = (2 e^2 / \pi) \, 2n / (2n - 3)` for Gaussian noise, and blended with
+    the median of the cloud, because a short track hardly determines it. Cameras count as exact.
 
     Returns:
         Scene units squared.
@@ -216,7 +215,8 @@ def point_covariances(
     inward = intrinsics.new_tensor([0, 0, 1])
     rate = (intrinsics[:, :2] - pixel * inward) / depth @ frames[:, :3, :3]
     information = rate.new_zeros(count, 3, 3).index_add(0, point, rate.mT @ rate)[index]
-    # A depth has a standard deviation of at most 1,000 times that across, as in one view.
+    # Bounds the standard deviation along the rays, infinite in one view, to some 1,000 times that
+    # across them.
     least = 1e-6 * information.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
     eye = torch.eye(3, dtype=rate.dtype, device=rate.device)
     covariance = torch.linalg.inv(information + least[:, None, None] * eye)

@@ -1,4 +1,4 @@
-"""Which faces of a closed surface stay: those that photographs, points or contours support."""
+"""Trimming of a closed surface to the faces that photographs, points or contours support."""
 
 from dataclasses import dataclass
 from functools import reduce
@@ -21,42 +21,42 @@ from pimper_torch.records import ContourPoints, OrientedPoints, Record, Support
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.parallel import num_workers, side_by_side
 
-# Of the surface's octree, pixels of the finest depth maps at the cloud's median depth. A choice.
+# Octree cell in pixels of the finest depth maps at the cloud's median depth. A choice.
 CELL_PX = 4.0
 
-# Side of a square as large as the largest hole that is closed whatever made it, in those pixels.
-# Strips along a border that are narrower go, where they are small or unsupported.
+# Side of a square with the area of the largest hole that is closed whatever its cause, in the same
+# pixels. Narrower strips along a border are removed if they are small or unsupported.
 HOLE_PX = 24.0
 
-# Fraction of the area seen up to which a hole is closed that only lack of views made, such as the
-# bottom of a deep concavity.
+# Largest area, as a fraction of the area seen, of a hole that is closed if only lack of views made
+# it, such as the bottom of a deep concavity.
 MAX_UNSEEN = 0.02
 
-# Cosine between a face's normal and the ray to a camera, above which a view counts: at 84 degrees a
+# Least cosine between a face's normal and the ray to a camera for a view to count: at 84 degrees a
 # face is a tenth as wide as it is long.
 _FACING = 0.1
 
-# Views that see something behind a face which is dropped: one may be wrong.
+# Views that see something behind a face for it to be dropped: a single one may be wrong.
 _MIN_BEHIND = 2
 
-# Fraction of a region that two views see through, from which all of it is in the air: 0.56 of the
-# lid over a mug's mouth, and at most 0.1 of regions without points that are there (mug, cow, jar).
-_MOST_THROUGH = 0.25
+# If two views see through at least this fraction of a region, all of it is dropped: 0.56 of the lid
+# over a mug's mouth, and at most 0.1 of regions without points that exist (mug, cow, jar).
+_MIN_THROUGH = 0.25
 
-# Without silhouettes a face without points is dropped where it is further than the first from all
+# Without silhouettes, a face without points is dropped if it is further than the first from all
 # points, with all connected to it that are further than the second. Spans over gaps in potatoes
-# stay, and surface in the air beside the object is dropped (benchmarks/README.md, ablations).
+# stay, and surface in the air next to the object is dropped (benchmarks/README.md, ablations).
 _GAP_PX, _MARGIN_PX = 40.0, 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ViewCounts(Record):
-    """Numbers of views, one of each a face.
+    """Numbers of views per face.
 
     Attributes:
-        seen: In which the face is unoccluded, within the picture, and facing.
-        lit: In which, of these, its pixel is illuminated.
-        behind: Whose depth map shows a matched point behind the face: they look through it.
+        seen: Views in which the face is unoccluded, within the image, and facing the camera.
+        lit: Those of them in which its pixel is illuminated.
+        behind: Views that see through the face: their depth map has a matched point behind it.
     """
 
     seen: Int[Tensor, " face"]
@@ -74,13 +74,14 @@ def view_counts(
 ) -> ViewCounts:
     """Count the views that see the centre of each face, see it lit, and see through it.
 
-    Depth maps of surface without texture are wrong in places, for single views: a depth counts only
-    where it meets the cloud that all views have in common.
+    Without texture, depth maps of single views have errors: a depth counts only if its point is
+    near the cloud of all views.
 
     Args:
         level: Photographs, at the resolution of the depth maps.
-        maps: Of all views; without, none sees through a face.
-        reach: Distance from these up to which a depth map meets them, scene units.
+        maps: Of all views; without them, no view sees through a face.
+        matched_world: The cloud of all views.
+        reach: Largest distance between this cloud and a depth that counts, scene units.
     """
     cameras = level.cameras
     centre = vertices[faces].mean(dim=1)
@@ -99,18 +100,18 @@ def view_counts(
         column = column.clamp_max(level.tone.shape[-1] - 1)
         row = row.clamp_max(level.tone.shape[-2] - 1)
         if maps is not None:
-            # Depths that agree differ by a step at most, faces lie off points by some.
+            # Depths that agree differ by a step at most, faces deviate from points by a few.
             nearest = maps.inverse_depth[view, row, column] + 4.0 * maps.step[view]
             through = maps.valid[view, row, column] & (1 / depth[chosen] > nearest)
             frame, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
             rays = rays_through(pixels[chosen][through], frame, intrinsics)
-            shown = maps.inverse_depth[view, row, column][through, None]
-            distance, _ = cloud.query((center + rays / shown).detach().cpu().numpy())
+            inverse_depth = maps.inverse_depth[view, row, column][through, None]
+            distance, _ = cloud.query((center + rays / inverse_depth).detach().cpu().numpy())
             behind[chosen[through]] = torch.from_numpy(distance <= reach).to(behind)
         free = ~caster.occluded(centre[chosen], center, 0.5 * side[chosen])
         free &= level.usable[view, row, column]
         seen[chosen] = free.long()
-        # A twentieth of the bright level's radiance, above the pedestal of a hundredth.
+        # A twentieth of the 98th percentile of radiance, plus the hundredth that ``tone`` adds.
         lit[chosen] = (free & (level.tone[view, row, column] > 0.06**0.5)).long()
         return torch.stack([seen, lit, behind])
 
@@ -120,7 +121,7 @@ def view_counts(
 
 
 def point_distances(queries: Float[Tensor, "query 3"], points: Points) -> Float[Tensor, " query"]:
-    """Measure the distance of each query to the nearest point."""
+    """Return the distance of each query to the nearest point."""
     tree = cKDTree(points.detach().cpu().numpy())
     distance, _ = tree.query(queries.detach().cpu().numpy(), workers=num_workers())
     return torch.from_numpy(distance).to(queries)
@@ -129,15 +130,15 @@ def point_distances(queries: Float[Tensor, "query 3"], points: Points) -> Float[
 def without_small_holes(
     vertices: Vertices, faces: Faces, kept: FaceMask, largest: float
 ) -> FaceMask:
-    """Keep connected components of dropped faces too whose area is small, in scene units."""
+    """Return the kept faces and components of the others of less area (scene units squared)."""
     areas = surfaces.component_areas(vertices, faces, topology.face_components(faces, ~kept))
     return kept | (~kept & (areas < largest))
 
 
 def enclosed_holes(vertices: Vertices, faces: Faces, kept: FaceMask, largest: float) -> FaceMask:
-    """Find connected components of dropped faces, up to an area, that kept faces enclose.
+    """Return the connected components of dropped faces, up to an area, that kept faces enclose.
 
-    A component that reaches the border of the surface is not enclosed.
+    A component at the border of the surface is not enclosed.
     """
     label = topology.face_components(faces, ~kept)
     paired = torch.bincount(topology.face_pairs(faces)[0].flatten(), minlength=len(faces))
@@ -149,13 +150,13 @@ def enclosed_holes(vertices: Vertices, faces: Faces, kept: FaceMask, largest: fl
 def supported_components(
     vertices: Vertices, faces: Faces, supported: FaceMask, fraction: float
 ) -> FaceMask:
-    """Find components with at least a fraction of the supported area of all."""
-    everything = torch.zeros_like(faces[:, 0])
-    own, total = (
+    """Return the faces of components with at least a fraction of the total supported area."""
+    same = torch.zeros_like(faces[:, 0])
+    areas, total = (
         surfaces.component_areas(vertices, faces, label, supported)
-        for label in (topology.face_components(faces), everything)
+        for label in (topology.face_components(faces), same)
     )
-    return own >= fraction * total
+    return areas >= fraction * total
 
 
 def supports(
@@ -170,15 +171,12 @@ def supports(
     Args:
         reach: Distance to a point, or a contour point, that supports a face.
     """
-    found = torch.full_like(counts.seen, Support.NOTHING)
-    found[counts.lit >= 2] = Support.LIGHT
-    for points, support in (
-        (contour.points_world, Support.CONTOUR),
-        (cloud.points_world, Support.POINTS),
-    ):
-        if len(points):
-            found[point_distances(centre, points) <= reach] = support
-    return found
+    support = torch.full_like(counts.seen, Support.NOTHING)
+    support[counts.lit >= 2] = Support.LIGHT
+    for points, kind in ((contour, Support.CONTOUR), (cloud, Support.POINTS)):
+        if len(points.points_world):
+            support[point_distances(centre, points.points_world) <= reach] = kind
+    return support
 
 
 def near_points(
@@ -189,11 +187,11 @@ def near_points(
     counts: ViewCounts,
     pixel: float,
 ) -> FaceMask:
-    """Find faces with points, and illuminated faces between points that are near to some.
+    """Return faces with points, and illuminated faces near points.
 
-    A component of faces further than the margin from all points is not marked if one of them is
-    further than the gap: surface that spans a gap inside the object is joined to surface in
-    the air beside it by strips along points, which the margin cuts through.
+    Illuminated faces beyond the margin from all points are excluded if their connected component
+    has a face beyond the gap. Surface that spans a gap inside the object is joined to surface in
+    the air next to it by strips along points, and the margin cuts through these.
     """
     supported = support == Support.POINTS
     distance = point_distances(centre, cloud.points_world)
@@ -213,51 +211,52 @@ def seen_surface(
     fraction: float,
     least: Support = Support.CONTOUR,
 ) -> FaceMask:
-    """Find the faces that stay: in the visual hull, and seen or supported.
+    """Return the faces to keep: in the visual hull, and seen or supported.
 
-    Surface without points that views see through is dropped: it closes an opening, or floats in
-    the air, and all of it goes where they see through enough of it. Faces that no view sees stay
-    where they close a small hole; the back of an object seen from one side is a large one.
+    Surface without points that views see through closes an opening or floats in the air, and is
+    dropped; a region is dropped completely if they see through enough of it. Faces that no view
+    sees are kept if they close a small hole, unlike the back of an object seen from one side.
 
     Args:
         inside: True for faces in the visual hull.
-        fraction: Of the supported area, that a component needs.
-        least: Support of the faces whose area that is.
+        pixel: Size of a pixel of the finest depth maps on the surface, scene units.
+        fraction: Least fraction of the supported area in a component that is kept.
+        least: Least support of a face that counts as supported area.
     """
-    known = support >= Support.CONTOUR
+    matched = support >= Support.CONTOUR
     small = (HOLE_PX * pixel) ** 2
     bare = inside & (support != Support.POINTS)
     through = bare & (counts.behind >= _MIN_BEHIND)
-    region = topology.face_components(faces, some := bare & (counts.seen > 0))
+    region = topology.face_components(faces, visible := bare & (counts.seen > 0))
     share = torch.bincount(region, through.double()) / torch.bincount(region)
-    through |= some & (share >= _MOST_THROUGH)[region]
+    through |= visible & (share >= _MIN_THROUGH)[region]
     possible = without_small_holes(vertices, faces, inside & ~through, small)
     leave_out("coarse.seen_through", inside & ~possible, at=(vertices, faces))
-    kept = possible & ((counts.seen > 0) | known)
+    kept = possible & ((counts.seen > 0) | matched)
     leave_out("coarse.unseen", possible & ~kept, at=(vertices, faces))
     area = float(total(surfaces.face_normals(vertices, faces[kept]).norm(dim=1))) / 2
     holes = enclosed_holes(vertices, faces, kept, MAX_UNSEEN * area)
     kept = kept | (holes & ~topology.connected_to(faces, ~kept, ~possible))
     kept = without_small_holes(vertices, faces, kept, small)
-    # Narrow is what a morphological opening removes: small or unsupported spurs of the border.
+    # Strips are narrow parts of the border, which a morphological opening removes.
     rings, count = int(HOLE_PX / (2 * CELL_PX)), len(vertices)
     core = ~topology.dilated(faces, ~kept, rings, count)
     strips = kept & ~topology.dilated(faces, core, rings, count)
     label = topology.face_components(faces, strips)
     areas = surfaces.component_areas(vertices, faces, label)
-    borne = surfaces.component_areas(vertices, faces, label, support != Support.NOTHING)
-    strips &= (areas < small) | (borne < areas / 2)
+    supported = surfaces.component_areas(vertices, faces, label, support != Support.NOTHING)
+    strips &= (areas < small) | (supported < areas / 2)
     leave_out("coarse.fringes", strips, at=(vertices, faces))
     kept &= ~strips
     (chosen,) = torch.nonzero(kept, as_tuple=True)
-    stays = supported_components(vertices, faces[chosen], support[chosen] >= least, fraction)
-    leave_out("coarse.components", ~stays, at=(vertices, faces[chosen]))
-    kept[chosen[~stays]] = False
+    large = supported_components(vertices, faces[chosen], support[chosen] >= least, fraction)
+    leave_out("coarse.components", ~large, at=(vertices, faces[chosen]))
+    kept[chosen[~large]] = False
     return kept
 
 
 def min_fraction(contours: Contours) -> float:
-    """Return the fraction of the supported area that a component needs."""
-    # Inside silhouettes even what others nearly hide is the object's: of six balls, the one behind
-    # the others is in two pieces of less than 0.01 each.
+    """Return the least fraction of the supported area in a component that is kept."""
+    # Inside silhouettes, even a nearly hidden component belongs to the object: the rear one of six
+    # balls is in two pieces of less than 0.01 each.
     return 0.002 if contours.confine else 0.01

@@ -1,8 +1,8 @@
-"""Match of views through a surface, under any light: correlation of windows.
+"""Matching of views through a surface under any light, by correlation of windows.
 
-A surface is a field of inverse depths over a view. Every source view is looked up once
-through the field, and windows are compared in what comes back: they are slanted and bent as
-the field is, at the price of one sample a pixel.
+A surface is a field of inverse depths over a view. Every source view is resampled once through the
+field, and windows of the view and the resampled images are compared. Windows thus follow the slant
+and curvature of the field, for one sample per pixel.
 """
 
 from collections.abc import Sequence
@@ -27,8 +27,8 @@ class MatchingLevel(Record):
     """All photographs at one resolution.
 
     Attributes:
-        tone: Root of gray radiance, so that noise is about the same everywhere; about 1 at
-            the photographs' bright level.
+        tone: Square root of gray radiance plus a hundredth, so that noise is about uniform; about 1
+            at the 98th percentile of the usable pixels of all photographs.
         usable: False outside photographs and masks.
     """
 
@@ -38,7 +38,7 @@ class MatchingLevel(Record):
 
 
 def level_of(scene: SparseScene, factor: int) -> MatchingLevel:
-    """Reduce the photographs by a whole factor; remainders at the right and the bottom are cut."""
+    """Reduce the photographs by an integer factor; right and bottom remainders are cut off."""
     views, cameras = scene.views, scene.cameras
     usable = views.inside
     if views.masks is not None:
@@ -49,17 +49,17 @@ def level_of(scene: SparseScene, factor: int) -> MatchingLevel:
         return avg_pool2d(gray, factor)[0].clamp_min(0)
 
     gray = by_view(reduced, views.images)
-    # All of a reduced pixel has to be usable: the smallest value is that of the pool's.
-    usable = by_view(lambda one: avg_pool2d(one[None].to(gray), factor)[0] > 1 - 1e-4, usable)
-    shown = torch.cat([one[lit] for one, lit in each(gray, usable)])
-    shown = shown if len(shown) else gray.reshape(-1)
-    # Above it lie highlights.
-    rank = min(len(shown), int(0.98 * len(shown)) + 1)
-    level = np.partition(shown.cpu().numpy(), rank - 1)[rank - 1]
-    bright = max(float(level), torch.finfo(gray.dtype).tiny)
+    # All pixels of a reduced pixel must be usable; the tolerance covers the rounding of the mean.
+    usable = by_view(lambda mask: avg_pool2d(mask[None].to(gray), factor)[0] > 1 - 1e-4, usable)
+    values = torch.cat([image[mask] for image, mask in each(gray, usable)])
+    values = values if len(values) else gray.reshape(-1)
+    # Brighter pixels are highlights.
+    rank = min(len(values), int(0.98 * len(values)) + 1)
+    percentile = np.partition(values.cpu().numpy(), rank - 1)[rank - 1]
+    bright = max(float(percentile), torch.finfo(gray.dtype).tiny)
     return MatchingLevel(
-        # The noise of black pixels is not stretched without limit.
-        tone=by_view(lambda one: (one / bright + 0.01).sqrt(), gray),
+        # The offset bounds the amplification of noise in black pixels.
+        tone=by_view(lambda image: (image / bright + 0.01).sqrt(), gray),
         usable=usable,
         cameras=cameras.replace(
             intrinsics=scale_intrinsics(cameras.intrinsics, 1 / factor, 1 / factor),
@@ -70,13 +70,13 @@ def level_of(scene: SparseScene, factor: int) -> MatchingLevel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Pairing(Record):
-    r"""One view and those it is matched with.
+    r"""A view and the source views that it is matched with.
 
-    A pixel with inverse depth q is seen by source s at the pixel that
-    :math:`A_s (u, v, 1)^T + q \, b_s` is the homogeneous form of.
+    A pixel with inverse depth q projects into source s at the homogeneous pixel
+    :math:`A_s (u, v, 1)^T + q \, b_s`.
 
     Attributes:
-        ray: ``A_s (u, v, 1)`` of every pixel of the view, or of some.
+        ray: ``A_s (u, v, 1)`` of every pixel of the view, or of a subset.
         shift: ``b_s``.
     """
 
@@ -88,10 +88,10 @@ class Pairing(Record):
     def look(
         self, inverse_depth: Float[Tensor, "*pixel"]
     ) -> tuple[Float[Tensor, "source 2 *pixel"], Float[Tensor, " source *pixel"]]:
-        """Project pixels into the sources; also give depth there over depth here."""
-        at = self.ray + self.shift.reshape(-1, 3, *(1,) * inverse_depth.dim()) * inverse_depth
-        ratio = at[:, 2]
-        return at[:, :2] / ratio.clamp_min(1e-6)[:, None], ratio
+        """Return the pixels in the sources, and the depth there over the depth in the view."""
+        image = self.ray + self.shift.reshape(-1, 3, *(1,) * inverse_depth.dim()) * inverse_depth
+        ratio = image[:, 2]
+        return image[:, :2] / ratio.clamp_min(1e-6)[:, None], ratio
 
 
 View = int | Int[Tensor, " view"]
@@ -100,7 +100,7 @@ View = int | Int[Tensor, " view"]
 def pixels_from_pixels(
     cameras: Cameras, to: View, start: View
 ) -> tuple[Float[Tensor, "pair 3 3"], Float[Tensor, "pair 3"]]:
-    """Return ``A`` and ``b`` of :class:`Pairing`, in double precision: of one view and many."""
+    """Return ``A`` and ``b`` of :class:`Pairing` in double precision; one argument is an index."""
     frames, intrinsics = cameras.cam_from_world.double(), cameras.intrinsics.double()
     relative = frames[to] @ torch.linalg.inv(frames[start])
     rotation = intrinsics[to] @ relative[:, :3, :3] @ torch.linalg.inv(intrinsics[start])
@@ -108,7 +108,7 @@ def pixels_from_pixels(
 
 
 def pair(level: MatchingLevel, view: int, sources: Int[Tensor, " source"]) -> Pairing:
-    """Prepare the lookup of a view's pixels in others."""
+    """Return the pairing of a view with its sources."""
     height, width = level.tone.shape[-2:]
     rotation, shift = pixels_from_pixels(level.cameras, sources, view)
     pixels = pixel_centers(width, height, like=rotation)
@@ -122,15 +122,15 @@ def pair(level: MatchingLevel, view: int, sources: Int[Tensor, " source"]) -> Pa
     )
 
 
-# How windows are compared; choices.
-RADIUS = 2  # they are squares of twice this and 1 pixels
-_LIKENESS = 0.2  # difference of tone to the centre at which a pixel's weight has fallen to 0.6
+# Comparison of windows; choices.
+RADIUS = 2  # windows have 2 * RADIUS + 1 pixels a side
+_LIKENESS = 0.2  # difference of tone to the centre at which the weight of a pixel is 0.6
 _CONTRAST = 0.005  # standard deviation of the tone in a window below which its correlation fades
-_BEST = 3  # sources that count: the best ones of each pixel
+_BEST = 3  # number of sources that count at each pixel, the best ones
 
 
 class Matcher:
-    """Normalized cross-correlation of a view's windows with its sources', through any field.
+    """Normalized cross-correlation of windows of a view and its sources, through any field.
 
     Source: Yoon & Kweon, Adaptive support-weight approach, PAMI 28(4), 2006, for the weights;
     Schönberger et al., Pixelwise view selection, ECCV 2016, for correlation with them.
@@ -138,51 +138,52 @@ class Matcher:
 
     def __init__(self, level: MatchingLevel, pairing: Pairing) -> None:
         tone = level.tone[pairing.view].detach().float()
-        here = level.usable[pairing.view]
+        usable = level.usable[pairing.view]
         around = torch.stack(shifted(tone, RADIUS, "replicate"))
         along = torch.exp(-(torch.arange(-RADIUS, RADIUS + 1) / RADIUS).square() / 2)
         spatial = (along[:, None] * along).reshape(-1, 1, 1).to(tone)
         weight = spatial * torch.exp(-((around - tone) / _LIKENESS).square() / 2)
-        weight *= torch.stack(shifted(here.to(tone), RADIUS, "replicate"))
+        weight *= torch.stack(shifted(usable.to(tone), RADIUS, "replicate"))
         weight /= weight.sum(dim=0).clamp_min(1e-12)
-        # Around the mean, so that no difference of large numbers is left for single precision.
+        # Centred first: single precision has no digits for a difference of large numbers.
         around -= (weight * around).sum(dim=0)
         deviation = weight * around
         power = (deviation * around).sum(dim=0)
-        of_sources = pairing.ray, pairing.shift, level.tone[pairing.sources]
-        self._ray, self._shift, self._tone = (as_array(one, torch.float32) for one in of_sources)
-        self._usable, self._here = as_array(level.usable[pairing.sources]), as_array(here)
+        arrays = pairing.ray, pairing.shift, level.tone[pairing.sources]
+        self._ray, self._shift, self._tone = (as_array(array, torch.float32) for array in arrays)
+        self._source_usable = as_array(level.usable[pairing.sources])
+        self._view_usable = as_array(usable)
         self._weight, self._deviation, self._power = map(as_array, (weight, deviation, power))
 
     def scores(self, field: Map, offsets: Sequence[float]) -> Float[Tensor, "offset height width"]:
-        """Score a field of inverse depths moved by each of some offsets.
+        """Return the scores of a field of inverse depths plus each offset.
 
-        The score is the mean correlation of the best sources, 0 where none sees the pixel:
-        computed on the CPU in single precision, a constant to autograd.
+        The score is the mean correlation of the best sources, 0 where none sees the pixel.
+        Computed on the CPU in single precision; not differentiable.
         """
         from pimper_torch.ground.kernels.window_scores import window_scores
 
-        found = torch.empty(len(offsets), *field.shape)
+        scores = torch.empty(len(offsets), *field.shape)
         window_scores(
             as_array(field, torch.float32),
             np.array(offsets, dtype=np.float32),
             self._ray,
             self._shift,
             self._tone,
-            self._usable,
+            self._source_usable,
             self._weight,
             self._deviation,
             self._power,
-            self._here,
+            self._view_usable,
             _CONTRAST**2,
             _BEST,
-            found.numpy(),
+            scores.numpy(),
         )
-        return found.to(field)
+        return scores.to(field)
 
 
 def shifted(values: Map, radius: int, padding: Literal["replicate", "constant"]) -> list[Map]:
-    """Return a map for each pixel of a window: the values shifted by its offset."""
+    """Return a map per pixel of a window: the values shifted by that pixel's offset."""
     height, width = values.shape
     wide = pad(values[None, None], (radius,) * 4, mode=padding)[0, 0]
     side = range(2 * radius + 1)
