@@ -112,7 +112,7 @@ def test_from_tensors_to_a_saved_result(given, tmp_path):
     off = np.linalg.norm(mesh.vertices, axis=1) - 1  # the ball's own radius
     assert np.abs(off).mean() < 0.01
     assert (tmp_path / "out" / "sparse" / "cameras.bin").is_file()
-    with pytest.raises(pt.InputError, match="cameras come twice"):
+    with pytest.raises(pt.InputError, match="cameras are given twice"):
         chain(scene_of(scene), tmp_path)
 
 

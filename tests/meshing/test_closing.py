@@ -112,7 +112,7 @@ def test_a_strip_that_is_twisted_once_has_no_inside():
             torch.stack([following, lower, below], dim=1),
         ]
     )
-    with pytest.raises(InputError, match="opposite ways"):
+    with pytest.raises(InputError, match="opposite orientation"):
         closed(Mesh(vertices_world=torch.rand(2 * count, 3), faces=faces))
 
 

@@ -36,7 +36,7 @@ def test_every_nth_photograph_by_name_is_held_out_but_for_what_is_needed(scene):
 
 def test_too_few_photographs_are_refused(scene):
     four = photographed(GLOSSY, views=4)[0]
-    with pytest.raises(ConfigError, match="hold_out is 2; needed: a number that leaves 3 views"):
+    with pytest.raises(ConfigError, match="hold_out is 2; needed: a number that leaves at least 3"):
         split_held_out(four, 2)
 
 

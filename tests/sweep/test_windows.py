@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.sweep.windows import level_weight, window_mean, window_size
+from pimper_torch.method.sweep.windows import flat_weight, window_mean, window_size
 
 
 @pytest.mark.parametrize("radius", [1.5, 2.5])
@@ -18,11 +18,11 @@ def test_windows_end_at_a_cliff_and_not_on_a_slope():
     gentle = (2.0 * x).expand(1, 6, 10)
     spacing = torch.ones(1)
     swept = torch.ones(1, 6, 10)
-    assert (level_weight(gentle, swept, spacing, 4.0) == 1).all()
+    assert (flat_weight(gentle, swept, spacing, 4.0) == 1).all()
     cliff = gentle + 9.0 * (x >= 5)
-    weight = level_weight(cliff, swept, spacing, 4.0)
+    weight = flat_weight(cliff, swept, spacing, 4.0)
     assert (weight[..., 4:6] == 0).all()
     assert (weight[..., :4] == 1).all()
     assert (weight[..., 6:] == 1).all()
-    assert_close(level_weight(cliff.mT, swept.mT, spacing, 4.0), weight.mT)
-    assert_close(level_weight(3 * cliff, swept, 3 * spacing, 4.0), weight)  # a matter of slope
+    assert_close(flat_weight(cliff.mT, swept.mT, spacing, 4.0), weight.mT)
+    assert_close(flat_weight(3 * cliff, swept, 3 * spacing, 4.0), weight)  # a matter of slope

@@ -1,1 +1,1 @@
-"""The two ways through the stages: coarse to fine, and as published."""
+"""The two chains of stages: coarse to fine, and as published."""

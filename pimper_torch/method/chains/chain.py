@@ -1,4 +1,4 @@
-"""The base of both chains: a run is a sequence of steps, and the last one's mesh."""
+"""Base class of both chains: a run is a sequence of steps and the mesh of the last one."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -58,15 +58,15 @@ class Step(Record):
     """All records of one pass over the facets.
 
     Attributes:
-        scale: Of the photographs that templates were sampled for; 1 is their own size.
+        scale: Scale of the photographs that templates were sampled for; 1 is full size.
         last: Whether this step's surface is the result.
-        scene: Cameras, undistorted photographs and the cloud.
-        held_out: Photographs that took no part but in finding cameras; None without any.
+        scene: Cameras, undistorted photographs and the point cloud.
+        held_out: Photographs used only to estimate cameras; None without any.
         heights: Depth maps of all patches, with their normals, albedo and lights.
         surface: Joined over all facets, on the subdivided coarse mesh.
-        reports: One of each stage that ran for this step, in order.
-        failures: What was left out so far, as it failed.
-        left_out: What guards left out or doubted so far, in order.
+        reports: Report of each stage that ran for this step, in order.
+        failures: Elements skipped so far because they failed.
+        left_out: Elements that guards removed or marked as unreliable so far, in order.
     """
 
     scale: float
@@ -99,17 +99,16 @@ class Step(Record):
 class Chain(Stage):
     """A graph of stages from photographs to a mesh.
 
-    Each stage is an attribute; assigning a different module that takes and returns the same records
-    swaps it, as naming it to the constructor does: ``CoarseToFine(config, factorize=Mine())``.
+    Each stage is an attribute. To replace it, assign a module that takes and returns the same
+    records, or pass one to the constructor: ``CoarseToFine(config, factorize=Mine())``.
 
-    Gradients run from photographs, cameras and coarse mesh through every stage after it. Structure
-    from motion, how the coarse mesh is found, and what is chosen (views, samples, faces, splits)
-    are constants to autograd.
+    Gradients flow from photographs, cameras and coarse mesh through all stages after it. Structure
+    from motion, the computation of the coarse mesh, and discrete choices (views, samples, faces,
+    splits) are not differentiable.
 
-    A function that is assigned to ``preview`` is called with the scene and the coarse surface as
-    soon as they are there; one that is assigned to ``watch`` with the scene as soon as cameras are
-    known, and with every step that is done. Photographs whose names are in ``needed`` are never
-    held out.
+    The function ``preview`` is called with the scene and the coarse surface as soon as they are
+    computed; ``watch`` is called with the scene as soon as cameras are known, and with every
+    finished step. Photographs named in ``needed`` are never held out.
     """
 
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
@@ -139,19 +138,19 @@ class Chain(Stage):
         sparse_model: Path | str | None,
         mesh: Mesh | None,
     ) -> Iterator[Step]:
-        """Run the stages up to the surface; yield each pass's records, without reports."""
+        """Run the stages up to the surface; yield the records of each pass, without reports."""
 
     def running(self) -> Running:
-        """Return how stages are called in a run."""
+        """Return the caller of stages for one run."""
         names = {module: name for name, module in self.named_children()}
         return Running(names=names, store=self.store)
 
     def references(self) -> Iterator[str]:
-        """List the photographs that stages were asked to take for the reference view."""
+        """Yield the names of photographs that settings of stages select as reference view."""
         for module in self.children():
-            named = getattr(getattr(module, "config", None), "reference", "")
-            if isinstance(named, str) and named:
-                yield named
+            name = getattr(getattr(module, "config", None), "reference", "")
+            if isinstance(name, str) and name:
+                yield name
 
     def placed(
         self,
@@ -162,48 +161,48 @@ class Chain(Stage):
         *,
         checked: bool = False,
     ) -> SparseScene:
-        """Return photographs with their cameras: those that come with them, or else find them.
+        """Return photographs with their cameras, given or estimated.
 
-        Views that cannot be used are left out; priors become those of undistorted views. A scene
-        without observed points gets some by the method ``with_points`` of ``reconstruct``, if that
-        has one, unless a mesh is given. Masks that belong to
-        other photographs, or are turned or inverted, are read as cameras and points say, and
-        cameras are found anew with them, unless they are ``checked``.
+        Unusable views are removed, and priors are undistorted. Unless a mesh is given, points are
+        added to a scene without observed ones, by the method ``with_points`` of ``reconstruct`` if
+        it has one. Masks of other photographs, or rotated or inverted ones, are corrected according
+        to cameras and points, and cameras are estimated again, unless masks are ``checked``.
         """
-        asked = views
+        original = views
         if isinstance(views, Views):
             views = run(self.reconstruct, views, sparse_model)
         elif sparse_model is not None:
             raise InputError(
-                f"{type(self).__name__}: cameras come twice, with the scene and as the model in "
-                f"{sparse_model}; needed: one of the two."
+                f"{type(self).__name__}: cameras are given twice, with the scene and as the model "
+                f"in {sparse_model}; needed: one of the two."
             )
         elif mesh is not None:
             refuse_other_axes(mesh, views)
         elif with_points := getattr(self.reconstruct, "with_points", None):
             observed: SparseScene = with_points(views)
             views = observed
-        few = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
-        scene = with_poses(sound(run(depth_points, views) if few else views))
+        bare = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
+        scene = with_poses(sound(run(depth_points, views) if bare else views))
         scene = with_undistorted_priors(scene)
         config = getattr(self.silhouettes, "config", None)
         if not checked and getattr(config, "object", "auto") != "everything":
-            given = asked if isinstance(asked, Views) else asked.views
-            reading = right_reading(scene, given)
+            photographs = original if isinstance(original, Views) else original.views
+            reading = right_reading(scene, photographs)
             if reading is not AS_THEY_ARE:
-                read = reading.of(given)
-                asked = read if isinstance(asked, Views) else asked.replace(views=read)
-                return self.placed(run, asked, sparse_model, mesh, checked=True)
-        self._watched(scene)
+                views = reading.of(photographs)
+                if isinstance(original, SparseScene):
+                    views = original.replace(views=views)
+                return self.placed(run, views, sparse_model, mesh, checked=True)
+        self._notify(scene)
         return scene
 
-    def _watched(self, found: "SparseScene | Step") -> None:
+    def _notify(self, record: "SparseScene | Step") -> None:
         if self.watch is not None:
             with stage("view"):
-                self.watch(found)
+                self.watch(record)
 
     def show(self, scene: SparseScene, coarse: CoarseMesh) -> None:
-        """Call ``preview`` with cameras and coarse surface, if it is set."""
+        """Call ``preview`` with the scene and the coarse surface, if it is set."""
         if self.preview is not None:
             with stage("preview"):
                 self.preview(scene, coarse)
@@ -215,11 +214,11 @@ class Chain(Stage):
         scene: SparseScene,
         silhouettes: Silhouettes,
     ) -> Mesh | None:
-        """Prepare a mesh that came with the photographs, see :func:`prepared`.
+        """Return the given mesh in the scene's frame, prepared by :func:`prepared`.
 
         Args:
-            mesh: If any. With photographs, in the frame of their cameras' model, with a scene in
-                that of the scene.
+            mesh: None is returned unchanged. Given with photographs, in the frame of their cameras'
+                model; given with a scene, in its frame.
 
         Raises:
             InputError: The mesh is not a surface, or is in a different frame.
@@ -227,11 +226,11 @@ class Chain(Stage):
         if mesh is None:
             return None
         if isinstance(views, Views):
-            placed = mesh.vertices_world.double()
-            mesh = mesh.replace(vertices_world=placed - placed.new_tensor(scene.offset_world))
-        with stage("given_mesh") as told:
+            vertices = mesh.vertices_world.double()
+            mesh = mesh.replace(vertices_world=vertices - vertices.new_tensor(scene.offset_world))
+        with stage("given_mesh") as report:
             mesh, figures = prepared(mesh, scene, silhouettes)
-            told |= figures
+            report |= figures
         return mesh
 
     def steps(
@@ -240,15 +239,15 @@ class Chain(Stage):
         sparse_model: Path | str | None = None,
         mesh: Mesh | None = None,
     ) -> Iterator[Step]:
-        """Run the stages up to the surface, pass by pass; takes what :meth:`forward` takes.
+        """Run the stages up to the surface, pass by pass. Arguments are those of :meth:`forward`.
 
         Yields:
-            The records of a pass, as soon as it is done. The next one runs when it is asked for.
+            The records of each finished pass. The next pass runs when it is requested.
         """
         check_handed(self, (views, sparse_model, mesh), {})
         names = (views if isinstance(views, Views) else views.views).names
-        for named in self.references():
-            view_named(named, names)  # not first after structure from motion
+        for reference in self.references():
+            view_named(reference, names)  # an unknown name fails before structure from motion
         passes = self.passes(self.running(), views, sparse_model, mesh)
         compile_ahead()
         entries: list[object] = []
@@ -256,7 +255,7 @@ class Chain(Stage):
             with collecting(self.on_failure, entries), recorded(self.observer) as reports:
                 step = next(passes, None)
                 if step is not None:
-                    self._watched(step)
+                    self._notify(step)
             if step is None:
                 return
             if step.last:
@@ -271,19 +270,18 @@ class Chain(Stage):
         sparse_model: Path | str | None = None,
         mesh: Mesh | None = None,
     ) -> Reconstruction:
-        """Reconstruct the surface that the photographs show.
+        """Reconstruct the surface of the photographed object.
 
         Args:
-            views: Photographs, on the device that everything after structure from motion
-                is to run on; or a scene whose cameras are known, see
-                :func:`~pimper_torch.doors.io.tensors.scene_of`.
+            views: Photographs, on the device on which stages after structure from motion run; or
+                a scene with known cameras, see :func:`~pimper_torch.doors.io.tensors.scene_of`.
             sparse_model: Folder of a COLMAP model of these photographs, or a file of their cameras,
                 used instead of running structure from motion.
-            mesh: A rough surface in that model's frame, or in the scene's, of any floating-point
-                type, used instead of the photographs' own.
+            mesh: A rough surface in the frame of that model or of the scene, of any floating-point
+                type, used instead of a reconstructed coarse surface.
 
         Raises:
-            PimperError: What was found at which stage, what was needed, what to do.
+            PimperError: Names the stage, what it found, what it needs, and what to do.
         """
         steps = self.steps(views, sparse_model, mesh)
         step = next(steps)
@@ -293,10 +291,10 @@ class Chain(Stage):
             step = next(steps)
             reports += step.reports
         with collecting(self.on_failure) as entries, recorded(self.observer) as last:
-            found = self.running()(self.extract, step.surface)
+            extracted = self.running()(self.extract, step.surface)
             warn_of(entries)
         return Reconstruction(
-            mesh=found,
+            mesh=extracted,
             scene=step.scene,
             held_out=step.held_out,
             silhouettes=step.silhouettes,
@@ -308,10 +306,10 @@ class Chain(Stage):
         )
 
     def finish(self, result: Reconstruction, files: MeshFiles | None = None) -> Reconstruction:
-        """Make a result ready to be written, on the CPU.
+        """Prepare a result for export, on the CPU.
 
-        A surface of fewer vertices; the lights and materials under which it predicts its
-        photographs, or those that were held out; and textures of few faces.
+        Adds a mesh with fewer vertices, the lights and materials that predict the photographs (the
+        held-out ones, if any), and textures for a mesh of few faces.
         """
         result = result.to("cpu")
         scene, held_out, silhouettes = result.scene, result.held_out, result.silhouettes
@@ -320,9 +318,9 @@ class Chain(Stage):
             finished = run(self.simplify, result.mesh, files or MeshFiles())
             relighting = run(self.relight, finished.few, scene, silhouettes, held_out)
             asset = run(self.texture, result.mesh, finished.few, relighting)
-            # By the photographs that the mesh was judged by.
-            judged_by = (scene, silhouettes) if held_out is None else (held_out, None)
-            relighting = run(judge_textures, relighting, asset, *judged_by)
+            # Against the same photographs as the mesh.
+            references = (scene, silhouettes) if held_out is None else (held_out, None)
+            relighting = run(judge_textures, relighting, asset, *references)
             warn_of(entries)
         return result.replace(
             finished=finished,
@@ -333,15 +331,15 @@ class Chain(Stage):
             left_out=(*result.left_out, *left_out_of(entries)),
         )
 
-    if TYPE_CHECKING:  # completion does not see through the type of a stage's call
+    if TYPE_CHECKING:  # code completion does not resolve the type of a stage's call
         __call__ = forward
 
     def _swap(self, stages: Mapping[str, nn.Module]) -> None:
         for name, module in stages.items():
-            known = [known for known, _ in self.named_children()]
-            if name not in known:
+            names = [child for child, _ in self.named_children()]
+            if name not in names:
                 raise ConfigError(
-                    f"{type(self).__name__} has no stage `{name}`.{nearest(name, known)} Stages: "
-                    f"{', '.join(known)}."
+                    f"{type(self).__name__} has no stage `{name}`.{nearest(name, names)} Stages: "
+                    f"{', '.join(names)}."
                 )
             setattr(self, name, module)

@@ -1,4 +1,4 @@
-"""Settings of whole chains, and the presets."""
+"""Settings of complete chains, and the presets."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,17 +30,16 @@ from pimper_torch.runtime.errors import OnFailure
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoarseToFineConfig:
-    """The settings of every stage of the chain from coarse to fine, in the order they run.
+    """Settings of every stage of the coarse-to-fine chain, in the order in which they run.
 
     Attributes:
-        chain: Which chain these are the settings of.
-        on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
-        max_memory: Such as 4GB: a surface that would take more is fused by blocks, or refused in
+        chain: Name of the chain.
+        on_failure: If a patch, view or solver fails, omit it and continue (skip), or stop (fail).
+        max_memory: For example 4GB: a surface that needs more is fused in blocks, or refused in
             the first pass.
-        hold_out: Predict every N-th photograph at the end, from the others alone; 0 holds out none.
-        scales: Of the photographs, one a pass, coarse to fine; 1 is their own size.
-        photographs: What :func:`~pimper_torch.doors.io.photographs.load_views` takes as
-            ``encoding``.
+        hold_out: Every N-th photograph is held out, and predicted at the end; 0 holds out none.
+        scales: Scale of the photographs in each pass, coarse to fine; 1 is full size.
+        photographs: ``encoding`` of :func:`~pimper_torch.doors.io.photographs.load_views`.
     """
 
     chain: ClassVar[str] = "coarse-to-fine"
@@ -64,21 +63,20 @@ class CoarseToFineConfig:
     def __post_init__(self) -> None:
         bytes_of(self.max_memory)
         require_ranges(self)
-        require(self.hold_out != 1, "hold_out", self.hold_out, "0, or 2 at least")
-        # Photographs hold nothing between their pixels, and memory goes with the square.
+        require(self.hold_out != 1, "hold_out", self.hold_out, "0, or at least 2")
+        # Photographs have no detail between pixels, and memory grows with the square of the scale.
         sound = bool(self.scales) and all(0 < scale <= 4 for scale in self.scales)
-        require(sound, "scales", self.scales, "one at least, above 0 and at most 4 each")
+        require(sound, "scales", self.scales, "at least one, each above 0 and at most 4")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishedConfig:
-    """The settings of every stage of the published chain, in the order they run.
+    """Settings of every stage of the published chain, in the order in which they run.
 
     Attributes:
-        chain: Which chain these are the settings of.
-        on_failure: Leave out a patch, view or solver that fails and go on (skip), or end (fail).
-        photographs: What :func:`~pimper_torch.doors.io.photographs.load_views` takes as
-            ``encoding``.
+        chain: Name of the chain.
+        on_failure: If a patch, view or solver fails, omit it and continue (skip), or stop (fail).
+        photographs: ``encoding`` of :func:`~pimper_torch.doors.io.photographs.load_views`.
     """
 
     chain: ClassVar[str] = "published"
@@ -103,12 +101,12 @@ Config = CoarseToFineConfig | PublishedConfig
 def load_config(
     name_or_path: str | Path = "default", changes: Mapping[str, object] | None = None
 ) -> Config:
-    """Read a preset, or a YAML file of one's own, which holds only what differs.
+    """Read the settings of a preset or of a YAML file; the file contains only changes to defaults.
 
     Args:
-        name_or_path: ``"default"``, ``"paper"``, ``"fast"``, or a file. Its ``chain`` says which
-            chain it is for: ``coarse-to-fine`` unless given, or ``published``.
-        changes: Laid over the file, nested by stage like it.
+        name_or_path: ``"default"``, ``"paper"``, ``"fast"``, or a file. Its ``chain`` selects the
+            chain: ``coarse-to-fine``, the default, or ``published``.
+        changes: Override the file, nested by stage as in it.
 
     Raises:
         ConfigError: Names the file or `changes`, section and key, and the nearest valid one.
@@ -121,8 +119,9 @@ def load_config(
 
 def _built(settings: Mapping[str, object], where: str) -> Config:
     chain = settings.get("chain", CoarseToFineConfig.chain)
-    found = [config for config in (CoarseToFineConfig, PublishedConfig) if config.chain == chain]
-    names = f"{CoarseToFineConfig.chain} or {PublishedConfig.chain}"
-    require(len(found) == 1, f"{where}: chain", chain, names)
-    config: type[Config] = found[0]
+    configs = (CoarseToFineConfig, PublishedConfig)
+    matching = [config for config in configs if config.chain == chain]
+    names = " or ".join(config.chain for config in configs)
+    require(len(matching) == 1, f"{where}: chain", chain, names)
+    config: type[Config] = matching[0]
     return build(config, settings, where)

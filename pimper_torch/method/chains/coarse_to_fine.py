@@ -1,4 +1,4 @@
-"""The chain from coarse to fine: all facets together, each pass on the surface before."""
+"""The coarse-to-fine chain: all facets together, each pass on the surface of the previous one."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -51,20 +51,20 @@ from pimper_torch.runtime.memory import largest_problem
 from pimper_torch.runtime.reporting import Observer
 from pimper_torch.runtime.store import Store, opened
 
-# As many as a surface needs, as everywhere.
+# The smallest number from which a surface is reconstructed.
 _MIN_VIEWS = 3
 
 
 def split_held_out(
     scene: SparseScene, every: int, needed: Iterable[str] = ()
 ) -> tuple[SparseScene, SparseScene | None]:
-    """Divide a scene into views that are used, and every n-th by name that is held out.
+    """Split a scene into used views and held-out views, which are every n-th in order of names.
 
     Args:
-        needed: Names, with their suffix or without, of views that are used in any case.
+        needed: Names, with or without suffix, of views that are never held out.
 
     Returns:
-        Both with the whole cloud; the first is the scene itself where no view is held out.
+        Scenes with the complete cloud. Without held-out views, the scene itself and None.
     """
     names, stay = scene.views.names, set(needed)
     ordered = sorted(range(len(names)), key=names.__getitem__)
@@ -73,7 +73,7 @@ def split_held_out(
     if not held:
         return scene, None
     left = len(names) - len(held)
-    needs = f"a number that leaves {_MIN_VIEWS} views at least; it leaves {left}"
+    needs = f"a number that leaves at least {_MIN_VIEWS} views; it leaves {left}"
     require(left >= _MIN_VIEWS, "hold_out", every, needs)
     out = torch.zeros(len(names), dtype=torch.bool)
     out[held] = True
@@ -84,7 +84,7 @@ def split_held_out(
 
 
 class CoarseToFine(Chain):
-    """A closed surface of what all views see, remeshed and fused again at every scale."""
+    """Chain that fuses and remeshes one surface of the object at every scale."""
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class CoarseToFine(Chain):
         sparse_model: Path | str | None,
         mesh: Mesh | None,
     ) -> Iterator[Step]:
-        """Run the stages behind the coarse mesh once a scale."""
+        """Run the stages after the coarse mesh once for each scale; see :meth:`Chain.passes`."""
         every = self.placed(run, views, sparse_model, mesh)
         needed = (*self.references(), *self.needed)
         placed, held_out = split_held_out(every, self.config.hold_out, needed)
@@ -156,12 +156,12 @@ class CoarseToFine(Chain):
                     del seen
             if surface is None:
                 limit, scales = bytes_of(self.config.max_memory), self.config.scales
-                most = largest_problem(limit, patches, scales[0], scales[-1])
-                by_blocks = () if math.isinf(most) else (most,)  # vertices solved for at once
+                size = largest_problem(limit, patches, scales[0], scales[-1])
+                by_blocks = () if math.isinf(size) else (size,)  # vertices per linear system
             heights = run(photometric, scene.views, cameras, patches, light, sources)
             heights = heights.replace(photometric=run(self.gauge, heights.photometric))
             if last:
-                del sources  # as much memory as the photographs themselves
+                del sources  # takes as much memory as the photographs
             surface = run(self.fuse, heights, contours, last, *by_blocks)
             surface = run(self.repair, surface)
             run(explain, surface, contours, shown.views.names if mesh is None else ())

@@ -1,4 +1,4 @@
-"""What the method does on each patch by itself: samples, normals under the light, and heights."""
+"""Stages that process each patch separately: samples, photometric normals, and heights."""
 
 from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
@@ -30,12 +30,12 @@ class Warping(Protocol):
     def __call__(
         self, views: Views, cameras: Cameras, patches: PatchSet, sources: Sources | None = None, /
     ) -> PatchViews:
-        """Return the samples J of every patch, and which of them are missing."""
+        """Return the samples J of every patch, and the mask D of valid ones."""
 
 
 @runtime_checkable
 class Sweeping(Protocol):
-    """A stage that finds heights under the fitted light."""
+    """A stage that sweeps heights under the fitted light."""
 
     def __call__(
         self,
@@ -50,10 +50,10 @@ class Sweeping(Protocol):
 
 
 class Photometric(Stage):
-    """Warp, factorize and sweep all patches, few at a time.
+    """Warp, factorize and sweep all patches, a few buckets at a time.
 
-    A patch needs nothing of others but the light. The samples J exist for as many buckets as are
-    worked on side by side, and no more: all of them take more memory than there is.
+    Patches are independent of each other given the light. Samples J exist only for the buckets
+    processed in parallel, because those of all patches do not fit into memory.
     """
 
     name = "photometry"
@@ -70,41 +70,41 @@ class Photometric(Stage):
         light: Illumination,
         sources: Sources | None = None,
     ) -> SweptPatches:
-        """Return heights, with the normals, albedo and lights that they were swept under.
+        """Return the swept heights of all patches, with their normals, albedo and lights.
 
         Args:
-            sources: The photographs, prepared for both stages.
+            sources: Image pyramids of the photographs, for warp and sweep.
         """
 
         def of_bucket(templates: Templates) -> SweptPatches:
-            some = patches.replace(buckets=(templates,))
+            bucket = patches.replace(buckets=(templates,))
             with part("warp"):
-                seen = self.warp(views, cameras, some, sources)  # samples J
+                seen = self.warp(views, cameras, bucket, sources)  # samples J
             add_counts(figures(seen))
             with part("factorize"):
                 photometric = self.factorize(seen, light)  # J = L N: lights, albedo and normals
             with part("sweep"):
                 return self.sweep(views, cameras, seen, photometric, sources)
 
-        parts = list(side_by_side(of_bucket, patches.buckets))
-        lit = tuple(one for each in parts for one in each.photometric.buckets)
+        results = list(side_by_side(of_bucket, patches.buckets))
+        lit = tuple(bucket for result in results for bucket in result.photometric.buckets)
         swept = SweptPatches(
             photometric=PhotometricPatches(patches=patches, buckets=lit),
-            buckets=tuple(one for each in parts for one in each.buckets),
-            averaged=parts[0].averaged,
+            buckets=tuple(bucket for result in results for bucket in result.buckets),
+            averaged=results[0].averaged,
         )
         warn_of_priors(figures(swept))
         release_memory()
         return swept
 
 
-def warn_of_priors(told: Mapping[str, int | float]) -> None:
-    """Warn of priors that are far from the estimates of the photographs."""
-    for what in ("normals", "depths"):
-        over = told.get(f"prior_{what}_over_claim", 0.0)
-        if over > 3:
+def warn_of_priors(counts: Mapping[str, int | float]) -> None:
+    """Warn of priors that deviate from the photographs by far more than their standard errors."""
+    for kind in ("normals", "depths"):
+        ratio = counts.get(f"prior_{kind}_over_claim", 0.0)
+        if ratio > 3:
             caution(
-                f"Prior {what} are {over:.1f} times as far from what the photographs tell as both "
-                "claim: they count for less. Look whether they are of these photographs, and how "
-                "far off they are said to be."
+                f"Prior {kind} deviate from estimates of the photographs {ratio:.1f} times as much "
+                "as the standard errors of both allow, and get less weight. Check that they belong "
+                "to these photographs, and that the standard errors given with them are right."
             )

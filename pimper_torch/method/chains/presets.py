@@ -1,4 +1,4 @@
-"""Settings by the name of a preset or from a file, and the chain that they are for."""
+"""Chains made from settings, a preset or a file."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,15 +18,15 @@ def make_chain(
     cache: Store | Path | str | None = None,
     **stages: nn.Module,
 ) -> CoarseToFine | Published:
-    """Make the chain that settings are for.
+    """Return the chain for these settings.
 
     Args:
-        observer: Hears how a run is going.
-        cache: Folder that keeps the record of every stage; nothing is kept without.
-        stages: Modules in place of the chain's own, by the names of its attributes.
+        observer: Receives reports of a run.
+        cache: Folder in which the record of every stage is kept; without it, none is.
+        stages: Modules that replace the chain's stages, by the names of its attributes.
 
     Raises:
-        ConfigError: The chain has no stage of a name.
+        ConfigError: The chain has no stage of a given name.
     """
     if isinstance(config, PublishedConfig):
         return Published(config, observer, cache, **stages)
@@ -40,5 +40,5 @@ def load_chain(
     cache: Store | Path | str | None = None,
     **stages: nn.Module,
 ) -> CoarseToFine | Published:
-    """Make the chain of a preset; see :func:`load_config` and :func:`make_chain`."""
+    """Return the chain of a preset or file; see :func:`load_config` and :func:`make_chain`."""
     return make_chain(load_config(name_or_path, changes), observer, cache, **stages)

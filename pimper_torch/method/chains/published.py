@@ -1,4 +1,4 @@
-"""The published chain: every facet by itself, then all joined."""
+"""The published chain: facets are reconstructed separately, then joined."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -40,7 +40,7 @@ from pimper_torch.runtime.store import Store, opened
 
 
 class Published(Chain):
-    """Facets between points of the cloud, depth of each by its normals, then all joined.
+    """Chain of facets between points of the cloud, each with depth from its normals, then joined.
 
     Source: Sabzevari, Del Bue, Murino: PiMPeR, piecewise dense 3D reconstruction from
     multi-view and multi-illumination images, 2015.
@@ -80,7 +80,7 @@ class Published(Chain):
         sparse_model: Path | str | None,
         mesh: Mesh | None,
     ) -> Iterator[Step]:
-        """Run once through the stages."""
+        """Run the stages once; see :meth:`Chain.passes`."""
         placed = self.placed(run, views, sparse_model, mesh)
         few = one_view_per_pose(placed, tuple(self.references()))
         outlines = run(self.silhouettes, few.scene)

@@ -1,4 +1,4 @@
-"""Calls of a chain's stages: kept and reported."""
+"""Calls of a chain's stages, with reports and kept records."""
 
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,12 +28,12 @@ from pimper_torch.runtime.store import Store, digest, kept
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Stages whose records are made in less time than they are read, and one that keeps its own.
+# Stages that compute records faster than these are read, and one that keeps its records itself.
 _NOT_KEPT = (
     *("reconstruct", "contours", "prepare", "decompose", "warp", "gauge", "repair", "explain"),
 )
 
-# Kernels that a stage waits for in an installation's first run.
+# Kernels that stages wait for in the first run of an installation.
 _KERNELS: Mapping[str, Sequence[str]] = {
     "silhouettes": COARSE,
     "warp": PHOTOMETRY,
@@ -44,16 +44,17 @@ _KERNELS: Mapping[str, Sequence[str]] = {
 
 @dataclass(slots=True, kw_only=True)
 class Running:
-    """Calls the stages of a chain in one run: ``run(self.fuse, heights, contours)``.
+    """Caller of a chain's stages in one run: ``run(self.fuse, heights, contours)``.
 
-    A stage's record is that of an earlier run where the store has it, and is kept else, see
-    :func:`~pimper_torch.runtime.store.store`. A stage of another package is called every time, as
-    its code is not known, and so is one that gradients are asked of.
+    The record of a stage is read from the store if an earlier run kept it there; otherwise it is
+    computed and kept, see :func:`~pimper_torch.runtime.store.store`. Stages of other packages are
+    always called, because their code is not known, and so are stages that need gradients.
 
     Attributes:
-        store: Where records are kept; nowhere without.
-        last: Whether this is the last pass. Warnings of earlier ones are given only where these
-            fail, as the last one repeats them.
+        names: Name of each module among the chain's stages.
+        store: Store of the records; without it, none is kept.
+        last: Whether this is the last pass. Warnings of earlier passes are given only if these
+            fail, because the last pass repeats them.
     """
 
     names: Mapping[nn.Module, str]
@@ -61,8 +62,8 @@ class Running:
     last: bool = True
 
     def __call__(self, stage: Callable[P, R], *inputs: P.args, **named: P.kwargs) -> R:
-        """Return the record of a stage, or of a function."""
-        given = (*inputs, *named.values())
+        """Return the record of a stage or of a function."""
+        arguments = (*inputs, *named.values())
         name = getattr(stage, "name", getattr(stage, "__name__", type(stage).__name__))
         if isinstance(stage, nn.Module):
             name = self.names.get(stage, name)
@@ -70,16 +71,16 @@ class Running:
             with reported_stage("compile"):
                 load(_KERNELS[name])
         with nullcontext() if self.last else held():
-            return typing.cast(R, self._kept(name, stage, given))
+            return typing.cast(R, self._kept(name, stage, arguments))
 
     def passes(self, scales: Sequence[float]) -> Iterator[tuple[float, bool]]:
-        """Walk through the scales of passes; yield each, and whether it is the last."""
+        """Yield the scale of each pass, and whether it is the last."""
         for number, scale in enumerate(scales, start=1):
             self.last = number == len(scales)
             yield scale, self.last
 
     def _kept(self, name: str, stage: Callable[..., object], inputs: tuple[object, ...]) -> object:
-        """Find the record of a stage, or make it and keep it."""
+        """Return the kept record of a stage, or compute and keep it."""
         make: Callable[[], Any] = partial(called, name, stage, *inputs)
         if self.store is None or name in _NOT_KEPT:
             return make()

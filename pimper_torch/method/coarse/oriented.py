@@ -54,7 +54,8 @@ def oriented_points(maps: Sequence[DepthMaps]) -> OrientedPoints:
         for scale in reversed(maps):
             wanted = torch.ones_like(scale.valid[view])
             if covered is not None:  # neither covered by finer pixels nor adjacent to one that is
-                fraction = adaptive_avg_pool2d(covered[None, None].float(), wanted.shape)
+                height, width = wanted.shape
+                fraction = adaptive_avg_pool2d(covered[None, None].float(), (height, width))
                 wanted &= max_pool2d(fraction, 3, 1, 1)[0, 0] == 0
             cloud, covered = _of_view(scale, view, wanted)
             clouds.append(cloud)

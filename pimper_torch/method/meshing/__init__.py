@@ -1,1 +1,1 @@
-"""Room of the package."""
+"""Extraction, repair and simplification of meshes."""

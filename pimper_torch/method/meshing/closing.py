@@ -1,4 +1,4 @@
-"""Closing: every hole of a surface, and every outer border, gets a cap."""
+"""Closing of a surface: caps over every hole and every outer border."""
 
 import math
 
@@ -15,19 +15,19 @@ from pimper_torch.runtime.errors import InputError
 
 
 def closed(mesh: Mesh) -> Closed:
-    """Close every border of a mesh by a membrane, as a soap film would.
+    """Close every border of a mesh with a membrane, like a soap film.
 
-    What was there stays as it is, but that the mesh is made a manifold first: where fans of
-    faces meet in a vertex only, each gets its own copy. A cap is a disk of rings, each with half
-    the vertices of the one around it, so that it is as fine as its border outside and coarse
-    inside. It says where the surface ends, not where the object is: its vertices have no
-    confidence, the mesh's extent as expected error, and the albedo of the border continued. Caps
-    of deep or twisted borders may cross the surface or themselves.
+    The given surface is unchanged, except that the mesh is made a manifold first: if fans of faces
+    meet only at a vertex, each gets its own copy. A cap is a disk of rings, each with half the
+    vertices of the ring around it, so it is as fine as the border outside and coarse inside. It
+    shows where the surface ends, not where the object is: its vertices have confidence 0, the
+    mesh's extent as expected error, and the continued albedo of the border. Caps of deep or twisted
+    borders may intersect the surface or themselves.
 
     Positions and albedo of caps are differentiable in those of the borders.
 
     Raises:
-        InputError: Faces on two sides of an edge face opposite ways.
+        InputError: Neighbouring faces have opposite orientation.
     """
     source, faces = vertex_fans(mesh.faces)
     count = len(source)
@@ -38,28 +38,28 @@ def closed(mesh: Mesh) -> Closed:
         count = max(count, int(cap.max()) + 1)
         caps.append(cap.to(faces))
     added = torch.cat(caps)
-    fresh = count - len(source)
+    num_new = count - len(source)
 
     extent = float(diagonal(mesh.vertices_world.detach()))
 
     def extended(values: Tensor | None, filler: float) -> Tensor | None:
         if values is None:
             return None
-        return torch.cat([values[source], values.new_full((fresh, *values.shape[1:]), filler)])
+        return torch.cat([values[source], values.new_full((num_new, *values.shape[1:]), filler)])
 
     film = mesh.vertices_world[source]
     if mesh.albedo is not None:
-        film = torch.cat([film, _known(mesh.albedo)[source].to(film)], dim=1)
-    film = torch.cat([film, film.new_zeros(fresh, film.shape[1])])
-    there = torch.arange(count, device=film.device) < len(source)
-    film = continued(film, there, face_edges(added)[0], film, film.new_zeros(count))
-    vertices, everything = film[:, :3], torch.cat([faces, added])
+        film = torch.cat([film, _filled(mesh.albedo)[source].to(film)], dim=1)
+    film = torch.cat([film, film.new_zeros(num_new, film.shape[1])])
+    given = torch.arange(count, device=film.device) < len(source)
+    film = continued(film, given, face_edges(added)[0], film, film.new_zeros(count))
+    vertices, all_faces = film[:, :3], torch.cat([faces, added])
     normals = mesh.normals_world
     if normals is not None:
-        normals = torch.cat([normals[source], vertex_normals(vertices, everything)[len(source) :]])
-    whole = Mesh(
+        normals = torch.cat([normals[source], vertex_normals(vertices, all_faces)[len(source) :]])
+    result = Mesh(
         vertices_world=vertices,
-        faces=everything,
+        faces=all_faces,
         normals_world=normals,
         albedo=None
         if mesh.albedo is None
@@ -67,21 +67,21 @@ def closed(mesh: Mesh) -> Closed:
         confidence=extended(mesh.confidence, 0.0),
         expected_error=extended(mesh.expected_error, extent),
     )
-    measured = torch.arange(len(everything), device=faces.device) < len(faces)
-    return Closed(mesh=whole, measured=measured, borders=len(cycles))
+    measured = torch.arange(len(all_faces), device=faces.device) < len(faces)
+    return Closed(mesh=result, measured=measured, borders=len(cycles))
 
 
-def _known(albedo: VertexValues) -> VertexValues:
-    """Assign vertices whose albedo no photograph shows the mean of the others'."""
-    known = albedo.isfinite()
-    mean = torch.where(known, albedo, 0).sum(dim=0) / known.sum(dim=0).clamp_min(1)
-    return torch.where(known, albedo, mean)
+def _filled(albedo: VertexValues) -> VertexValues:
+    """Return the albedo with the mean where it is not measured."""
+    measured = albedo.isfinite()
+    mean = torch.where(measured, albedo, 0).sum(dim=0) / measured.sum(dim=0).clamp_min(1)
+    return torch.where(measured, albedo, mean)
 
 
 def border_cycles(faces: Faces) -> list[list[int]]:
-    """Order the border of an oriented manifold: every one a cycle, its faces on the right.
+    """Return the borders of an oriented manifold as cycles of vertices, faces on their right.
 
-    A face on the other side of an edge runs the way of the cycle.
+    Faces of a cap use the edges in the direction of the cycle.
     """
     _, index = face_edges(faces)
     alone = (face_counts(index) == 1)[index].flatten()
@@ -90,22 +90,22 @@ def border_cycles(faces: Faces) -> list[list[int]]:
     following = dict(zip(first, ends[:, 0].tolist(), strict=True))
     if len(following) < len(first) or len(set(following.values())) < len(first):
         raise InputError(
-            "faces next to each other face opposite ways, so that nothing tells outside from "
-            "inside; needed: faces that all have their corners counter-clockwise from outside."
+            "neighbouring faces have opposite orientation, so inside and outside are undefined; "
+            "needed: corners of all faces counter-clockwise as seen from outside."
         )
-    cycles, left = [], dict(following)
+    cycles = []
     for start in first:
         cycle = []
-        while start in left:
+        while start in following:
             cycle.append(start)
-            start = left.pop(start)
+            start = following.pop(start)
         if cycle:
             cycles.append(cycle)
     return cycles
 
 
 def _disk(cycle: list[int], first: int) -> Faces:
-    """Triangulate a disk in rings; its inner vertices are numbered from ``first``."""
+    """Return faces of a disk in rings; its inner vertices are numbered from ``first``."""
     if len(cycle) == 3:
         return torch.tensor([cycle])
     outer, triangles = torch.tensor(cycle), []

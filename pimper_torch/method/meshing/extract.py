@@ -1,4 +1,4 @@
-"""Extraction: the joined surface in, one connected mesh out."""
+"""Extraction of the mesh from the joined surface."""
 
 import torch
 from torch.nn.functional import normalize
@@ -15,25 +15,24 @@ from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
-# Of a facet's side: what sticks out of a border and is about so wide is cut off. A choice: with 1,
-# a skull lost the edge of its teeth; so its base ends smoothly and they stay.
+# Approximate width of protrusions that are cut off a border, over a facet's side. A choice: a skull
+# keeps the edge of its teeth, which it lost with 1, and its base ends smoothly.
 _TOOTH = 0.7
-# Expected error, in multiples of the surface's median, from which surface is not determined. Of the
-# skull's flaps 3 in 4 faces have more than 8, of its other faces the median has 1; with 5 the
-# flaps go, and 8 % of what is cut without this limit stays.
+# Expected error, in multiples of the surface's median, above which surface is not determined. It is
+# above 8 for three quarters of the faces of the skull's flaps, and 1 for the median of its other
+# faces; with 5 the flaps are removed, and 8 % of the faces cut without this limit stay.
 _UNSURE = 5.0
 
 
 class Extract(Stage):
     """Extract the mesh that the photographs support, a manifold.
 
-    Faces without support are dropped, and so are spikes, faces that a fold turns over, and what
-    sticks out of borders (:mod:`~pimper_torch.method.meshing.borders`) and is not determined. Of
-    the remaining ones the large components stay, and where two fans of faces met in a vertex only,
-    each gets its own copy. Orientation is the coarse mesh's: counter-clockwise from outside.
+    Faces without support, spikes, overturned faces of folds, and undetermined protrusions of
+    borders (:mod:`~pimper_torch.method.meshing.borders`) are dropped. Large components of the rest
+    are kept. If two fans of faces meet only at a vertex, each gets its own copy. Orientation is
+    that of the coarse mesh: counter-clockwise from outside.
 
-    Differentiable: faces are chosen without gradient, and vertices, normals, albedo and
-    confidence of those keep theirs.
+    Differentiable in vertices, normals, albedo and confidence; the selection of faces is constant.
     """
 
     def __init__(self, config: ExtractConfig | None = None) -> None:
@@ -41,14 +40,14 @@ class Extract(Stage):
         self.config = config or ExtractConfig()
 
     def forward(self, surface: Surface) -> Mesh:
-        """Extract the mesh.
+        """Return the extracted mesh.
 
-        A surface without support anywhere, as of photographs without texture under one light, is
-        kept whole.
+        A surface without any support, as from photographs without texture under one light, is
+        kept completely. Raises :class:`ReconstructionError` if no face is left.
         """
         vertices = surface.vertices_world.detach()
         supported = surface.supported
-        if not bool(supported.any()):  # nowhere better than elsewhere
+        if not bool(supported.any()):
             supported = ~supported
         max_hole = self.config.max_hole * diagonal(vertices)
         filled = small_groups(vertices, surface.faces, ~supported, max_hole)
@@ -67,17 +66,16 @@ class Extract(Stage):
         faces, index = surface.faces[keep & ~spikes], index[keep & ~spikes]
         if len(faces) == 0:
             raise ReconstructionError(
-                f"extraction: of {len(surface.faces)} faces {with_support} have support, and "
-                f"{len(faces)} of those are no spikes; at least one is needed. Raise "
-                f"`extract.max_expected_error` (now {bound}) or "
-                f"`extract.max_stretch` (now {self.config.max_stretch}), or look at the fraction "
-                "of missing data that the report gives."
+                f"extraction: {with_support} of {len(surface.faces)} faces have support, and "
+                f"{len(faces)} of these are not spikes; at least one is needed. Raise "
+                f"`extract.max_expected_error` (now {bound}) or `extract.max_stretch` (now "
+                f"{self.config.max_stretch}), or check the fraction of missing data in the report."
             )
         unsure = ~surface.supported if error is None else error > _UNSURE * _typical(surface, error)
         length = _TOOTH * facet_side(surface)
         teeth = protruding(vertices, faces, length, unsure[faces].any(dim=1), (edges, index))
         leave_out("extract.borders", teeth & ~teeth.all(), at=(vertices, faces))
-        if not bool(teeth.all()):  # where all is as narrow as a facet, it is the surface
+        if not bool(teeth.all()):  # a surface as narrow as a facet is all teeth, and stays
             faces, index = faces[~teeth], index[~teeth]
         large = large_components(vertices, faces, self.config.min_piece, (edges, index))
         leave_out("extract.pieces", ~large, at=(vertices, faces))
@@ -93,7 +91,7 @@ class Extract(Stage):
 
 
 def _typical(surface: Surface, values: PerVertex) -> Scalar:
-    """Return the median over facets of the mean on each: vertices lie closer on some."""
+    """Return the median over facets of their mean, as vertices are denser on some facets."""
     count = torch.bincount(surface.facet)
     mean = torch.bincount(surface.facet, values.detach(), len(count)) / count
     return mean[count > 0].median()
@@ -109,9 +107,9 @@ def facet_side(surface: Surface) -> float:
 def large_components(
     vertices: Vertices, faces: Faces, fraction: float, edges: topology.FaceEdges
 ) -> FaceMask:
-    """Find the components, connected by edges, with a fraction of the largest one's area.
+    """Return the components, connected by edges, with at least a fraction of the largest area.
 
-    With a fraction of 1 only the first of the largest is marked.
+    With a fraction of 1, only the first of the largest is returned.
     """
     label = topology.graph_components(topology.face_pairs(faces, edges)[0], len(faces))
     areas = component_areas(vertices, faces, label)

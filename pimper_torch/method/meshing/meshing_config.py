@@ -1,4 +1,4 @@
-"""Settings of the mesh that is made of a surface."""
+"""Settings of the extraction of a mesh."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -11,15 +11,14 @@ class ExtractConfig:
     """Criteria for the parts of the surface to keep.
 
     Attributes:
-        max_expected_error: Faces with a vertex that is expected to be further off are cut out;
-            a fraction of the surface's extent (diagonal of its bounding box). Infinite keeps all.
-        max_hole: Connected vertices without support stay, as a filled hole, when they
-            extend over no more than this fraction of the surface's extent (both diagonals
-            of bounding boxes).
-        max_stretch: Longest edge of a face, in multiples of the surface's median edge;
-            longer ones are spikes or cliffs. Infinite keeps all.
-        min_piece: Fraction of the largest connected component's area that another one needs to
-            be kept; 1 keeps the largest only.
+        max_expected_error: Largest expected error of a face's vertices, as a fraction of the
+            surface's extent (diagonal of its bounding box). Infinite keeps all faces.
+        max_hole: Largest extent of connected vertices without support that stay as a filled
+            hole, as a fraction of the surface's (both diagonals of bounding boxes).
+        max_stretch: Longest edge of a face, in multiples of the surface's median edge; faces
+            with a longer one are spikes or cliffs. Infinite keeps all faces.
+        min_piece: Least area of a connected component that is kept, as a fraction of the largest
+            one's; 1 keeps only the largest.
     """
 
     max_expected_error: Annotated[float, Range(above=0)] = 0.02

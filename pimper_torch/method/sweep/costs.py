@@ -1,6 +1,6 @@
-"""Costs of a bucket's samples at all heights, under the fitted light.
+"""Matching costs of a bucket's samples at all heights, under the fitted light.
 
-On the CPU a kernel computes them in float32, and its adjoint the gradients; the torch functions
+A kernel computes them in float32 on the CPU, and its adjoint the gradients; the torch functions
 here are its reference.
 """
 
@@ -44,106 +44,104 @@ def inconsistency(
 
     .. math:: C = \sum_g \tfrac12 \log(1 + (x_g - \rho s_g)^2 / c^2)
 
-    with the albedo that is the median of those of single views, then so many re-weighted means.
+    The albedo is the median over views, refined by ``iterations`` re-weighted means.
 
     Args:
-        radiance: What each view shows of the sample if the hypothesis holds.
-        shading: Of albedo 1, the same for all hypotheses; positive where seen.
-        seen: Views that take part; the same for all hypotheses, as costs of different sets
-            could not be compared.
+        radiance: Radiance of the sample in each view under the hypothesis.
+        shading: For albedo 1, the same for all hypotheses; positive where seen.
+        seen: Views that are compared; the same for all hypotheses, because costs of different
+            sets are not comparable.
         scale: ``c``, in units of radiance.
 
     Differentiable in radiance, shading and scale, through the iterations of the albedo.
     """
     s = torch.where(seen, shading, 1)[..., None]
-    taken, per_scale = seen[..., None].to(radiance), 1 / scale[:, None, None]
+    used, per_scale = seen[..., None].to(radiance), 1 / scale[:, None, None]
     single = torch.where(seen[..., None], radiance / s, torch.nan)
     albedo = single.nanmedian(dim=1, keepdim=True).values.nan_to_num(nan=0.0)
     for _ in range(iterations):
         residual = (radiance - albedo * s) * per_scale
-        lit = taken * s / (1 + residual.square())
-        square = (lit * s).sum(dim=1, keepdim=True)
-        albedo = (lit * radiance).sum(dim=1, keepdim=True) / torch.where(square > 0, square, 1)
+        weighted = used * s / (1 + residual.square())
+        square = (weighted * s).sum(dim=1, keepdim=True)
+        albedo = (weighted * radiance).sum(dim=1, keepdim=True) / torch.where(square > 0, square, 1)
     residual = (radiance - albedo * s) * per_scale
-    return 0.5 * (taken * torch.log1p(residual.square())).sum(dim=1)
+    return 0.5 * (used * torch.log1p(residual.square())).sum(dim=1)
 
 
 def best_views(
     score: PerView, usable: SeenBy, count: int
 ) -> tuple[Int[Tensor, "sample chosen"], Bool[Tensor, "sample chosen"]]:
-    """Choose, for every sample, the usable views of the best scores, ``count`` of them at most.
+    """Return, for every sample, at most ``count`` usable views with the best scores.
 
     Returns:
-        The views, and which entries are no padding: a sample with fewer usable ones has fewer.
+        The views, and a mask that is False for padding, where a sample has fewer usable views.
 
     >>> score = torch.tensor([[0.5, 0.9, 0.7]])
     >>> best_views(score, torch.tensor([[True, True, False]]), 2)
     (tensor([[1, 0]]), tensor([[True, True]]))
     """
-    rated = torch.where(usable, score, -torch.inf)
-    best = rated.topk(min(count, score.shape[1]), dim=1)
+    score = torch.where(usable, score, -torch.inf)
+    best = score.topk(min(count, score.shape[1]), dim=1)
     return best.indices, best.values > -torch.inf
 
 
 def poses_first(score: PerView, usable: SeenBy, poses: Int[Tensor, " view"]) -> PerView:
-    """Rate the best usable view of every pose before the second of any, and so on.
+    """Return scores that rank the best view of every pose above the second best of any.
 
-    Views of one pose say nothing of a height: they agree whatever it is.
+    Views of the same pose agree at every height, so they do not determine it.
 
     Args:
         score: In [0, 1].
 
     Returns:
-        The score, less the number of better views of the same pose.
+        The score minus the number of better usable views of the same pose.
 
     >>> score, poses = torch.tensor([[0.9, 0.8, 0.3]]), torch.tensor([0, 0, 1])
     >>> poses_first(score, torch.ones(1, 3, dtype=torch.bool), poses)
     tensor([[ 0.9000, -0.2000,  0.3000]])
     """
-    rated = torch.where(usable, score, -torch.inf)
-    found = score.clone()
+    candidates = torch.where(usable, score, -torch.inf)
+    result = score.clone()
     for pose in sorted(set(poses.tolist())):
-        (own,) = torch.nonzero(poses == pose, as_tuple=True)
-        order = rated[:, own].argsort(dim=1, descending=True, stable=True)
-        found[:, own] -= order.argsort(dim=1)
-    return found
+        (views,) = torch.nonzero(poses == pose, as_tuple=True)
+        order = candidates[:, views].argsort(dim=1, descending=True, stable=True)
+        result[:, views] -= order.argsort(dim=1)
+    return result
 
 
 def view_scores(facing: PerView, footprint: PerView, shading: PerView) -> PerView:
-    """Rate views by angle, resolution and light.
+    """Return scores of views by angle, resolution and light; at most 1.
 
     Args:
-        facing: Cosine between the normal and the way to the camera.
-        footprint: Pixels that a sample spans, if it faced the camera; more than one is no
-            better than one.
-        shading: What the light makes of albedo 1 there.
-
-    A view that sees the surface straight on and finely, in the light of a good view, has 1.
+        facing: Cosine between the normal and the direction to the camera.
+        footprint: Pixels that a sample would span if it faced the camera; more than one counts
+            as one.
+        shading: Radiance for albedo 1; the mean over views and more count as 1.
     """
     typical = shading.clamp_min(0).mean(dim=1, keepdim=True)
     lit = shading / torch.where(typical > 0, typical, 1)
     return facing * footprint.clamp_max(1) * lit.clamp(0, 1)
 
 
-# Samples of the template between heights that are tried: a choice.
+# Distance between heights, in samples of the template. A choice.
 STEP = 0.7
 
-# A sample seen at a flatter angle (cosine) is looked up as if seen at this one, 87 degrees.
+# Least cosine of the viewing angle, 87 degrees, for the pyramid level of a lookup.
 _MIN_FACING = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Hypotheses(Record):
-    """Heights of a bucket's samples that are tried, and what they are tried on.
+    """Heights to compare for a bucket's samples, with the data for it.
 
     Attributes:
-        registered: Which views have which samples.
-        outward: Unit normals that samples are moved along, patch frame.
-        cameras: Of the bucket's views.
-        images: Where each camera's photograph is among the sources.
-        poses: Number of each view's pose, where some have several.
+        registered: Valid samples of each view.
+        outward: Unit normals along which samples are moved, patch frame.
+        cameras: Those of the bucket's views.
+        images: Index of each camera's photograph among the sources.
+        poses: Index of each view's pose; None if every view has its own.
         ladder: Heights, in steps.
-        scale: Of the robust cost, in units of radiance.
+        scale: Scale of the robust cost, in units of radiance.
     """
 
     templates: Templates
@@ -159,7 +157,7 @@ class Hypotheses(Record):
 
     @property
     def lights(self) -> tuple[Float[Tensor, "patch view 4"], Float[Tensor, "patch view"]]:
-        """Lights over the exposure of their views, and the factors of radiance beside them."""
+        """Lights divided by the exposure of their views, and the factors of radiance for it."""
         lights, exposure = self.photometry.lights_patch, self.photometry.exposure
         gains = torch.ones_like(lights[..., 0]) if exposure is None else 1 / exposure
         return lights * gains[..., None], gains
@@ -168,40 +166,40 @@ class Hypotheses(Record):
 Costs = tuple[Float[Tensor, "patch hypothesis height width"], Float[Tensor, "patch height width"]]
 
 
-def costs_of(given: Hypotheses, num_views: int, min_views: int) -> Costs:
+def costs_of(hypotheses: Hypotheses, num_views: int, min_views: int) -> Costs:
     """Return the robust cost of every height, and 1 where a sample is swept, else 0.
 
     Args:
-        num_views: Largest number of views that a sample is compared in.
-        min_views: Least number of them for a sample that is swept.
+        num_views: Largest number of views in which a sample is compared.
+        min_views: Least number of views of a sample that is swept.
     """
-    gray = given.sources.gray.finest
+    gray = hypotheses.sources.gray.finest
     if gray.dtype == torch.float32 and compiled_for(gray.detach()):
-        return _compiled_costs(given, num_views, min_views)
-    return _reference_costs(given, num_views, min_views)
+        return _compiled_costs(hypotheses, num_views, min_views)
+    return _reference_costs(hypotheses, num_views, min_views)
 
 
-def _compiled_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
+def _compiled_costs(bucket: Hypotheses, num_views: int, min_views: int) -> Costs:
     from pimper_torch.ground.kernels import sweep_costs
 
-    templates, photometry, gray = given.templates, given.photometry, given.sources.gray
-    to_patches = given.cameras, templates.patch_from_world
+    templates, photometry, gray = bucket.templates, bucket.photometry, bucket.sources.gray
+    to_patches = bucket.cameras, templates.patch_from_world
     projection, centers = image_from_patch(*to_patches), centers_in_patches(*to_patches)
-    intrinsics = given.cameras.intrinsics.double()
+    intrinsics = bucket.cameras.intrinsics.double()
     focals = (intrinsics[:, 0, 0] * intrinsics[:, 1, 1]).sqrt()
-    placed, samples = kernel_geometry(given.images, templates, given.outward, projection, centers)
-    light = photometry.normals_patch, *given.lights
+    placed, samples = kernel_geometry(bucket.images, templates, bucket.outward, projection, centers)
+    light = photometry.normals_patch, *bucket.lights
     trial = sweep_costs.Trial(
         as_array(photometry.observed & templates.inside),
-        as_array(given.registered.valid),
-        as_array(given.scale, torch.float32),
-        as_array(STEP * given.ladder, torch.float64),
-        as_array(torch.zeros(0, dtype=torch.long) if given.poses is None else given.poses),
+        as_array(bucket.registered.valid),
+        as_array(bucket.scale, torch.float32),
+        as_array(STEP * bucket.ladder, torch.float64),
+        as_array(torch.zeros(0, dtype=torch.long) if bucket.poses is None else bucket.poses),
         num_views,
         min_views,
         _MIN_FACING,
     )
-    shading = sweep_costs.Shading(*(as_array(each, torch.float32) for each in light))
+    shading = sweep_costs.Shading(*(as_array(values, torch.float32) for values in light))
     call = gray.pictures, as_array(gray.table), placed, as_array(focals), samples, shading, trial
     cost, swept = _Compiled.apply(  # type: ignore[no-untyped-call]
         call,
@@ -213,19 +211,19 @@ def _compiled_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
         templates.origin,
         templates.spacing,
         templates.depth,
-        given.outward,
+        bucket.outward,
         *light,
-        given.scale,
+        bucket.scale,
     )
     return cost.to(templates.depth), swept.to(templates.depth)
 
 
 class _Compiled(torch.autograd.Function):
-    """Costs as a function of pictures, geometry and light, by a kernel and its adjoint."""
+    """Costs as a function of images, geometry and light, by a kernel and its adjoint."""
 
     @staticmethod
     def forward(ctx: Any, call: Any, *inputs: Tensor) -> Costs:
-        """Return the costs, and which samples are swept."""
+        """Return the costs, and 1 for samples that are swept, else 0."""
         from pimper_torch.ground.kernels import sweep_costs
 
         trial = call[-1]
@@ -241,33 +239,33 @@ class _Compiled(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, on_cost: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
-        """Return gradients of pictures, geometry and light."""
+        """Return gradients of images, geometry and light."""
         from pimper_torch.ground.kernels import sweep_adjoint as adjoint
 
-        of_pictures = any(ctx.needs_input_grad[1:3])
+        of_images = any(ctx.needs_input_grad[1:3])
 
-        def add_to(*found: _Array) -> None:
-            gradients = adjoint.CostGradients(*found)
-            adjoint.pull_back(*(*ctx.call, as_array(on_cost), int(of_pictures), gradients))
+        def add_to(*arrays: _Array) -> None:
+            gradients = adjoint.CostGradients(*arrays)
+            adjoint.pull_back(*(*ctx.call, as_array(on_cost), int(of_images), gradients))
 
-        return None, *pulled_back(add_to, ctx.saved_tensors, of_pictures)
+        return None, *pulled_back(add_to, ctx.saved_tensors, of_images)
 
 
-def _reference_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs:
-    templates, cameras, poses = given.templates, given.cameras, given.poses
-    tested = given.photometry.observed & templates.inside
-    tested = tested & (given.registered.valid.sum(dim=1) >= min_views)
+def _reference_costs(bucket: Hypotheses, num_views: int, min_views: int) -> Costs:
+    templates, cameras, poses = bucket.templates, bucket.cameras, bucket.poses
+    tested = bucket.photometry.observed & templates.inside
+    tested = tested & (bucket.registered.valid.sum(dim=1) >= min_views)
     (index,) = torch.nonzero(tested.flatten(), as_tuple=True)
     patch = index // tested[0].numel()
     world_from_patch = invert_rigid(templates.patch_from_world)
     points = transform(world_from_patch, templates.points_patch.flatten(1, 2))
-    outward = rotate(world_from_patch, given.outward.flatten(1, 2))
+    outward = rotate(world_from_patch, bucket.outward.flatten(1, 2))
     points, outward = points.reshape(-1, 3)[index], outward.reshape(-1, 3)[index]
-    normals = given.photometry.normals_patch.reshape(-1, 3)[index]
+    normals = bucket.photometry.normals_patch.reshape(-1, 3)[index]
     basis = torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
-    lights, gains = given.lights
+    lights, gains = bucket.lights
     shading = torch.einsum("sga,sa->sg", lights[patch], basis)
-    valid = given.registered.valid.movedim(1, -1).reshape(-1, cameras.num_views)[index]
+    valid = bucket.registered.valid.movedim(1, -1).reshape(-1, cameras.num_views)[index]
     with torch.no_grad():
         away = cameras.centers_world - points[:, None]
         facing = (normalize(away, dim=-1) * outward[:, None]).sum(dim=-1)
@@ -282,10 +280,10 @@ def _reference_costs(given: Hypotheses, num_views: int, min_views: int) -> Costs
             enough = (seen & (score.gather(1, chosen) > 0)).sum(dim=1) >= min_views
     index, patch, chosen, seen = index[enough], patch[enough], chosen[enough], seen[enough]
     points, outward = points[enough], outward[enough]
-    radiance = _look_up(given, patch, points, outward, torch.where(seen, chosen, -1))
+    radiance = _look_up(bucket, patch, points, outward, torch.where(seen, chosen, -1))
     radiance = gains[patch].gather(1, chosen)[..., None] * radiance
     shading = shading[enough].gather(1, chosen)
-    cost = inconsistency(radiance, shading, seen, given.scale[patch])
+    cost = inconsistency(radiance, shading, seen, bucket.scale[patch])
     raster = templates.depth
     flat = cost.new_zeros(raster.numel(), cost.shape[1]).index_copy(0, index, cost)
     swept = torch.zeros_like(raster).flatten().index_fill(0, index, 1.0)
@@ -301,30 +299,30 @@ def _footprint(points: Float[Tensor, "sample 3"], spacing: PerSample, cameras: C
 
 
 def _look_up(
-    given: Hypotheses,
+    bucket: Hypotheses,
     patch: Int[Tensor, " sample"],
     points: Float[Tensor, "sample 3"],
     outward: Float[Tensor, "sample 3"],
     chosen: Int[Tensor, "sample chosen"],
 ) -> Float[Tensor, "sample chosen hypothesis"]:
-    """Look samples up at all heights in their views; -1 for none. World frame."""
-    spacing = given.templates.spacing[patch]
-    moves = STEP * spacing[:, None] * given.ladder.to(spacing)
+    """Return radiances of samples (world frame) at all heights in their views; -1 is padding."""
+    spacing = bucket.templates.spacing[patch]
+    moves = STEP * spacing[:, None] * bucket.ladder.to(spacing)
     radiance = moves.new_zeros(*chosen.shape, moves.shape[1]).flatten(0, 1)
-    for view in range(given.cameras.num_views):
+    for view in range(bucket.cameras.num_views):
         (slot,) = torch.nonzero((chosen == view).flatten(), as_tuple=True)
         if len(slot) == 0:
             continue
         sample = slot // chosen.shape[1]
         start, along = points[sample], outward[sample]
         moved = start[:, None] + moves[sample, :, None] * along[:, None]
-        camera = given.cameras.take([view])
+        camera = bucket.cameras.take([view])
         pixels, _ = project(moved.reshape(-1, 3), camera.cam_from_world[0], camera.intrinsics[0])
         across = _footprint(start, spacing[sample], camera)[:, 0]
         away = normalize(camera.centers_world - start, dim=-1)
         squeezed = (away * along).sum(dim=-1).clamp_min(_MIN_FACING)
         level = (across * squeezed.sqrt()).clamp_min(1).log2()
         level = level[:, None].expand(-1, moves.shape[1]).flatten()
-        looked_up = look_up(given.sources.gray.levels(int(given.images[view])), pixels, level)
+        looked_up = look_up(bucket.sources.gray.levels(int(bucket.images[view])), pixels, level)
         radiance = radiance.index_copy(0, slot, looked_up.reshape(len(slot), -1).to(radiance))
     return radiance.reshape(*chosen.shape, moves.shape[1])

@@ -1,4 +1,4 @@
-"""Where the costs of evenly spaced hypotheses are least, finer than their steps."""
+"""Sub-step minimum of the costs of evenly spaced hypotheses, and its variance."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,46 +12,46 @@ Costs = Float[Tensor, "*batch hypothesis"]
 def parabola_minimum(
     cost: Costs, prior: Costs | None = None
 ) -> tuple[Scalars, Scalars, Bool[Tensor, "*batch"]]:
-    """Fit a parabola to the least cost and the two beside it.
+    """Fit a parabola to the least cost and its two neighbours.
 
     Args:
-        prior: Added to the costs for the choice of the least one alone.
+        prior: Added to the costs only for selecting the least one.
 
     Returns:
         The position of the minimum in steps from the first hypothesis, the parabola's second
-        derivative there (per squared step), and whether there is such a minimum: a cost at
-        an end of the range is none, for the range may end before it.
+        derivative there (per squared step), and whether the minimum is interior: the least cost
+        does not count at an end of the range, because the minimum may be beyond it.
 
-    Differentiable in the costs; which hypothesis is least is constant.
+    Differentiable in the costs; the index of the least cost is constant.
 
     >>> cost = torch.tensor([[4.0, 1.0, 0.0, 1.0]])
     >>> parabola_minimum(cost)
     (tensor([2.]), tensor([2.]), tensor([True]))
     """
     last = cost.shape[-1] - 1
-    chosen_by = cost if prior is None else cost + prior
-    best = chosen_by.detach().argmin(dim=-1, keepdim=True)
+    selection = cost if prior is None else cost + prior
+    best = selection.detach().argmin(dim=-1, keepdim=True)
     interior = (best > 0) & (best < last)
     centre = best.clamp(1, last - 1)
-    before, here, after = (cost.gather(-1, centre + step)[..., 0] for step in (-1, 0, 1))
-    curvature = before - 2 * here + after
+    before, least, after = (cost.gather(-1, centre + step)[..., 0] for step in (-1, 0, 1))
+    curvature = before - 2 * least + after
     bent = interior[..., 0] & (curvature > 0)
-    aside = (before - after) / (2 * torch.where(bent, curvature, 1))
-    position = torch.where(bent, centre[..., 0] + aside.clamp(-0.5, 0.5), best[..., 0].to(cost))
+    shift = (before - after) / (2 * torch.where(bent, curvature, 1))
+    position = torch.where(bent, centre[..., 0] + shift.clamp(-0.5, 0.5), best[..., 0].to(cost))
     return position, torch.where(bent, curvature, 0), bent
 
 
 def posterior_variance(cost: Costs, position: Scalars, curvature: Scalars) -> Scalars:
-    r"""Return the variance of the minimum's position, in squared steps.
+    r"""Return the posterior variance of the minimum's position, in squared steps.
 
-    Costs are taken for negative log likelihoods, :math:`p_k \propto e^{-C_k}`. The variance is
-    that of the parabola at the minimum, :math:`1 / C''`, and by how much the variance over all
-    hypotheses exceeds that over the same hypotheses of this parabola: costs of a Gaussian have
-    its variance, and further minima that are nearly as low add their spread.
+    Costs are interpreted as negative log likelihoods, :math:`p_k \propto e^{-C_k}`. The variance is
+    that of the parabola at the minimum, :math:`1 / C''`, plus the excess of the variance over all
+    hypotheses above that of this parabola at the same hypotheses. Gaussian costs thus give the
+    variance of the Gaussian, and other minima that are nearly as low add their spread.
 
     Args:
         position: Of the minimum, in steps from the first hypothesis.
-        curvature: Second derivative there; where it is 0 the variance is infinite.
+        curvature: Second derivative there; if it is 0, the variance is infinite.
 
     >>> cost = torch.tensor([[100.0, 0.0, 100.0]])
     >>> posterior_variance(cost, torch.tensor([1.0]), torch.tensor([200.0]))

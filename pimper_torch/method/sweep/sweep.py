@@ -1,4 +1,4 @@
-"""The stage that finds heights by a sweep along normals, under the fitted light."""
+"""The stage that estimates heights by a sweep along normals, under the fitted light."""
 
 import torch
 from jaxtyping import Float, Int
@@ -9,7 +9,7 @@ from pimper_torch.ground.geometry.template_normals import transferred_normals
 from pimper_torch.method.sweep.costs import STEP, Hypotheses, costs_of
 from pimper_torch.method.sweep.minimum import parabola_minimum, posterior_variance
 from pimper_torch.method.sweep.sweep_config import SweepConfig
-from pimper_torch.method.sweep.windows import level_weight, window_mean, window_size
+from pimper_torch.method.sweep.windows import flat_weight, window_mean, window_size
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -27,33 +27,32 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.runtime.stage import Stage
 
-# Samples whose noise is correlated, as they are interpolated between the same pixels: with 4 the
-# claimed deviation of heights is 0.8 to 1.25 times that of their errors (`test_sweep.py`).
+# Number of samples with common noise, because they are interpolated between the same pixels: with 4
+# the estimated standard error of heights is 0.8 to 1.25 times the actual one (`test_sweep.py`).
 CORRELATED_SAMPLES = 4.0
 
-# Standard deviation of the window that costs are averaged over, in samples: a choice.
+# Standard deviation of the window over which costs are averaged, in samples. A choice.
 _WINDOW = 1.5
 
-# Of the robust cost, in standard deviations of the patch's residuals: a choice (2.385 is 95 %
+# Scale of the robust cost, in standard deviations of the patch's residuals. A choice (2.385 is 95 %
 # efficient on Gaussian noise).
 _LOSS_SCALE = 2.0
 
 
 class Sweep(Stage):
-    r"""Find how far along the template's normal every sample has to move for views to agree.
+    r"""Estimate the height of every sample, along the template's normal, at which views agree.
 
-    For each of a few heights all views are looked up again, and the light that was fitted, the
-    photometric normal, or the coarse one where light determines none, and the best albedo predict
-    them; robust residuals are averaged over a
-    small window, which stops at cliffs and at the template's border, and the least cost is
-    found to a fraction of a step. This is multi-view stereo under changing light. The inverse
-    variance of a height follows from the costs of all heights: it is small with little texture,
-    or where several heights have low costs. Depth that was guessed of the photographs chooses
-    between these, and views that likely show no diffuse reflection of a sample are left out.
+    At each of a few heights all views are sampled, and their radiance is predicted from the fitted
+    light, the photometric normal (the coarse one if light determines none) and the best albedo.
+    Robust residuals are averaged over a small window that stops at cliffs and at the template's
+    border, and the minimum is located to a fraction of a step. This is multi-view stereo under
+    changing light. The inverse variance of a height follows from the costs of all heights: it is
+    small with little texture, or if several heights have low costs. A depth prior selects between
+    these, and views that likely show no diffuse reflection of a sample are excluded.
 
-    A height at the end of the range is none. Differentiable in photographs, cameras, templates,
-    normals, lights and the patches' residuals, offsets through the parabola at the least cost;
-    which views and which height are chosen is constant.
+    A minimum at the end of the range gives no height. Differentiable in photographs, cameras,
+    templates, normals, lights and the patches' residuals; offsets through the parabola at the least
+    cost. The selected views and heights are constant.
     """
 
     def __init__(self, config: SweepConfig | None = None) -> None:
@@ -68,42 +67,42 @@ class Sweep(Stage):
         photometric: PhotometricPatches,
         sources: Sources | None = None,
     ) -> SweptPatches:
-        """Sweep all patches, or those of some buckets.
+        """Return the heights of all patches.
 
         Args:
-            photometric: Light and normals of the same buckets.
-            sources: The photographs as ``Warp`` prepares them; made here where not given.
+            photometric: Lights and normals of the same buckets.
+            sources: Image pyramids of the photographs, as for ``Warp``; computed if not given.
         """
         buckets = zip(photometric.patches.buckets, seen.buckets, photometric.buckets, strict=True)
-        pictures, coarse = sources or prepare(views), photometric.patches.coarse
+        pyramids, coarse = sources or prepare(views), photometric.patches.coarse
 
-        def one(bucket: tuple[Templates, Observations, Photometry]) -> Heights:
-            found = self._sweep(cameras, pictures, coarse, views.poses, *bucket)
-            return self._finite(found, *bucket[:2])
+        def of_bucket(bucket: tuple[Templates, Observations, Photometry]) -> Heights:
+            heights = self._sweep(cameras, pyramids, coarse, views.poses, *bucket)
+            return self._finite(heights, *bucket[:2])
 
         return SweptPatches(
             photometric=photometric,
-            buckets=tuple(side_by_side(one, list(buckets))),
+            buckets=tuple(side_by_side(of_bucket, list(buckets))),
             averaged=window_size(_WINDOW),
         )
 
-    def _finite(self, found: Heights, templates: Templates, registered: Observations) -> Heights:
-        """Drop heights that are not finite, and record how many samples have none."""
+    def _finite(self, heights: Heights, templates: Templates, registered: Observations) -> Heights:
+        """Return the finite heights, and record the number of samples without height."""
         usable = registered.valid.sum(dim=1)
-        most = (usable - self.config.num_views).clamp_min(0)
-        leave_out("sweep.selection", int(most.sum()), total=int(usable.sum()))
-        asked = usable >= self.config.min_views
-        none = asked & (found.information == 0)
-        leave_out("sweep.heights", int(none.sum()), total=int(asked.sum()))
-        finite = found.offset.isfinite() & found.information.isfinite()
+        surplus = (usable - self.config.num_views).clamp_min(0)
+        leave_out("sweep.selection", int(surplus.sum()), total=int(usable.sum()))
+        swept = usable >= self.config.min_views
+        missing = swept & (heights.information == 0)
+        leave_out("sweep.heights", int(missing.sum()), total=int(swept.sum()))
+        finite = heights.offset.isfinite() & heights.information.isfinite()
         if bool(finite.all()):
-            return found
-        lost = templates.facet[~finite.flatten(1).all(dim=1)]
+            return heights
+        facets = templates.facet[~finite.flatten(1).all(dim=1)]
         done = "These patches keep their template's heights there"
-        skipped_patches("sweep", lost, "heights are not finite", done)
-        return found.replace(
-            offset=torch.where(finite, found.offset, 0),
-            information=torch.where(finite, found.information, 0),
+        skipped_patches("sweep", facets, "heights are not finite", done)
+        return heights.replace(
+            offset=torch.where(finite, heights.offset, 0),
+            information=torch.where(finite, heights.information, 0),
         )
 
     def _sweep(
@@ -118,11 +117,11 @@ class Sweep(Stage):
     ) -> Heights:
         config = self.config
         images = templates.rows(cameras.num_views)
-        shown = registered.valid.flatten(2).any(dim=2).sum(dim=1)
+        num_views = registered.valid.flatten(2).any(dim=2).sum(dim=1)
         priors = registered.priors
         if priors is not None and priors.inlier is not None:
             registered = registered.replace(valid=registered.valid & (priors.inlier > 0.5))
-        # On exact data residuals are rounding.
+        # On exact data, residuals are only rounding errors.
         residual = photometry.convergence.residual.clamp_min(1e-4)
         ladder = torch.arange(-config.steps, config.steps + 1.0)
         hypotheses = Hypotheses(
@@ -138,31 +137,31 @@ class Sweep(Stage):
             scale=_LOSS_SCALE * residual,
         )
         costs, swept = costs_of(hypotheses, config.num_views, config.min_views)
-        window = level_weight(templates.depth.detach(), swept, templates.spacing)
+        window = flat_weight(templates.depth.detach(), swept, templates.spacing)
         averaged = window_size(_WINDOW)
-        # Near zero Cauchy's loss is the square over twice its scale's: now over the variance.
+        # Near zero Cauchy's loss is the square over twice the squared scale: now over the variance.
         weight = _LOSS_SCALE**2 * averaged / CORRELATED_SAMPLES
         costs = weight * window_mean(costs, window, _WINDOW)
-        weighed = window > 0
-        costs = costs.movedim(1, -1)[weighed]
-        guess: Float[Tensor, "sample hypothesis"] | None = None
+        inside = window > 0
+        costs = costs.movedim(1, -1)[inside]
+        prior: Float[Tensor, "sample hypothesis"] | None = None
         if priors is not None:
-            # Where several heights agree, the guess chooses; photographs show where it is.
-            off = STEP * templates.spacing[:, None, None, None] * ladder.to(costs)
-            off = off - priors.offset[..., None]
-            guess = torch.log1p(0.5 * priors.offset_information[..., None] * off.square())[weighed]
-        position, curvature, interior = parabola_minimum(costs, guess)
+            # The prior selects among heights of low cost; costs alone locate the minimum.
+            error = STEP * templates.spacing[:, None, None, None] * ladder.to(costs)
+            error = error - priors.offset[..., None]
+            prior = torch.log1p(0.5 * priors.offset_information[..., None] * error.square())[inside]
+        position, curvature, interior = parabola_minimum(costs, prior)
         variance = posterior_variance(costs, position, curvature)
-        unknown = ((2 * config.steps + 1) ** 2 - 1) / 12  # the variance of not knowing
-        fraction = (1 / variance - 1 / unknown).clamp_min(0) / averaged
+        uniform = ((2 * config.steps + 1) ** 2 - 1) / 12  # variance of equal costs
+        fraction = (1 / variance - 1 / uniform).clamp_min(0) / averaged
         interior = interior & (fraction > 0)
-        step = (STEP * templates.spacing)[:, None, None].expand_as(window)[weighed]
+        step = (STEP * templates.spacing)[:, None, None].expand_as(window)[inside]
         offset = torch.where(interior, (position - config.steps) * step, 0)
         information = torch.where(interior, fraction / step.square(), 0)
         zero = torch.zeros_like(window)
         return Heights(
-            offset=zero.index_put((weighed,), offset),
-            information=zero.index_put((weighed,), information),
-            num_views=shown,
+            offset=zero.index_put((inside,), offset),
+            information=zero.index_put((inside,), information),
+            num_views=num_views,
             priors=priors,
         )

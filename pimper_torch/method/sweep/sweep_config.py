@@ -8,13 +8,13 @@ from pimper_torch.runtime.config import Range, require, require_ranges
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepConfig:
-    """Which heights are tried, and in how many views they are compared.
+    """Number of heights, and of views in which they are compared.
 
     Attributes:
-        steps: Tried on each side of the template.
-        num_views: Largest number of views that a sample is compared in: the best by angle,
-            resolution and light of those that have it.
-        min_views: A sample that fewer usable views have, of distinct poses, gets no height.
+        steps: Number of heights on each side of the template.
+        num_views: Largest number of views in which a sample is compared: those with the best
+            angle, resolution and light.
+        min_views: Samples in fewer usable views, of distinct poses, get no height.
     """
 
     steps: Annotated[int, Range(least=1, most=1000)] = 4

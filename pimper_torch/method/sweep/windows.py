@@ -13,25 +13,25 @@ Layers = Float[Tensor, "patch channel height width"]
 
 
 def window_mean(values: Layers, weight: PatchRaster, radius: float) -> Layers:
-    """Average with a Gaussian of standard deviation ``radius``, in samples.
+    """Return Gaussian averages of standard deviation ``radius``, in samples.
 
     Args:
-        values: Anything; what has no weight does not matter, if finite.
-        weight: Of each sample, 0 for those that must stay out.
-        radius: Cut off at two and a half of it.
+        values: Ignored where the weight is 0, but must be finite.
+        weight: Of each sample; 0 excludes it.
+        radius: The window is cut off at 2.5 times this.
 
     Zero where no sample of the window has weight. Differentiable.
     """
-    heavy = torch.cat([values * weight[:, None], weight[:, None]], dim=1)
-    rows, columns = (_blur(size, radius).to(heavy) for size in heavy.shape[2:])
-    summed = rows @ (heavy @ columns)
+    weighted = torch.cat([values * weight[:, None], weight[:, None]], dim=1)
+    rows, columns = (_blur(size, radius).to(weighted) for size in weighted.shape[2:])
+    summed = rows @ (weighted @ columns)
     total = summed[:, -1:]
-    some = total > torch.finfo(total.dtype).eps
-    return torch.where(some, summed[:, :-1] / torch.where(some, total, 1), 0)
+    positive = total > torch.finfo(total.dtype).eps
+    return torch.where(positive, summed[:, :-1] / torch.where(positive, total, 1), 0)
 
 
 def _blur(size: int, radius: float) -> Float[Tensor, "size size"]:
-    """Return the symmetric matrix that sums over the window along an axis of that many samples."""
+    """Return the symmetric matrix that averages over the window along an axis of ``size``."""
     reach = max(1, round(2.5 * radius))
     steps = torch.arange(max(size, reach + 1))
     away = (steps[:size, None] - steps[:size]).abs()
@@ -40,7 +40,7 @@ def _blur(size: int, radius: float) -> Float[Tensor, "size size"]:
 
 
 def window_size(radius: float) -> float:
-    """Return how many samples the window averages: as many as one of equal weights with its noise.
+    """Return the effective number of samples in the window: equal weights give the same noise.
 
     >>> round(window_size(2.0))
     50
@@ -48,21 +48,21 @@ def window_size(radius: float) -> float:
     return 4 * math.pi * radius**2
 
 
-def level_weight(
+def flat_weight(
     depth: PatchRaster, swept: PatchRaster, spacing: Float[Tensor, " patch"], max_slope: float = 4.0
 ) -> PatchRaster:
-    """Return the weight of every sample in windows: none on a cliff.
+    """Return the weight of every sample in windows, 0 on a cliff.
 
-    A window would otherwise mix the two sides of a depth edge.
+    Otherwise a window would mix the two sides of a depth edge.
 
     Args:
         swept: 1 where a sample has costs, else 0.
-        spacing: Of the samples, in units of the depth.
-        max_slope: Between a sample and each of its four neighbours; more is a cliff.
+        spacing: Sample spacing, in units of the depth.
+        max_slope: Largest slope between a sample and its four neighbours; above it is a cliff.
     """
     per_sample = 1 / spacing[:, None, None]
     across = depth.diff(dim=2).abs() * per_sample < max_slope
     down = depth.diff(dim=1).abs() * per_sample < max_slope
-    level = pad(across, (1, 0), value=True) & pad(across, (0, 1), value=True)
-    level = level & pad(down, (0, 0, 1, 0), value=True) & pad(down, (0, 0, 0, 1), value=True)
-    return swept * level
+    flat = pad(across, (1, 0), value=True) & pad(across, (0, 1), value=True)
+    flat = flat & pad(down, (0, 0, 1, 0), value=True) & pad(down, (0, 0, 0, 1), value=True)
+    return swept * flat
