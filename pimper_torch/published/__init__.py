@@ -1,1 +1,1 @@
-"""Stages of the published chain alone: every facet by itself, then all joined."""
+"""Stages of the published chain: facets are reconstructed separately, then joined."""

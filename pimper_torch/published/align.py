@@ -1,4 +1,4 @@
-"""Alignment: bas-relief transforms that make neighbouring patches agree."""
+"""Alignment of neighbouring patches by bas-relief transforms."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ from pimper_torch.runtime.stage import Stage
 def patch_status(
     facets: Int[Tensor, "seam 2"], met: Bool[Tensor, "seam ray"], count: int
 ) -> Int[Tensor, " face"]:
-    """Assign every patch its :class:`~pimper_torch.records.AlignStatus`."""
+    """Return the :class:`~pimper_torch.records.AlignStatus` of every patch."""
     overlapping = met.sum(dim=1) >= 0.25 * met.shape[1]
     status = torch.full((count,), int(AlignStatus.ALONE), device=facets.device)
     status[facets[overlapping].flatten()] = int(AlignStatus.ALIGNED)
@@ -41,78 +41,78 @@ def patch_status(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Anchors(Record):
-    """The vertices of every facet, which its height field is to pass through.
+    """The vertices of every facet, which its height field should pass through.
 
     Attributes:
-        samples: ``(x, y, z)`` of the height field over the vertex, before any transform, patch
+        samples: ``(x, y, z)`` of the height field at the vertex, before any transform, patch
             frame.
-        variance: Of the vertex along the facet's normal, scene units squared.
-        known: Whether there is height field over the vertex.
+        variance: Variance of the vertex along the facet's normal, scene units squared.
+        valid: True if the height field is valid at the vertex.
     """
 
     samples: Float[Tensor, "face 3 3"]
     variance: Float[Tensor, "face 3"]
-    known: Bool[Tensor, "face 3"]
+    valid: Bool[Tensor, "face 3"]
 
 
 def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
-    """Anchor every height field at its facet's three vertices."""
+    """Return the anchors of every height field at its facet's three vertices."""
     mesh, covariance = patches.coarse.mesh, patches.coarse.covariance_world
     vertices = mesh.vertices_world[mesh.faces].double()
     if covariance is None:
         covariance = vertices.new_zeros(len(mesh.vertices_world), 3, 3)
-    found = []
+    results = []
     for templates, depths in zip(patches.buckets, buckets, strict=True):
         facet, frames = templates.facet, templates.patch_from_world.double()
         across = transform(frames, vertices[facet])[..., :2]
         grid = templates.origin.double(), templates.spacing.double()
         height = sample_raster(depths.depth[:, None], across, *grid, valid=depths.valid)
         support = sample_raster(depths.valid[:, None].to(depths.depth), across, *grid)
-        along, spread = frames[:, 2, :3], covariance[mesh.faces[facet]].double()
-        variance = torch.einsum("fi,fvij,fj->fv", along, spread, along).clamp_min(0)
-        found.append((torch.cat([across, height.mT], dim=-1), variance, support[:, 0] > 0.5))
-    samples, variance, known = (by_facet(patches, parts) for parts in zip(*found, strict=True))
-    return Anchors(samples=samples, variance=variance, known=known)
+        normal, spread = frames[:, 2, :3], covariance[mesh.faces[facet]].double()
+        variance = torch.einsum("fi,fvij,fj->fv", normal, spread, normal).clamp_min(0)
+        results.append((torch.cat([across, height.mT], dim=-1), variance, support[:, 0] > 0.5))
+    samples, variance, valid = (by_facet(patches, values) for values in zip(*results, strict=True))
+    return Anchors(samples=samples, variance=variance, valid=valid)
 
 
-# Solves within the first round, so that weights that depend on the answer settle; later
-# rounds begin nearer to it and take one less.
+# Solves within the first round, until weights that depend on the solution converge; later rounds
+# start closer to it and need one less.
 _REWEIGHTINGS = 3
 
 
 # Lines of samples across each overlap, samples along each, and the distance of the outermost lines
-# from the edge in template samples: `paper` has overlaps of 6.
+# to the edge in template samples; `paper` has overlaps of 6.
 _ROWS, _COLUMNS, _REACH = 3, 12, 5.0
 
 
 class Align(Stage):
-    r"""Undo the bas-relief transform that photometry leaves each patch with.
+    r"""Estimate the bas-relief transform that photometry leaves undetermined in each patch.
 
-    The height field z of a patch may still be changed to :math:`h^T S`, :math:`S = (x, y, z)`
-    in its own frame, without contradicting its photographs. All h are found together: rays along
-    the bisector of two facets' normals meet both height fields over the edge they share, and
+    The height field z of a patch can be changed to :math:`h^T S`, :math:`S = (x, y, z)` in its
+    frame, without contradicting its photographs. All h are estimated together: rays along the
+    bisector of two facets' normals intersect both height fields over their shared edge, and
 
     .. math::
         \min_h \sum_{seams} k \, \overline{| P_\mu + N_\mu h_\mu^T S_\mu
         - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'} |^2}
 
-    with P the foot points on the facets' planes and N their normals. Each round meets the
-    overlaps anew and solves one sparse linear system.
+    with P the foot points on the facets' planes and N their normals. Each round intersects the
+    overlaps again and solves one sparse linear system.
 
     :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, with C the mean square of the height field's
-    curvature along the seam times the edge's length, which grows as :math:`h_z^2`: flattening both
-    height fields does not make :math:`k |r|^2` smaller. The derivative of k enters the right-hand
-    side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve.
+    curvature along the seam times the edge's length. C is proportional to :math:`h_z^2`, so
+    flattening both height fields does not reduce :math:`k |r|^2`. The derivative of k enters the
+    right-hand side of :math:`h_z`, as :math:`k^2 C h_z \overline{|r|^2}` from the previous solve.
 
-    Over coplanar facets a common affine change leaves height fields in agreement, and
-    :math:`h = 0` has no error. Folds determine scales; anchors, each height field passing through
-    its facet's vertices, determine tilts; the prior toward the identity determines the rest. A
-    patch that meets no neighbour stays on the mesh, where its own anchors put it.
+    Over coplanar facets, height fields still agree after a common affine change, and
+    :math:`h = 0` has no error. Folds determine scales. Anchors, which keep each height field at
+    its facet's vertices, determine tilts. The prior toward the identity determines the rest. A
+    patch without overlap stays on the mesh, at its anchors.
 
     Invariant to rigid motions and the scale of the world. Differentiable in the depths.
 
     Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; anchors and rounds are
-    ours.
+    additions.
     """
 
     def __init__(self, config: AlignConfig | None = None) -> None:
@@ -120,78 +120,77 @@ class Align(Stage):
         self.config = config or AlignConfig()
 
     def forward(self, depths: DepthPatches) -> DepthPatches:
-        """Align all patches.
+        """Return the aligned depths of all patches.
 
         Returns:
-            Changed depths with their transforms, an :class:`~pimper_torch.records.AlignStatus`
-            each, and the distance of neighbours before and after each round; the input where no
-            patch meets a neighbour.
+            Depths with their transform and :class:`~pimper_torch.records.AlignStatus`, and the
+            distance of neighbours before and after each round. The input if no patches overlap.
         """
         config, patches = self.config, depths.patches
         seams = find_seams(patches, _ROWS, _COLUMNS, _REACH)
         if len(seams.facets) == 0:
             return depths
         anchors = vertex_anchors(patches, depths.buckets)
-        # h_0 is in units of the edge length here, so that no term of the system has a unit.
+        # h_0 is in units of the edge length here, so all terms of the system are dimensionless.
         identity = seams.origins.new_tensor([0, 0, 1, 0])
         transforms = identity.expand(patches.num_patches, 4)
-        apart = []
+        distances = []
         for done in range(config.iterations):
-            pulls = self._met(depths, seams, anchors, transforms)
+            pulls = self._intersected(depths, seams, anchors, transforms)
             if not bool((pulls.weight > 0).any()):
                 return depths
-            apart.append(_root_mean_square(pulls, transforms))
+            distances.append(_root_mean_square(pulls, transforms))
             transforms = self._solve_round(pulls, transforms, fresh=done == 0)
             report(done + 1, config.iterations)
         with torch.no_grad():
-            pulls = self._met(depths, seams, anchors, transforms)
+            pulls = self._intersected(depths, seams, anchors, transforms)
             status = patch_status(pulls.facets, pulls.weight > 0, len(transforms))
         aligned = (status == int(AlignStatus.ALIGNED))[:, None]
         if not bool(aligned.all()):
-            # Every height field where its own anchors alone have it.
-            nothing = torch.zeros_like(pulls.curvature)
-            on_mesh = solve_transforms(
-                pulls, identity.expand_as(transforms), nothing[:, 0], nothing
-            )
+            # Without seams, each height field follows its anchors.
+            zero = torch.zeros_like(pulls.curvature)
+            on_mesh = solve_transforms(pulls, identity.expand_as(transforms), zero[:, 0], zero)
             on_mesh = _limit_scales(on_mesh, config.scale_limit)
             transforms = torch.where(aligned, transforms, on_mesh)
             with torch.no_grad():
-                pulls = self._met(depths, seams, anchors, transforms)
-        mismatch = torch.stack([*apart, _root_mean_square(pulls, transforms)]) * seams.units[3]
+                pulls = self._intersected(depths, seams, anchors, transforms)
+        mismatch = torch.stack([*distances, _root_mean_square(pulls, transforms)]) * seams.units[3]
         return depths.replace(
             buckets=_apply(depths, transforms * seams.units, status),
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
         )
 
-    def _met(
+    def _intersected(
         self, depths: DepthPatches, seams: Seams, anchors: Anchors, transforms: Transforms
     ) -> Pulls:
-        """Meet the overlaps as transformed so far, and anchor every height field at vertices."""
+        """Return the terms of seams with the current transforms, and of anchors at vertices."""
         unit, coarse = seams.units[3], depths.patches.coarse
         in_scene = transforms * seams.units
-        found, feet, both = meet_overlaps(seams, depths.patches, depths.buckets, in_scene)
-        met = both.flatten(1)
+        samples, feet, hit = meet_overlaps(seams, depths.patches, depths.buckets, in_scene)
+        met = hit.flatten(1)
         prior = unit.new_full((4,), self.config.prior)
         prior[3] = torch.inf  # patches do not move along their normals
-        count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # thin evidence weighs less
+        count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # few rays have less weight
         corners = pad(anchors.samples / unit, (0, 1), value=1.0)
         pulls = Pulls(
             facets=seams.facets,
             normals=seams.normals,
-            samples=pad(found.flatten(2, 3) / unit, (0, 1), value=1.0),
+            samples=pad(samples.flatten(2, 3) / unit, (0, 1), value=1.0),
             gap=(feet[:, 0] - feet[:, 1]).flatten(1, 2) / unit,
             weight=met.to(unit) / count[:, None],
-            curvature=curvature_along(found[..., 2], both, seams.edge_lengths),
+            curvature=curvature_along(samples[..., 2], hit, seams.edge_lengths),
             corners=corners,
             corner_weight=torch.zeros_like(corners[..., 0]),
             prior_weight=prior,
         )
-        # The error of one height field, from the median distance of two.
-        apart = mismatches(pulls, transforms).norm(dim=-1).detach()[met]
-        noise = apart.median().clamp_min(5e-3) / 2**0.5 if len(apart) else torch.ones_like(unit)
-        # The weight of an exact anchor is 1. Vertices that are no points of the cloud are guesses.
-        certain = noise.square() / (noise.square() + anchors.variance / unit.square())
-        weight = torch.where(coarse.is_point[coarse.mesh.faces], certain, 0.1) * anchors.known
+        # The error of a single height field, from the median distance of two.
+        distance = mismatches(pulls, transforms).norm(dim=-1).detach()[met]
+        noise = torch.ones_like(unit)
+        if len(distance):
+            noise = distance.median().clamp_min(5e-3) / 2**0.5
+        # An exact anchor has weight 1. Vertices that are not points of the cloud are inaccurate.
+        exactness = noise.square() / (noise.square() + anchors.variance / unit.square())
+        weight = torch.where(coarse.is_point[coarse.mesh.faces], exactness, 0.1) * anchors.valid
         return pulls.replace(corner_weight=self.config.anchor * weight)
 
     def _solve_round(self, pulls: Pulls, transforms: Transforms, fresh: bool) -> Transforms:
@@ -200,17 +199,17 @@ class Align(Stage):
         pulls = pulls.replace(corner_weight=pulls.corner_weight * moves[:, None])
         prior = pulls.prior_weight.clone()
         prior[2] = torch.inf
-        scales_held = pulls.replace(prior_weight=prior)
+        fixed_scales = pulls.replace(prior_weight=prior)
         for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
             distance = mismatches(pulls, transforms).norm(dim=-1)
-            apart = (pulls.weight * distance.square()).sum(dim=1)
-            terms = seam_stiffness(pulls.curvature, transforms[pulls.facets, 2], apart)
-            # What tilts and shifts can repair says nothing about scales.
-            free = scales_held if fresh and solve == 0 else pulls
-            transforms = solve_transforms(free, transforms, *terms)
+            square = (pulls.weight * distance.square()).sum(dim=1)
+            terms = seam_stiffness(pulls.curvature, transforms[pulls.facets, 2], square)
+            # Tilts and shifts first: the mismatches that they remove do not depend on scales.
+            problem = fixed_scales if fresh and solve == 0 else pulls
+            transforms = solve_transforms(problem, transforms, *terms)
             limited = _limit_scales(transforms, self.config.scale_limit)
             if not torch.equal(limited, transforms):
-                transforms = solve_transforms(scales_held, limited, *terms)
+                transforms = solve_transforms(fixed_scales, limited, *terms)
         return transforms
 
 
@@ -229,12 +228,12 @@ def _apply(
 ) -> tuple[Depths, ...]:
     buckets = []
     for templates, height_field in zip(depths.patches.buckets, depths.buckets, strict=True):
-        own = transforms[templates.facet]
-        hx, hy, hz, h0 = own[:, :, None, None].unbind(dim=1)
+        h = transforms[templates.facet]
+        hx, hy, hz, h0 = h[:, :, None, None].unbind(dim=1)
         x, y, _ = templates.points_patch.double().unbind(dim=-1)
         depth = hx * x + hy * y + hz * height_field.depth.double() + h0
-        # Transforms chain: whoever aligns twice still learns the way from the first height field.
-        chained = own[:, 2:3] * height_field.transform + own * own.new_tensor([1, 1, 0, 1])
+        # Composed, so that after a second alignment the transform is still from the first field.
+        chained = h[:, 2:3] * height_field.transform + h * h.new_tensor([1, 1, 0, 1])
         buckets.append(
             height_field.replace(
                 depth=depth.to(height_field.depth),

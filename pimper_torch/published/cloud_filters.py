@@ -1,4 +1,4 @@
-"""Points of the cloud: those that agree with their neighbours, and a well-spread subset.
+"""Filters of the point cloud: points consistent with their neighbours, and a well-spread subset.
 
 Numbers are choices, the same for all photographs.
 """
@@ -17,20 +17,20 @@ Nearest = Int[Tensor, "point neighbour"]
 
 
 def behind_others(pixels: Pixels, points_cam: Points, observed: PointMask) -> PointMask:
-    """Find points that a nearer surface occludes in the image, or probably does.
+    """Return points that a nearer surface certainly or probably occludes in the image.
 
-    Of the 24 nearest points in the image those count that are nearer to the camera by more than 3
-    times their lateral distance. If three or more leave no open half-plane, the point is
-    occluded. If they are all on one side, as beside a contour or where the surface is steep, it is
-    occluded only if the view has no observation of it.
+    Among the 24 nearest points in the image, those count that are nearer to the camera by more than
+    3 times their lateral distance. If three or more surround the point, it is occluded. If they are
+    all in one half-plane, as at a contour or on a steep surface, it is occluded only if the view
+    does not observe it.
     """
     nearest = nearest_in_image(pixels, 24)
     steps = points_cam[nearest] - points_cam[:, None]
     front = (steps[..., 2] < 0) & (_steepness(points_cam, nearest) > 3.0)
-    aside = pixels[nearest] - pixels[:, None]
-    angle = torch.atan2(aside[..., 1], aside[..., 0])
+    offset = pixels[nearest] - pixels[:, None]
+    angle = torch.atan2(offset[..., 1], offset[..., 0])
     ordered = torch.where(front, angle, torch.inf).sort(dim=1).values
-    around = ordered[:, :1] + 2 * torch.pi  # the first once more, after the last
+    around = ordered[:, :1] + 2 * torch.pi  # the first angle again, after the last
     gaps = torch.cat([ordered.minimum(around), around], dim=1).diff(dim=1)
     return (front.sum(dim=1) >= 3) & ((gaps.amax(dim=1) < torch.pi) | ~observed)
 
@@ -38,12 +38,12 @@ def behind_others(pixels: Pixels, points_cam: Points, observed: PointMask) -> Po
 def neighbours_agree(
     pixels: Pixels, points_cam: Points, *, neighbours: int = 12, max_slope: float = 6.0
 ) -> PointMask:
-    """Find points that lie on the same surface as those around them in the image.
+    """Return points on the same surface as their neighbours in the image.
 
-    A point of another surface is steep against most of them: ``|dz|`` over the lateral distance
-    exceeds ``max_slope``. A badly triangulated one is off the plane of its neighbours by more than
-    half the neighbourhood's radius. The worst are dropped first, in rounds, so that
-    one outlier does not take its neighbours along.
+    A point on a different surface has a steep slope to most neighbours: ``|dz|`` over the lateral
+    distance exceeds ``max_slope``. A badly triangulated point is farther from the plane of its
+    neighbours than half the neighbourhood's radius. The worst are dropped first, in rounds, so that
+    an outlier does not affect its neighbours.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
     neighbours = min(neighbours, len(pixels) - 1)
@@ -59,7 +59,7 @@ def neighbours_agree(
 
 
 def nearest_in_image(pixels: Pixels, count: int) -> Int[Tensor, "point near"]:
-    """List every point's nearest others, ``count`` or all of them."""
+    """Return the indices of every point's nearest others, at most ``count``."""
     coordinates = pixels.detach().cpu().numpy()
     ranks = list(range(2, min(count, len(pixels) - 1) + 2))
     _, index = cKDTree(coordinates).query(coordinates, k=ranks)
@@ -67,9 +67,9 @@ def nearest_in_image(pixels: Pixels, count: int) -> Int[Tensor, "point near"]:
 
 
 def on_hull(pixels: Pixels) -> PointMask:
-    """Find the corners of the points' convex hull in the image.
+    """Return the corners of the points' convex hull in the image.
 
-    Chosen before all others, they let the mesh reach as far as the cloud does.
+    Selected first, they extend the mesh over the complete cloud.
     """
     corners = ConvexHull(pixels.detach().cpu().double().numpy()).vertices
     marked = torch.zeros(len(pixels), dtype=torch.bool)
@@ -78,10 +78,10 @@ def on_hull(pixels: Pixels) -> PointMask:
 
 
 def well_accompanied(pixels: Pixels) -> PointMask:
-    """Find all points but isolated corners of the hull, one hull after another.
+    """Return all points except isolated corners of the hull, which are removed repeatedly.
 
-    Isolated are those farther from their third nearest point than 3 times the median of its
-    neighbours.
+    A point is isolated if the distance to its third nearest point exceeds 3 times the median of
+    this distance over its neighbours.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
     while keep.sum() > 8:
@@ -97,7 +97,7 @@ def well_accompanied(pixels: Pixels) -> PointMask:
 
 
 def spread(pixels: Pixels, quality: PerPoint, distance_px: float) -> Int[Tensor, " chosen"]:
-    """Choose points at least ``distance_px`` apart, the best first."""
+    """Return the indices of points at least ``distance_px`` apart, the best first."""
     coordinates = pixels.detach().cpu().numpy()
     close = cKDTree(coordinates).query_ball_point(coordinates, distance_px)
     blocked = torch.zeros(len(pixels), dtype=torch.bool)
@@ -110,20 +110,20 @@ def spread(pixels: Pixels, quality: PerPoint, distance_px: float) -> Int[Tensor,
 
 
 def spread_to_count(pixels: Pixels, quality: PerPoint, target: int) -> Int[Tensor, " chosen"]:
-    """Choose about ``target`` well-spread points by bisecting their distance."""
+    """Return the indices of about ``target`` well-spread points, by bisecting their distance."""
     if target >= len(pixels):
         return torch.arange(len(pixels), device=pixels.device)
     extent = pixels.amax(dim=0) - pixels.amin(dim=0)
-    # Not from the whole image's size down: with such a distance all points are neighbours.
+    # Starts from an estimate: with a distance of the image's size all points are neighbours.
     low, high = 0.0, float(torch.maximum((extent.prod() / target).sqrt(), extent.norm() / target))
     chosen = spread(pixels, quality, high)
     while len(chosen) > target:
         low, high = high, 2 * high
         chosen = spread(pixels, quality, high)
     for _ in range(20):
-        between = (low + high) / 2
-        chosen = spread(pixels, quality, between)
-        low, high = (between, high) if len(chosen) > target else (low, between)
+        middle = (low + high) / 2
+        chosen = spread(pixels, quality, middle)
+        low, high = (middle, high) if len(chosen) > target else (low, middle)
     return chosen
 
 
@@ -133,24 +133,24 @@ def _steepness(points_cam: Points, nearest: Nearest) -> Float[Tensor, "point nei
 
 
 def _deviation(points_cam: Points, nearest: Nearest) -> PerPoint:
-    """Measure the distance from the neighbours' robust plane, in radii of the neighbourhood."""
+    """Return the distance to the neighbours' robust plane, in radii of the neighbourhood."""
     steps = (points_cam[nearest] - points_cam[:, None]).double()
     radius = steps[..., :2].norm(dim=-1).median(dim=1).values.clamp_min(1e-12)
     scaled = steps / radius[:, None, None]
     design = torch.cat([scaled[..., :2], torch.ones_like(scaled[..., :1])], dim=-1)
     ridge = 1e-3 * torch.eye(3, dtype=design.dtype, device=design.device)
-    weight = 1 / (1 + scaled[..., 2].square())  # start from those on the point's own side
+    weight = 1 / (1 + scaled[..., 2].square())  # starts from neighbours on the same side
     for _ in range(5):  # re-weighted: a neighbour across a depth edge must not tilt the plane
         normal = (weight[..., None] * design).mT @ design + ridge
-        right = ((weight * scaled[..., 2])[..., None] * design).sum(dim=1)
-        plane = torch.linalg.solve(normal, right)
+        rhs = ((weight * scaled[..., 2])[..., None] * design).sum(dim=1)
+        plane = torch.linalg.solve(normal, rhs)
         residual = (scaled[..., 2] - (design @ plane[..., None])[..., 0]).abs()
         weight = 1 / (1 + (residual / (residual.median(dim=1).values[:, None] + 0.02)) ** 2)
     return plane[:, 2].abs().to(points_cam.dtype)
 
 
 def delaunay(pixels: Pixels) -> Faces:
-    """Triangulate points of an image, so that faces show their front to its camera."""
+    """Return a Delaunay triangulation of points of an image, front faces to the camera."""
     simplices = Delaunay(pixels.detach().cpu().double().numpy()).simplices
     faces = torch.from_numpy(simplices.astype(np.int64)).to(pixels.device)
     corners = pixels[faces]
@@ -159,11 +159,11 @@ def delaunay(pixels: Pixels) -> Faces:
 
 
 def facets_under(pixels: Pixels, corners_px: Float[Tensor, "face 3 2"]) -> Int[Tensor, " point"]:
-    """Find the facet that contains each point of an image, -1 outside all."""
-    found = []
-    at_once = max(1, 2_000_000 // max(1, len(corners_px)))  # some 100 MB
-    for part in torch.split(pixels, at_once):
-        within = (barycentric_2d(part[:, None], corners_px[None]) >= 0).all(dim=-1)
+    """Return the facet that contains each point of an image, -1 outside all."""
+    facets = []
+    size = max(1, 2_000_000 // max(1, len(corners_px)))  # some 100 MB
+    for batch in torch.split(pixels, size):
+        within = (barycentric_2d(batch[:, None], corners_px[None]) >= 0).all(dim=-1)
         facet = within.to(torch.int8).argmax(dim=1)
-        found.append(torch.where(within.any(dim=1), facet, -1))
-    return torch.cat(found)
+        facets.append(torch.where(within.any(dim=1), facet, -1))
+    return torch.cat(facets)

@@ -1,8 +1,8 @@
-r"""Integration: normals of every patch become its height field.
+r"""Integration of the normals of every patch to a height field.
 
-A least-squares problem :math:`\min_z \sum |\nabla z - g|^2` with forward differences and nothing
-fixed at the border. The cosine basis turns it into a division, frequency by frequency. Products
-with the basis are 3 to 10 times as fast as FFTs on rasters of 30 to 120 samples a side.
+A least-squares problem :math:`\min_z \sum |\nabla z - g|^2` with forward differences and free
+borders. In the cosine basis it is a division per frequency. Products with the basis are 3 to 10
+times as fast as FFTs on rasters of 30 to 120 samples a side.
 """
 
 import math
@@ -27,42 +27,42 @@ Layers = Float[Tensor, "patch channel height width"]
 
 
 def fill_smoothly(values: Layers, weight: PatchRaster) -> Layers:
-    """Inpaint samples without weight from those around, through a pyramid of halved rasters.
+    """Return values, inpainted where they have no weight through a pyramid of halved rasters.
 
     Args:
         values: Kept exactly where ``weight`` is 1, ignored where it is 0, NaN included.
         weight: In [0, 1].
 
     Returns:
-        Finite everywhere; zero in a patch without any weight. Differentiable.
+        Finite values; zero in a patch without any weight. Differentiable.
 
     Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.4.
     """
     size, fraction = weight.shape[-2:], weight[:, None]
-    known = torch.where(fraction > 0, values, 0)
+    values = torch.where(fraction > 0, values, 0)
     if max(size) == 1:
-        return known
+        return values
     window = [min(2, side) for side in size]
     mean_weight, mean = (
         avg_pool2d(raster, kernel_size=window, stride=window, ceil_mode=True)
-        for raster in (fraction, fraction * known)
+        for raster in (fraction, fraction * values)
     )
-    # A parent of one known child knows as much as that child: without saturation, thin
-    # evidence would fade on its way up, and the mean of the whole patch would win.
-    full = (4 * mean_weight[:, 0]).clamp_max(1)
-    coarse = fill_smoothly(mean / torch.where(mean_weight > 0, mean_weight, 1), full)
+    # A parent of one weighted child has full weight: otherwise sparse data would fade on coarser
+    # levels, and the mean of the complete patch would dominate.
+    saturated = (4 * mean_weight[:, 0]).clamp_max(1)
+    coarse = fill_smoothly(mean / torch.where(mean_weight > 0, mean_weight, 1), saturated)
     around = interpolate(coarse, size=size, mode="bilinear", align_corners=False)
-    return fraction * known + (1 - fraction) * around
+    return fraction * values + (1 - fraction) * around
 
 
 def cosine_basis(size: int, like: Float[Tensor, "..."]) -> Float[Tensor, "{size} {size}"]:
-    """Return the orthonormal cosines (DCT-II), one a row, with device and dtype of ``like``."""
+    """Return the orthonormal cosines (DCT-II) as rows, with device and dtype of ``like``."""
     frequency = torch.arange(size, device=like.device, dtype=like.dtype)
     return normalize((math.pi / size * frequency[:, None] * (frequency + 0.5)).cos(), dim=1)
 
 
 def differences(heights: Heights) -> tuple[StepsRight, StepsDown]:
-    """Return the steps to the right and down."""
+    """Return the forward differences of heights, to the right and down."""
     return heights.diff(dim=-1), heights.diff(dim=-2)
 
 
@@ -73,23 +73,23 @@ def differences_transposed(right: StepsRight, down: StepsDown) -> Heights:
 
 
 def solve_poisson(source: Heights) -> Heights:
-    r"""Solve :math:`D^T D z = s`, D the steps of :func:`differences`.
+    r"""Return the heights z with :math:`D^T D z = s`, where D is :func:`differences`.
 
     Args:
-        source: ``s``. No ``z`` can produce its mean, which is ignored; ``z`` has mean zero.
+        source: ``s``. Its mean is ignored, because no ``z`` produces one; ``z`` has mean zero.
 
-    With ``s`` the transposed differences of given steps, these are the heights whose steps come
-    nearest to them. Differentiable in ``source``.
+    With ``s`` the transposed differences of given steps, the heights fit these steps in least
+    squares. Differentiable in ``source``.
 
     Source: Frankot & Chellappa, PAMI 10(4), 1988, in the cosine basis; Simchony, Chellappa &
     Shao, PAMI 12(5), 1990, for the discrete operator.
     """
     height, width = source.shape[-2:]
     rows, cols = cosine_basis(height, source), cosine_basis(width, source)
-    # The steps of a cosine are orthogonal to those of the others.
+    # The differences of one cosine are orthogonal to those of every other.
     down, right = (basis.diff(dim=1).square().sum(dim=1) for basis in (rows, cols))
     stiffness = down[:, None] + right
-    # No height answers to the mean; dividing it by infinity removes it.
+    # The mean has no solution; dividing it by infinity removes it.
     stiffness = stiffness.masked_fill(stiffness == 0, torch.inf)
     return rows.mT @ ((rows @ source @ cols.mT) / stiffness) @ cols
 
@@ -97,18 +97,18 @@ def solve_poisson(source: Heights) -> Heights:
 class Integrate(Stage):
     """Integrate the normals of every patch on its template.
 
-    Samples without normals, and the raster outside the enlarged triangle, have inpainted slopes; a
-    patch without any normals stays its facet's plane. The height field passes, on average,
-    through the facet's corners. Differentiable in normals.
+    Slopes are inpainted at samples without normals and outside the enlarged triangle. A patch
+    without any normals keeps its facet's plane. The mean distance of the height field to the
+    facet's corners is zero. Differentiable in normals.
 
     Source: Frankot & Chellappa, A method for enforcing integrability in shape from shading
     algorithms, PAMI 10(4), 1988.
     """
 
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
-        """Return the height fields, ``valid`` inside enlarged triangles that have data."""
-        # A normal beyond the warp's limit lies on the contour or is wrong, and one alone can bend
-        # its whole patch.
+        """Return the height fields, ``valid`` inside enlarged triangles with data."""
+        # A normal beyond the warp's limit is at a contour or wrong, and a single one can bend its
+        # complete patch.
         steepest = math.tan(math.radians(75))
         mesh = photometric.patches.coarse.mesh
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
@@ -120,8 +120,8 @@ class Integrate(Stage):
             vertices = mesh.vertices_world[mesh.faces[templates.facet]]
             corners = transform(templates.patch_from_world, vertices)
             grid = templates.origin, templates.spacing
-            found = sample_raster(height_field[:, None], corners[..., :2], *grid)
-            offset = (found[:, 0] - corners[..., 2]).mean(dim=1)
+            heights = sample_raster(height_field[:, None], corners[..., :2], *grid)
+            offset = (heights[:, 0] - corners[..., 2]).mean(dim=1)
             depth = height_field - offset[:, None, None]
             has_data = photometry.valid.flatten(1).any(dim=1)
             identity = depth.new_tensor([0, 0, 1, 0]).expand(len(depth), 4)
@@ -133,18 +133,18 @@ class Integrate(Stage):
 def integrate_normals(
     normals: PatchVectors, valid: PatchMask, spacing: Float[Tensor, " patch"], steepest: float
 ) -> PatchRaster:
-    """Find the height field, of mean zero over its raster, whose slopes are the normals'.
+    """Return the height field that fits the slopes of the normals, of mean zero over its raster.
 
     Args:
         normals: Unit, ``n_z < 0``; ignored where not valid.
-        spacing: Between samples, in the units of the depth.
-        steepest: Limit of a slope's size.
+        spacing: Sample spacing, in the units of the depth.
+        steepest: Largest absolute slope.
     """
     upright = normals.new_tensor([0, 0, -1])
     slopes = slopes_from_normals(torch.where(valid[..., None], normals, upright), steepest)
     slopes = slopes.movedim(-1, 1)
     slopes = fill_smoothly(slopes, valid.to(slopes)).double() * spacing[:, None, None, None]
-    # Half-way between samples the mean of the two is right to second order.
+    # The mean of two samples is the slope half-way between them, to second order.
     right = (slopes[:, 0, :, 1:] + slopes[:, 0, :, :-1]) / 2
     down = (slopes[:, 1, 1:] + slopes[:, 1, :-1]) / 2
     return solve_poisson(differences_transposed(right, down)).to(normals)

@@ -1,4 +1,4 @@
-"""Settings of the published method's own stages."""
+"""Settings of the stages that only the published chain has."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -8,11 +8,11 @@ from pimper_torch.runtime.config import Range, require_ranges
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriangulateConfig:
-    """Which points become vertices, and which triangles facets.
+    """Settings of the triangulation.
 
     Attributes:
-        reference: Name or stem of the frontal photograph; empty chooses it.
-        num_points: About how many vertices to spread over the visible side.
+        reference: Name or stem of the frontal photograph; empty selects it automatically.
+        num_points: Approximate number of vertices, spread over the visible side.
     """
 
     reference: str = ""
@@ -27,13 +27,13 @@ class AlignConfig:
     """Settings of the alignment.
 
     Attributes:
-        iterations: Rounds: meeting the overlaps as transformed so far, and solving.
-        anchor: Weight of a facet's vertex next to the agreement of a seam; less for points whose
-            uncertainty exceeds the disagreement at the seams.
-        prior: Weight that holds each transform at the identity. Where neighbours agree but
-            for their scales, 1e-3 gives back three quarters of a wrong scale, 1e-4 all but
-            4 %; where they agree in nothing, 1e-4 lets them be flattened.
-        scale_limit: Maximum factor by which a height field is flattened or stretched.
+        iterations: Number of rounds of intersecting the transformed overlaps and solving.
+        anchor: Weight of a facet's vertex relative to the agreement of a seam; reduced for points
+            with an uncertainty above the disagreement at the seams.
+        prior: Weight of the identity for each transform. If neighbours differ only in scale, 1e-3
+            corrects three quarters of a wrong scale, and 1e-4 all but 4 %; if they do not agree at
+            all, 1e-4 allows flattening.
+        scale_limit: Largest factor by which a height field is flattened or stretched.
     """
 
     iterations: Annotated[int, Range(least=1, most=1000)] = 3  # a solve each
@@ -51,7 +51,7 @@ class RefineConfig:
 
     Attributes:
         smoothing_radius_samples: ``r``, in vertices of the surface: lambda is
-            ``1 / (r * spacing)^2``. Where G is constant, a wave of length ``w`` keeps
+            ``1 / (r * spacing)^2``. For constant G, a wave of length ``w`` keeps
             ``1 / (1 + (2 pi R / w)^2)`` of its height, with ``R = r sqrt(G / (1 - G))`` vertices.
     """
 

@@ -1,10 +1,10 @@
-r"""Refinement: height fields of all patches in, one joined surface out.
+r"""Refinement of the height fields of all patches to one joined surface.
 
 .. math:: E(S) = \int \lambda (1 - G) |\cup S_\mu - S|^2 + G |\nabla S|^2
 
 over the flat facets, in linear finite elements on the subdivided mesh: lumped masses, cotangents,
-and G averaged over each face. S is the position of every vertex, so that the three coordinates are
-three right-hand sides of one system.
+and G averaged over each face. S is the position of every vertex, so the three coordinates are three
+right-hand sides of one system.
 """
 
 import torch
@@ -25,7 +25,7 @@ from pimper_torch.runtime.stage import Stage
 
 
 def seam_weight(barycentric: Vectors) -> Scalars:
-    r"""Return G: where a facet is a seam and where it is its centre.
+    r"""Return G, which is 0 at the centre of a facet and increases towards its seams.
 
     :math:`G = \frac12 \sqrt{|a - b| + |a - c| + |c - b|}` of the barycentric coordinates.
 
@@ -39,9 +39,9 @@ def seam_weight(barycentric: Vectors) -> Scalars:
 class Refine(Stage):
     """Join the patches and smooth their seams, keeping the centre of every facet.
 
-    One sparse factorization of the energy over the subdivided mesh, three right-hand sides.
-    :mod:`~pimper_torch.method.fusion.blend` is the union. Vertices that no patch supports are
-    filled by the smoothness term and have information 0.
+    The energy over the subdivided mesh takes one sparse factorization for three right-hand sides.
+    :mod:`~pimper_torch.method.fusion.blend` computes the union. Vertices without a supporting patch
+    are filled by the smoothness term and have information 0.
 
     Differentiable in depth, photometric normals, albedo and information; the coarse mesh and
     the templates are constants.
@@ -52,11 +52,11 @@ class Refine(Stage):
         self.config = config or RefineConfig()
 
     def forward(self, depths: DepthPatches) -> Surface:
-        """Refine the union of all patches.
+        """Return the surface refined from the union of all patches.
 
-        The convergence's residual is the root mean square distance between the union and the
-        surface, in scene units. Without any valid height field, as under one light for all views,
-        the surface is that of the facets, its seams smoothed, with information 0.
+        The residual of its convergence is the root mean square distance between the union and the
+        surface, in scene units. Without any valid height field, as with one light for all views,
+        the surface is that of the facets with smoothed seams, and information is 0.
         """
         patches = depths.patches
         mesh = patches.coarse.mesh
@@ -70,21 +70,21 @@ class Refine(Stage):
         radius = self.config.smoothing_radius_samples
         refined = smooth_seams(subdivision, points, blend.supported, spacing, radius)
         vertices = refined.to(points)
-        own = normalize(vertex_normals(vertices, subdivision.faces), dim=-1)
+        geometric = normalize(vertex_normals(vertices, subdivision.faces), dim=-1)
         photometric = blend.seen & (blend.normals_world.detach().norm(dim=-1) > 0.5)
-        apart = (refined - points.double())[blend.supported].detach()
+        moves = (refined - points.double())[blend.supported].detach()
         return Surface(
             vertices_world=vertices,
             faces=subdivision.faces,
             facet=subdivision.facet,
             barycentric=subdivision.barycentric,
-            normals_world=torch.where(photometric[:, None], blend.normals_world, own),
+            normals_world=torch.where(photometric[:, None], blend.normals_world, geometric),
             albedo=about_mean(blend.albedo, blend.observed, face_edges(subdivision.faces)[0]),
             information=blend.normal_information,
             height_information=blend.offset_information,
             convergence=Convergence(
                 iterations=torch.ones(1, dtype=torch.long, device=points.device),
-                residual=average(apart.square().sum(dim=-1)).sqrt()[None].to(points),
+                residual=average(moves.square().sum(dim=-1)).sqrt()[None].to(points),
                 cause=torch.full((1,), int(StopCause.CONVERGED), device=points.device),
             ),
         )
@@ -97,29 +97,29 @@ def smooth_seams(
     spacing: PerFacet,
     radius: float,
 ) -> Vertices:
-    """Minimise the energy over the subdivided mesh; float64, differentiable in ``points``.
+    """Return vertices that minimize the energy, in float64 and differentiable in ``points``.
 
     The normal equations are ``(M + L) S = M (union)``, M the lumped mass and L the Laplacian.
 
     Args:
         points: The union of the patches at each vertex.
-        supported: Where the union is known. Elsewhere the mass is nearly zero.
-        radius: Of the smoothing, in spacings; see :class:`RefineConfig`.
+        supported: True where the union is defined. Elsewhere the mass is nearly zero.
+        radius: Smoothing radius, in spacings; see :class:`RefineConfig`.
     """
     fidelity = (radius * spacing.double()) ** -2
     weights = seam_weight(subdivision.barycentric.double())
     mesh = elements(subdivision.points.detach().double(), subdivision.faces)
     mass = lumped_mass(mesh, fidelity[subdivision.face_facet])
-    # A little mass ties what no patch supports to the flat facets: the system is definite.
+    # A little mass ties unsupported vertices to the flat facets, so the system is definite.
     mass = mass * (1 - weights) * torch.where(supported, 1, 1e-9)
     seams = weights[subdivision.faces].mean(dim=1)
-    rows, cols, values = cotangent_laplacian(mesh, seams, 1e-4)  # needles are taken as wider
+    rows, cols, values = cotangent_laplacian(mesh, seams, 1e-4)  # needles count as wider
     diagonal = torch.arange(mesh.count, device=mass.device)
-    (found,) = solutions(
+    (solution,) = solutions(
         torch.cat([rows, diagonal]),
         torch.cat([cols, diagonal]),
         torch.cat([values, mass]),
         mass[:, None] * points.double(),
         what="the refinement",
     )
-    return found
+    return solution

@@ -1,8 +1,8 @@
-r"""Seams of neighbouring patches: the rays that meet both, and the equations of the alignment.
+r"""Seams of neighbouring patches: rays that intersect both, and the equations of the alignment.
 
 The unknown of a patch is :math:`h_\mu = (h_x, h_y, h_z, h_0)`; its height field becomes
-:math:`h_\mu^T S` with :math:`S = (x, y, z, 1)`. Lengths of the equations are in units of one length
-of the mesh, so that all terms, and their weights, have no unit.
+:math:`h_\mu^T S` with :math:`S = (x, y, z, 1)`. Lengths in the equations are in units of the median
+edge of the mesh, so all terms and weights are dimensionless.
 """
 
 from collections.abc import Iterable
@@ -33,11 +33,11 @@ class Seams(Record):
     """Rays through the strips along shared edges.
 
     Attributes:
-        origins: A point of each ray, world; rows are lines parallel to the edge.
-        directions: Of all rays of a seam: the bisector of the two inward normals; unit.
+        origins: A point on each ray, world; rows are lines parallel to the edge.
+        directions: Common direction of all rays of a seam: unit bisector of the inward normals.
         normals: Inward unit normals of the two facets, world.
-        seam_of: The seam at each edge of a facet, opposite to its corners; -1 without a neighbour.
-        place_of: Index of each seam and side in ``seam_of``, flattened.
+        seam_of: Seam at the edge opposite to each corner of a facet; -1 without a neighbour.
+        slot_of: Index of each seam and side in ``seam_of``, flattened.
     """
 
     facets: Int[Tensor, "seam 2"]
@@ -46,30 +46,30 @@ class Seams(Record):
     normals: Float[Tensor, "seam 2 3"]
     edge_lengths: PerSeam
     seam_of: Faces
-    place_of: Int[Tensor, "seam 2"]
+    slot_of: Int[Tensor, "seam 2"]
 
     @property
     def units(self) -> Float[Tensor, " 4"]:
-        """Factors from transforms in units of the median edge, which is the last, to the scene."""
+        """Factors of transforms from units of the median edge to scene units; the last is it."""
         unit = self.edge_lengths.median()
         return torch.stack([torch.ones_like(unit)] * 3 + [unit])
 
 
 def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float) -> Seams:
-    """Lay rays over all edges that two facets share.
+    """Return ``rows`` lines of ``columns`` rays along all edges that two facets share.
 
     Args:
-        reach_samples: Distance of the outermost lines from the edge, in template samples.
+        reach_samples: Distance of the outermost lines to the edge, in template samples.
     """
-    frames = by_facet(patches, [one.patch_from_world for one in patches.buckets]).double()
-    spacing = by_facet(patches, [one.spacing for one in patches.buckets]).double()
+    frames = by_facet(patches, [bucket.patch_from_world for bucket in patches.buckets]).double()
+    spacing = by_facet(patches, [bucket.spacing for bucket in patches.buckets]).double()
     vertices = patches.coarse.mesh.vertices_world.double()
     edges, edge_of = face_edges(patches.coarse.mesh.faces)
     shared = face_counts(edge_of) == 2
     seam_of = torch.where(shared, shared.cumsum(dim=0) - 1, -1)[edge_of]
-    place = edge_of.flatten().argsort(stable=True)
-    place_of = place[seam_of.flatten()[place] >= 0].reshape(-1, 2)
-    facets = place_of // 3
+    slot = edge_of.flatten().argsort(stable=True)
+    slot_of = slot[seam_of.flatten()[slot] >= 0].reshape(-1, 2)
+    facets = slot_of // 3
     normals = frames[facets, 2, :3]
     directions = normalize(normals.sum(dim=1), dim=-1)
     start, end = vertices[edges[shared]].unbind(dim=1)
@@ -80,40 +80,40 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
     offset = torch.linspace(-1, 1, rows, device=start.device, dtype=start.dtype)
     reach = reach_samples * spacing[facets].mean(dim=1)
     on_edge = start[:, None] + along[:, None] * (end - start)[:, None]
-    beside = (reach[:, None] * offset)[..., None] * across[:, None]
+    shift = (reach[:, None] * offset)[..., None] * across[:, None]
     return Seams(
         facets=facets,
-        origins=on_edge[:, None] + beside[:, :, None],
+        origins=on_edge[:, None] + shift[:, :, None],
         directions=directions,
         normals=normals,
         edge_lengths=edge_lengths,
         seam_of=seam_of,
-        place_of=place_of,
+        slot_of=slot_of,
     )
 
 
 def meet_overlaps(
     seams: Seams, patches: PatchSet, buckets: tuple[Depths, ...], transforms: Transforms
 ) -> tuple[PerRay, PerRay, Met]:
-    """Meet both height fields of every seam, as transformed now, with the seam's rays.
+    """Intersect the rays of every seam with both height fields, as currently transformed.
 
     Returns:
-        ``(x, y, z)`` of each patch's own height field, before any transform, patch frame; the
-        foot points of these on their facets' planes, world; and where both height fields were met.
+        ``(x, y, z)`` of each patch's height field before any transform, patch frame; the foot
+        points on the facets' planes, world; and a mask of rays that hit both height fields.
 
     Differentiable in the depths and the transforms.
     """
-    found = []
+    results = []
     for templates, depths in zip(patches.buckets, buckets, strict=True):
-        own = seams.seam_of[templates.facet]
-        seam = own.clamp_min(0)
+        index = seams.seam_of[templates.facet]
+        seam = index.clamp_min(0)
         patch_from_world = templates.patch_from_world.double()
         origins_world = seams.origins.flatten(1, 2)[seam]
         directions_world = seams.directions[seam][:, :, None].expand_as(origins_world)
         origins = transform(patch_from_world, origins_world.flatten(1, 2))
         directions = rotate(patch_from_world, directions_world.flatten(1, 2))
-        # A ray meets the transformed height field where the ray transformed back meets the height
-        # field.
+        # A ray hits the transformed height field where the inversely transformed ray hits the
+        # height field.
         hx, hy, hz, h0 = transforms[templates.facet][:, :, None].unbind(dim=1)
         height = origins[..., 2] - hx * origins[..., 0] - hy * origins[..., 1] - h0
         sinking = directions[..., 2] - hx * directions[..., 0] - hy * directions[..., 1]
@@ -128,21 +128,21 @@ def meet_overlaps(
         feet = torch.cat([points[..., :2], torch.zeros_like(points[..., :1])], dim=-1)
         feet_world = transform(invert_rigid(patch_from_world), feet)
         shape = origins_world.shape
-        met = hit.reshape(shape[:3]) & (own >= 0)[..., None]
-        found.append((points.reshape(shape), feet_world.reshape(shape), met))
+        met = hit.reshape(shape[:3]) & (index >= 0)[..., None]
+        results.append((points.reshape(shape), feet_world.reshape(shape), met))
     raster = seams.origins.shape[1:3]
-    joined = [by_facet(patches, parts).flatten(0, 1) for parts in zip(*found, strict=True)]
+    joined = [by_facet(patches, values).flatten(0, 1) for values in zip(*results, strict=True)]
     samples, feet, met = (
-        part[seams.place_of].reshape(*seams.place_of.shape, *raster, *part.shape[2:])
-        for part in joined
+        values[seams.slot_of].reshape(*seams.slot_of.shape, *raster, *values.shape[2:])
+        for values in joined
     )
     return samples, feet, met.all(dim=1)
 
 
-def by_facet(patches: PatchSet, parts: Iterable[Tensor]) -> Tensor:
-    """Join values of all buckets in the order of the facets."""
+def by_facet(patches: PatchSet, values: Iterable[Tensor]) -> Tensor:
+    """Return the values of all buckets, concatenated in the order of the facets."""
     order = torch.argsort(torch.cat([templates.facet for templates in patches.buckets]))
-    return torch.cat(list(parts))[order]
+    return torch.cat(list(values))[order]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -151,12 +151,12 @@ class Pulls(Record):
 
     Attributes:
         normals: Inward unit normals of the facets, world.
-        samples: ``S`` of both height fields where a ray meets them.
+        samples: ``S`` of both height fields where a ray hits them.
         gap: Foot point of the first sample minus that of the second, world.
-        weight: Of each ray, 0 where ignored; adds up to at most 1 over a seam.
+        weight: Weight of each ray, 0 where ignored; the sum over a seam is at most 1.
         curvature: ``C`` of both height fields before any transform; see :func:`curvature_along`.
         corners: ``S`` of every height field at its facet's corners.
-        prior_weight: Of each component of h, towards the identity; infinite for fixed ones.
+        prior_weight: Weight of the identity for each component of h; infinite for fixed ones.
     """
 
     facets: Int[Tensor, "seam 2"]
@@ -183,44 +183,44 @@ def curvature_along(
     r"""Return the mean square of a height field's curvature along the edge, times its length.
 
     :math:`C = \overline{(\ell\,\kappa)^2}`, :math:`\kappa` by second differences over a
-    quarter of the edge :math:`\ell`, which noise of normals hardly reaches.
+    quarter of the edge :math:`\ell`, a distance at which noise of normals averages out.
     """
     columns = heights.shape[-1]
     stride = max(1, columns // 4)
     centre = heights[..., stride:-stride]
     step = heights[..., 2 * stride :] - 2 * centre + heights[..., : -2 * stride]
-    known = met[..., 2 * stride :] & met[..., stride:-stride] & met[..., : -2 * stride]
+    valid = met[..., 2 * stride :] & met[..., stride:-stride] & met[..., : -2 * stride]
     bend = step * (columns / stride) ** 2 / edge_lengths[:, None, None, None]
-    square = torch.where(known[:, None], bend, 0).square().sum(dim=(-2, -1))
-    return square / known.sum(dim=(-2, -1)).clamp_min(1)[:, None]
+    square = torch.where(valid[:, None], bend, 0).square().sum(dim=(-2, -1))
+    return square / valid.sum(dim=(-2, -1)).clamp_min(1)[:, None]
 
 
-def seam_stiffness(curvature: PerSide, scales: PerSide, apart: PerSeam) -> tuple[PerSeam, PerSide]:
-    r"""Return the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, and its derivative's part.
+def seam_stiffness(curvature: PerSide, scales: PerSide, square: PerSeam) -> tuple[PerSeam, PerSide]:
+    r"""Return the published :math:`k = 1 / \sum (C_\mu + C_{\mu'})`, and its derivative's term.
 
     Args:
-        scales: ``h_z`` of both patches; ``C`` grows with its square.
-        apart: :math:`\overline{|r|^2}` of the rays.
+        scales: ``h_z`` of both patches; ``C`` is proportional to its square.
+        square: :math:`\overline{|r|^2}` of the rays.
 
     Returns:
-        k, finite for flat neighbours, too; and what its derivative adds to the right-hand sides.
+        k, which is finite for flat neighbours; and the terms of its derivative in right-hand sides.
     """
-    # The floor is C of an arc whose centre stands out by 0.7 % of its edge's length.
+    # The floor is C of an arc with a sagitta of 0.7 % of its edge's length.
     stiffness = 1 / (3e-3 + (curvature * scales.square()).sum(dim=1))
-    return stiffness, (stiffness.square() * apart)[:, None] * curvature * scales
+    return stiffness, (stiffness.square() * square)[:, None] * curvature * scales
 
 
 def solve_transforms(
     pulls: Pulls, transforms: Transforms, stiffness: PerSeam, uplift: PerSide
 ) -> Transforms:
-    r"""Find the transforms that minimise the weighted squares of all terms.
+    r"""Return the transforms that minimize the weighted squares of all terms.
 
     .. math::
         \sum_{seams} k \sum_{rays} w |r|^2 + \sum_{corners} w (h^T S)^2
         + \sum_{patches} \sum_c w_c (h_c - e_c)^2
 
     Args:
-        transforms: Those so far; fixed components keep their values.
+        transforms: Current ones; fixed components keep their values.
         uplift: Added to the right-hand sides of both ``h_z`` of a seam; see
             :class:`~pimper_torch.published.align.Align`.
     """
@@ -228,28 +228,28 @@ def solve_transforms(
     identity = pulls.prior_weight.new_tensor([0, 0, 1, 0])
     fixed = torch.where(pulls.prior_weight.isfinite(), 0, transforms)
     samples, corners = pulls.samples[..., free], pulls.corners[..., free]
-    # What components that are not free contribute counts as given.
+    # Contributions of the fixed components.
     gap = mismatches(pulls, fixed)
-    given = (pulls.corners * fixed[:, None]).sum(dim=-1)
+    height = (pulls.corners * fixed[:, None]).sum(dim=-1)
 
-    # Of the mismatch of each ray, by the unknowns of both patches.
+    # Derivative of the mismatch of each ray by the unknowns of both patches.
     normals = torch.stack([pulls.normals[:, 0], -pulls.normals[:, 1]], dim=1)
     slope = torch.einsum("perc,pex->prxec", samples, normals).flatten(3)
     weighted = (stiffness[:, None] * pulls.weight)[..., None, None] * slope
-    wanted = uplift[..., None] * identity[free]
-    wanted = wanted.flatten(1) - torch.einsum("prxk,prx->pk", weighted, gap)
-    held, prior = pulls.corner_weight[..., None] * corners, pulls.prior_weight[free]
-    rhs = prior * identity[free] - torch.einsum("fvc,fv->fc", held, given)
+    seam_rhs = uplift[..., None] * identity[free]
+    seam_rhs = seam_rhs.flatten(1) - torch.einsum("prxk,prx->pk", weighted, gap)
+    anchored, prior = pulls.corner_weight[..., None] * corners, pulls.prior_weight[free]
+    rhs = prior * identity[free] - torch.einsum("fvc,fv->fc", anchored, height)
     unknown = torch.arange(rhs.numel(), device=rhs.device).reshape(rhs.shape)
     of_seam = unknown[pulls.facets].flatten(1)
-    rhs = rhs.flatten().index_add(0, of_seam.flatten(), wanted.flatten())
+    rhs = rhs.flatten().index_add(0, of_seam.flatten(), seam_rhs.flatten())
     terms = [
-        (unknown, torch.einsum("fvc,fvd->fcd", held, corners) + prior.diag()),
+        (unknown, torch.einsum("fvc,fvd->fcd", anchored, corners) + prior.diag()),
         (of_seam, torch.einsum("prxk,prxl->pkl", weighted, slope)),
     ]
     rows = [index[:, :, None].expand_as(block).flatten() for index, block in terms]
     cols = [index[:, None].expand_as(block).flatten() for index, block in terms]
     values = torch.cat([block.flatten() for _, block in terms])
-    what = "the alignment of the patches"
-    factor = SparseCholesky(torch.cat(rows), torch.cat(cols), values, len(rhs), what)
+    name = "the alignment of the patches"
+    factor = SparseCholesky(torch.cat(rows), torch.cat(cols), values, len(rhs), name)
     return fixed.index_copy(1, free, factor.solve(rhs).reshape(unknown.shape))

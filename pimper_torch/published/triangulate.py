@@ -1,4 +1,4 @@
-"""Coarse mesh: a few hundred facets through the cloud, seen from the frontal view."""
+"""Coarse mesh of a few hundred facets between points of the cloud, in the frontal view."""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,21 +20,21 @@ from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
-# All constants are choices, the same for all photographs. A point of the cloud is seen by a view
-# whose axis is within this angle of the reference's.
+# All constants are choices, the same for all photographs. A point must be observed by a view with
+# an axis within this angle of the reference's.
 _MAX_VIEW_ANGLE_DEG = 40.0
 
-# A facet turned further from the reference bridges a depth discontinuity; so does one turned by
-# more than the second with an edge so many times the median facet's.
+# A facet tilted more against the reference bridges a depth discontinuity; so does one tilted by more
+# than the second angle with an edge longer than this multiple of the median facet's.
 _MAX_TILT_DEG, _BRIDGE_TILT_DEG, _MAX_STRETCH = 80.0, 60.0, 3.0
 
-# On the border a facet is dropped with a smaller height over its longest edge in the image, or with
-# a smaller angle at a corner that it alone reaches, or with a smaller fraction of it on the object.
+# On the border a facet is dropped below any of these: height over longest edge in the image, angle
+# at a corner of no other facet, fraction of its area on the object.
 _MIN_ALTITUDE, _MIN_TIP_DEG, _MIN_COVERAGE = 0.08, 45.0, 0.6
 
 
 class Triangulate(Stage):
-    """Triangulate reliable points of the cloud; the result is a constant to autograd."""
+    """Triangulate reliable points of the cloud. Not differentiable."""
 
     def __init__(self, config: TriangulateConfig | None = None) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class Triangulate(Stage):
 
     @torch.no_grad()
     def forward(self, scene: SparseScene) -> CoarseMesh:
-        """Triangulate the cloud in the reference view.
+        """Return the coarse mesh of the cloud, triangulated in the reference view.
 
         Raises:
             InputError: No registered photograph has the reference's name.
@@ -58,8 +58,8 @@ class Triangulate(Stage):
         facets = self._facets(scene.points_world[source], scene.views, scene.cameras, reference)
         if len(facets) == 0:
             raise ReconstructionError(
-                f"coarse mesh: all facets between {len(source)} points were dropped, and at least "
-                "one is needed. Choose another `triangulate.reference`, or look at the masks."
+                f"coarse mesh: all facets between {len(source)} points were dropped; needed: at "
+                "least one. Choose a different `triangulate.reference`, or check the masks."
             )
         label = face_components(facets)
         connected = label == label.bincount().argmax()
@@ -90,7 +90,7 @@ class Triangulate(Stage):
     def _reliable(
         self, scene: SparseScene, reference: int
     ) -> tuple[Int[Tensor, " reliable"], Float[Tensor, " reliable"]]:
-        """List the points that pass every filter, and how good each is."""
+        """Return the points that pass every filter, and their quality."""
         cameras, observed = scene.cameras, scene.observed
         cam_from_world = cameras.cam_from_world[reference]
         axes = cameras.cam_from_world[:, 2, :3]
@@ -99,34 +99,34 @@ class Triangulate(Stage):
         within = ((pixels > 0) & (pixels < cameras.sizes_px[reference])).all(dim=1) & (depth > 0)
         points_cam = transform(cam_from_world, scene.points_world)
 
-        def unhidden(at: Int[Tensor, " some"]) -> Bool[Tensor, " some"]:
-            seen = observed[at, reference]
-            return ~cloud_filters.behind_others(pixels[at], points_cam[at], seen)
+        def visible(index: Int[Tensor, " point"]) -> Bool[Tensor, " point"]:
+            seen = observed[index, reference]
+            return ~cloud_filters.behind_others(pixels[index], points_cam[index], seen)
 
         filters = (
-            lambda at: (within & observed[:, near].any(dim=1))[at],
-            unhidden,
-            unhidden,  # without those that seemed to be in between
-            lambda at: cloud_filters.neighbours_agree(pixels[at], points_cam[at]),
-            lambda at: cloud_filters.well_accompanied(pixels[at]),
+            lambda index: (within & observed[:, near].any(dim=1))[index],
+            visible,
+            visible,  # again, without points that seemed to be occluders
+            lambda index: cloud_filters.neighbours_agree(pixels[index], points_cam[index]),
+            lambda index: cloud_filters.well_accompanied(pixels[index]),
         )
-        every = index = reliable_points(scene)
-        for passed in filters:
+        before = index = reliable_points(scene)
+        for passes in filters:
             if len(index) >= 4:
-                index = index[passed(index)]
-        leave_out("triangulate.reliable", ~torch.isin(every, index), at=scene.points_world[every])
+                index = index[passes(index)]
+        leave_out("triangulate.reliable", ~torch.isin(before, index), at=scene.points_world[before])
         if len(index) < 4:
             raise ReconstructionError(
                 f"coarse mesh: {len(index)} of {len(depth)} sparse points are reliable and seen "
-                f"near {scene.views.names[reference]}, and at least 4 are needed. Take more "
-                "photographs near the frontal one, or choose another `triangulate.reference`."
+                f"near {scene.views.names[reference]}; needed: at least 4. Take more photographs "
+                "near the frontal one, or choose a different `triangulate.reference`."
             )
         errors = scene.reprojection_errors_px[index]
         quality = observed[index].sum(dim=1).to(scene.points_world) - errors
         return index, quality + 3 * observed[index, reference].to(quality)
 
     def _facets(self, vertices: Vertices, views: Views, cameras: Cameras, reference: int) -> Faces:
-        """Triangulate, drop bridges, and peel off the border what shows no object."""
+        """Return Delaunay facets without bridges, and without background at the border."""
         camera = cameras.cam_from_world[reference], cameras.intrinsics[reference]
         pixels, _ = project(vertices, *camera)
         faces = cloud_filters.delaunay(pixels)
@@ -142,32 +142,32 @@ class Triangulate(Stage):
         gray = views.images[reference].mean(dim=0)
         u, v = pixels.long().unbind(dim=1)
         at_vertices = gray[v.clamp(0, gray.shape[0] - 1), u.clamp(0, gray.shape[1] - 1)]
-        shows_object = gray > 0.12 * at_vertices.median()  # darker is background
+        foreground = gray > 0.12 * at_vertices.median()  # darker is background
         if views.masks is not None:
-            shows_object = shows_object & views.masks[reference]
+            foreground = foreground & views.masks[reference]
         corners = pixels[faces]
-        shown = _shown(corners, shows_object)
+        coverage = _coverage(corners, foreground)
         ahead, back = corners.roll(-1, dims=1) - corners, corners.roll(1, dims=1) - corners
         (ux, uy), (vx, vy) = ahead[:, 0].mT, back[:, 0].mT
         square = side_lengths(corners).amax(dim=1).square().clamp_min(1e-30)
         thin = (ux * vy - uy * vx).abs() / square < _MIN_ALTITUDE
         cosine = (normalize(ahead, dim=-1) * normalize(back, dim=-1)).sum(dim=-1)
         spikes = cosine > torch.deg2rad(cosine.new_tensor(_MIN_TIP_DEG)).cos()
-        return peel(faces, (shown < _MIN_COVERAGE) | thin, spikes)
+        return peel(faces, (coverage < _MIN_COVERAGE) | thin, spikes)
 
 
 def peel(faces: Faces, unwanted: FaceMask, sharp: Bool[Tensor, "face 3"]) -> Int[Tensor, "kept 3"]:
-    """Drop unwanted faces on the border repeatedly; inner ones stay, so that no hole opens.
+    """Return faces, with unwanted ones dropped repeatedly from the border so that no hole opens.
 
     Args:
-        unwanted: Dropped as soon as they have an edge on the border.
-        sharp: Corners; a face with a sharp corner between two border edges is dropped, too.
+        unwanted: Faces to drop if they have an edge on the border.
+        sharp: Sharp corners; a face with one between two border edges is dropped, too.
     """
     while True:
         _, opposite = face_edges(faces)
         alone = face_counts(opposite)[opposite] == 1
         on_border = alone.roll(1, dims=1)  # the first edge runs from the first corner
-        # Corner i lies between edges i - 1 and i.
+        # Corner i is between edges i - 1 and i.
         tips = on_border & on_border.roll(1, dims=1) & sharp
         drop = (on_border.any(dim=1) & unwanted) | tips.any(dim=1)
         if not drop.any():
@@ -175,13 +175,13 @@ def peel(faces: Faces, unwanted: FaceMask, sharp: Bool[Tensor, "face 3"]) -> Int
         faces, unwanted, sharp = faces[~drop], unwanted[~drop], sharp[~drop]
 
 
-def _shown(corners_px: Float[Tensor, "face 3 2"], shows_object: Mask) -> Float[Tensor, " face"]:
-    """Return the fraction of each triangle's pixels that show the object."""
+def _coverage(corners_px: Float[Tensor, "face 3 2"], foreground: Mask) -> Float[Tensor, " face"]:
+    """Return the foreground fraction of each triangle's pixels."""
     steps = [(a, b, 9 - a - b) for a in range(10) for b in range(10 - a)]
     weights = corners_px.new_tensor(steps) * (1 - 3 / 27) / 9 + 1 / 27  # a little inside
-    height, width = shows_object.shape
+    height, width = foreground.shape
     sampled = grid_sample(
-        shows_object[None, None].to(corners_px),
+        foreground[None, None].to(corners_px),
         grid_from_pixels(weights @ corners_px, width, height)[None],
         mode="nearest",
         align_corners=False,

@@ -190,7 +190,7 @@ def test_anchors_know_the_height_field_over_them_and_their_spread_along_the_norm
     long = torch.diag(torch.tensor([1.0, 1.0, 9.0], dtype=torch.float64))
     patches = flat.replace(coarse=coarse.replace(covariance_world=long.expand(count, 3, 3)))
     found = vertex_anchors(patches, depths.buckets)
-    assert found.known.all()
+    assert found.valid.all()
     assert_close(found.variance, torch.full_like(found.variance, 9.0))
     x, y, _ = coarse.mesh.vertices_world[coarse.mesh.faces].unbind(dim=-1)
     assert_close(found.samples[..., 2], bumps(x, y) + 0.2, atol=2e-4, rtol=0)
@@ -266,8 +266,8 @@ def test_seams_name_each_inner_edge_once_with_rays_about_it(generator):
         centre = seams.origins[seam].mean(dim=(0, 1))
         assert_close(centre, (start + end) / 2)
         assert_close(seams.edge_lengths[seam], (end - start).norm())
-        assert seams.seam_of.flatten()[seams.place_of[seam]].tolist() == [seam, seam]
-        assert (seams.place_of[seam] // 3).tolist() == [a, b]
+        assert seams.seam_of.flatten()[seams.slot_of[seam]].tolist() == [seam, seam]
+        assert (seams.slot_of[seam] // 3).tolist() == [a, b]
     spread = (seams.origins[:, 2] - seams.origins[:, 0]).norm(dim=-1)
     assert_close(spread, torch.full_like(spread, 10 * float(patches.buckets[0].spacing[0])))
 

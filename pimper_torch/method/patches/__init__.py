@@ -1,1 +1,1 @@
-"""Facets to templates, and views resampled on them."""
+"""Templates on facets, and views resampled on them."""

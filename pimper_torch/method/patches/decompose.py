@@ -1,4 +1,4 @@
-"""Decomposition: every facet of the coarse mesh becomes a patch with a template."""
+"""Decomposition of the coarse mesh into patches, one template per facet."""
 
 import torch
 from jaxtyping import Float, Int
@@ -23,7 +23,7 @@ Indices = Int[Tensor, " bucket"]
 
 
 class Decompose(Stage):
-    """Assign every facet a frame, an enlarged triangle and a raster."""
+    """Compute a template for every facet: a frame, an enlarged triangle and a raster."""
 
     def __init__(self, config: DecomposeConfig | None = None) -> None:
         super().__init__()
@@ -36,25 +36,24 @@ class Decompose(Stage):
         surface: Surface | None = None,
         scale: float = 1.0,
     ) -> PatchSet:
-        """Decompose a coarse mesh.
+        """Return the patches of a coarse mesh.
 
-        The spacing of the samples of all templates is the same: one over ``samples_per_pixel``
-        times ``scale`` pixels of the reference view at the median depth of the mesh, or further
-        where ``max_samples`` asks for it.
+        All templates have the same sample spacing, ``1 / (samples_per_pixel * scale)`` pixels of
+        the reference view at the median depth of the mesh, or more if ``max_samples`` requires it.
 
         Args:
-            surface: What is transferred to the templates; without, they are flat.
-            scale: Of the photographs, 1 for their own size.
+            surface: Transferred to the templates; without it, they are flat.
+            scale: Scale of the photographs; 1 is full size.
 
         Raises:
-            ReconstructionError: A mesh without facets.
+            ReconstructionError: The mesh has no facets.
         """
         coarse = with_area(coarse)
         vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
         if len(faces) == 0:
             raise ReconstructionError(
-                "the coarse mesh has 0 facets, and at least one is needed. Relax the filters "
-                "of `triangulate`, or bring a mesh of your own."
+                "decompose: the coarse mesh has 0 facets with an area; needed: at least one. Check "
+                "the points, or give a mesh."
             )
         patch_from_world = facet_frames(vertices, faces, cameras.cam_from_world[coarse.reference])
         corners = transform(patch_from_world, vertices[faces])[..., :2]
@@ -66,7 +65,7 @@ class Decompose(Stage):
         warped = (area * faced.clamp_max(limit)).sum()
         spacing = torch.maximum(spacing, (warped / self.config.max_samples).sqrt())
         enlarged = enlarge(corners, self.config.overlap_samples * spacing)
-        # A sliver's enlarged corner runs far away; no patch needs more than twice the overlap.
+        # The enlarged corner of a sliver is far away; no patch needs more than twice the overlap.
         reach = 2 * self.config.overlap_samples * spacing
         low = torch.maximum(enlarged.amin(dim=1), corners.amin(dim=1) - reach)
         high = torch.minimum(enlarged.amax(dim=1), corners.amax(dim=1) + reach)
@@ -95,10 +94,10 @@ class Decompose(Stage):
             )
 
         buckets = tuple(
-            templates(some[facets], raster, views > 0)
-            for some, views in blocks
+            templates(block[facets], raster, views > 0)
+            for block, views in blocks
             for facets, raster in group_by_size(
-                sides[some], max(1, self.config.bucket_entries // int(views.sum()))
+                sides[block], max(1, self.config.bucket_entries // int(views.sum()))
             )
         )
         patches = PatchSet(coarse=coarse, buckets=buckets)
@@ -106,12 +105,12 @@ class Decompose(Stage):
 
 
 def with_area(coarse: CoarseMesh) -> CoarseMesh:
-    """Leave out facets without area, on which no template can stand."""
+    """Return the coarse mesh without facets of zero area, which have no template."""
     mesh, points = coarse.mesh, coarse.points
     kept = (face_normals(mesh.vertices_world.detach(), mesh.faces) != 0).any(dim=1)
     if bool(kept.all()):
         return coarse
-    reason, done = "its facet has no area", "These facets are left out of the coarse mesh"
+    reason, done = "its facet has no area", "These facets are removed from the coarse mesh"
     skipped_patches("decompose", (~kept).nonzero()[:, 0], reason, done)
     if points is not None:
         points = points.take(kept[points.facet].nonzero()[:, 0])
@@ -126,14 +125,14 @@ def with_area(coarse: CoarseMesh) -> CoarseMesh:
 def facet_frames(
     vertices: Vertices, faces: Faces, cam_from_world: Pose
 ) -> Float[Tensor, "face 4 4"]:
-    """Return ``patch_from_world`` of every facet: the paper's R_mu, and the facet's centroid.
+    """Return ``patch_from_world`` of every facet: the paper's R_mu, with the centroid as origin.
 
-    z is the inward normal; x is the reference camera's x made orthogonal to it, so that a
-    facet that faces the camera appears in its template as in the image.
+    z is the inward normal; x is the reference camera's x made orthogonal to it, so a facet that
+    faces the camera appears in its template as in the image.
     """
     z = -unit_face_normals(vertices, faces)
     x_cam, y_cam = cam_from_world[0, :3].expand_as(z), cam_from_world[1, :3].expand_as(z)
-    # Near the camera's own x axis the projection degenerates, and y serves instead.
+    # Near the camera's x axis the projection degenerates, and y is used instead.
     side = torch.where(((x_cam * z).sum(-1).abs() < 0.99)[:, None], x_cam, y_cam)
     x = normalize(side - (side * z).sum(-1, keepdim=True) * z, dim=-1)
     rotation = torch.stack([x, torch.linalg.cross(z, x), z], dim=-2)
@@ -144,7 +143,7 @@ def facet_frames(
 def sample_spacing(
     vertices: Vertices, cameras: Cameras, reference: int, samples_per_pixel: float
 ) -> Scalar:
-    """Return the scene units that one sample spans: 1/zeta."""
+    """Return the sample spacing in scene units: 1/zeta."""
     intrinsics = cameras.intrinsics[reference]
     _, depth = project(vertices, cameras.cam_from_world[reference], intrinsics)
     focal = (intrinsics[0, 0] * intrinsics[1, 1]).sqrt()
@@ -152,7 +151,7 @@ def sample_spacing(
 
 
 def views_facing(vertices: Vertices, faces: Faces, cameras: Cameras) -> Int[Tensor, " face"]:
-    """Count, for each facet, the views that it faces and that have its centre in their frame."""
+    """Return, for each facet, the number of views that it faces and that frame its centre."""
     centre, normals = vertices[faces].mean(dim=1), face_normals(vertices, faces)
     pixels, depth = project(centre[None], cameras.cam_from_world, cameras.intrinsics)
     towards = cameras.centers_world[:, None] - centre
@@ -161,9 +160,9 @@ def views_facing(vertices: Vertices, faces: Faces, cameras: Cameras) -> Int[Tens
 
 
 def enlarge(corners: Float[Tensor, "patch 3 2"], distance: Scalar) -> Float[Tensor, "patch 3 2"]:
-    """Move every edge outward by ``distance``, parallel to itself.
+    """Return triangles with every edge moved outward by ``distance``, parallel to itself.
 
-    The new triangle is the old one scaled about its incentre by ``1 + distance / inradius``.
+    This scales the triangle about its incentre by ``1 + distance / inradius``.
 
     >>> enlarge(torch.tensor([[[0.0, 0], [1, 0], [0, 1]]]), torch.tensor(0.1))[0, 0]
     tensor([-0.1000, -0.1000])
@@ -180,16 +179,16 @@ def enlarge(corners: Float[Tensor, "patch 3 2"], distance: Scalar) -> Float[Tens
 def group_by_size(
     sides: Int[Tensor, "patch 2"], bucket_samples: int
 ) -> list[tuple[Indices, tuple[int, int]]]:
-    """Batch templates of like size.
+    """Batch templates of similar size.
 
     Args:
-        sides: Width and height each template needs.
-        bucket_samples: Limit for a bucket; a template larger than that is a bucket alone.
+        sides: Width and height of each template.
+        bucket_samples: Largest number of samples in a bucket of several templates.
 
     Returns:
         Facets and (height, width) of each bucket.
     """
-    # Sizes in steps of a third of an octave: padding adds little, and buckets stay few.
+    # Sizes in steps of a third of an octave: little padding, and few buckets.
     keys = (2 ** ((sides.double().log2() * 3).ceil() / 3)).ceil().long()
     groups: dict[tuple[int, int], list[int]] = {}
     for facet, (width, height) in enumerate(keys.tolist()):

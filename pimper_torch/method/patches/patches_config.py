@@ -1,4 +1,4 @@
-"""Settings of patches and of their warp."""
+"""Settings of the decomposition and the warp."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -9,18 +9,18 @@ from pimper_torch.runtime.config import Range, require, require_ranges
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DecomposeConfig:
-    """Spacing of a facet's samples, and their reach over its edges.
+    """Sample spacing, overlap and views of the templates.
 
     Attributes:
         samples_per_pixel: Template samples per pixel of the reference view; the paper's
             zeta, made independent of the scene's unit.
-        overlap_samples: How far, in samples, each edge is moved outward, parallel to itself.
-        num_views: Largest number of views of a facet. Where more face one, each is seen in its best
-            ones, spread in direction, which it shares with a block of facets.
-        max_samples: Of all facets in all views that they face, ``num_views`` at most: where there
-            would be more, samples lie further apart. Bounds time and memory; infinite for no limit.
-        bucket_entries: Samples times views of templates that are batched together: few enough
-            for a processor's cache.
+        overlap_samples: Distance, in samples, by which each edge is moved outward.
+        num_views: Largest number of views of a facet. If more face it, a block of facets uses its
+            best views, spread in direction.
+        max_samples: Largest number of samples of all facets in all views that they face, at most
+            ``num_views`` each; the spacing is increased to meet it. Bounds time and memory;
+            infinite for no limit.
+        bucket_entries: Samples times views of a batch of templates, to fit a processor's cache.
     """
 
     samples_per_pixel: Annotated[float, Range(above=0, most=8)] = 1.0
@@ -35,13 +35,13 @@ class DecomposeConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WarpConfig:
-    """Which samples a view is allowed to contribute.
+    """Criteria for valid samples of a view.
 
     Attributes:
-        dark_level: Radiance at or below which a sample is missing; 1 is saturation.
-        saturation_level: Radiance at or above which a pixel of any channel is missing.
-        max_tilt_deg: A facet turned further from a view is not used there.
-        occlusion_stride: Samples between the rays that test for occlusion.
+        dark_level: Radiance at or below which a sample is invalid; 1 is saturation.
+        saturation_level: Radiance of any channel at or above which a pixel is invalid.
+        max_tilt_deg: Largest angle between the normal and the direction to the view.
+        occlusion_stride: Distance in samples between the rays that test for occlusion.
     """
 
     dark_level: Annotated[float, Range(least=0, below=1)] = 0.01

@@ -1,4 +1,4 @@
-"""Priors on templates: guessed maps of several views, merged sample by sample."""
+"""Priors on templates: maps of several views, merged per sample."""
 
 from collections.abc import Sequence
 
@@ -14,21 +14,21 @@ from pimper_torch.records import Cameras, LightPrior, Observations, PatchPriors,
 
 
 def merged(
-    guesses: Sequence[tuple[PriorMaps, Observations]],
+    prior_samples: Sequence[tuple[PriorMaps, Observations]],
     hidden: Bool[Tensor, "patch view height width"],
     cameras: Cameras,
     templates: Templates,
     lights: LightPrior | None = None,
 ) -> PatchPriors:
-    """Average guesses of one sample by their inverse variance, which adds up.
+    """Return the priors of all samples, averaged over views with inverse variances, which add up.
 
-    Where they scatter more than they claim, over views or from pixel to pixel, the information is
-    what their scatter shows. An error that all of them have in common does not scatter: the fusion
-    finds more noise than is claimed.
+    If values scatter more than their variances indicate, over views or from pixel to pixel, the
+    information is that of their scatter. A common error of all maps does not scatter: it raises the
+    noise factor in the fusion.
 
     Args:
-        guesses: Maps, and what was looked up in them.
-        hidden: Where a surface occludes a sample in a view.
+        prior_samples: Maps, and the samples looked up in them.
+        hidden: True where a surface occludes a sample in a view.
 
     Differentiable in the maps and lights.
     """
@@ -37,28 +37,28 @@ def merged(
     offsets = templates.depth.new_zeros(*shape, 4)
     albedo = templates.depth.new_zeros(*shape, 2)
     inlier: Float[Tensor, "patch view height width"] | None = None
-    for maps, guess in guesses:
-        seen = guess.valid & ~hidden[:, maps.view]
-        values = torch.where(seen[:, :, None], guess.radiance, 0)
-        own = cameras.take(maps.view)
+    for maps, samples in prior_samples:
+        seen = samples.valid & ~hidden[:, maps.view]
+        values = torch.where(seen[:, :, None], samples.radiance, 0)
+        viewers = cameras.take(maps.view)
         if maps.kind == "normals":
-            normals = normals + _in_patches(values, seen, own, templates, maps.in_world)
+            normals = normals + _in_patches(values, seen, viewers, templates, maps.in_world)
         elif maps.kind == "depth":
-            offsets = offsets + _offsets(values, seen, own, templates)
+            offsets = offsets + _offsets(values, seen, viewers, templates)
         elif maps.kind == "albedo":
             albedo = albedo + values.sum(dim=1).movedim(1, -1)
         else:
-            ones = torch.ones_like(hidden, dtype=values.dtype) if inlier is None else inlier
-            own_inlier = torch.where(seen, values[:, :, 0], 1)
-            inlier = ones.index_copy(1, maps.view, ones[:, maps.view] * own_inlier)
+            before = torch.ones_like(hidden, dtype=values.dtype) if inlier is None else inlier
+            probability = torch.where(seen, values[:, :, 0], 1)
+            inlier = before.index_copy(1, maps.view, before[:, maps.view] * probability)
     vector, (information, count) = normals[..., :3], normals[..., 3:].unbind(dim=-1)
     length = vector.norm(dim=-1)
-    # Of vectors that scatter by small angles, 1 less the mean's length is half their mean square.
+    # The mean square of small angles to the mean is 2 (1 - length of the mean vector).
     scatter = 2 * (information - length).clamp_min(0)
-    total, mean_square, certain, seen_in = offsets.unbind(dim=-1)
-    offset = total / torch.where(certain > 0, certain, 1)
-    precise = albedo[..., 1] > 0
-    one = torch.where(precise, albedo[..., 1], 1)
+    total, square, precision, num_views = offsets.unbind(dim=-1)
+    offset = total / torch.where(precision > 0, precision, 1)
+    determined = albedo[..., 1] > 0
+    divisor = torch.where(determined, albedo[..., 1], 1)
     rotated: Float[Tensor, "patch view 4"] | None = None
     if lights is not None:
         rotation = templates.patch_from_world[:, None].to(lights.lights)
@@ -71,9 +71,9 @@ def merged(
         normals_patch=normalize(vector, dim=-1),
         normal_information=_scattered(information, scatter, count),
         offset=offset,
-        offset_information=_scattered(certain, mean_square - offset * total, seen_in),
-        albedo=albedo[..., 0] / one,
-        albedo_variance=torch.where(precise, 1 / one, torch.inf),
+        offset_information=_scattered(precision, square - offset * total, num_views),
+        albedo=albedo[..., 0] / divisor,
+        albedo_variance=torch.where(determined, 1 / divisor, torch.inf),
         inlier=inlier,
         lights_patch=rotated,
         light_variance=None if lights is None else lights.variance.expand(shape[0], -1),
@@ -81,11 +81,11 @@ def merged(
 
 
 def _scattered(information: Scalars, scatter: Scalars, count: Scalars) -> Scalars:
-    """Lower information by the Birge ratio, where it is above 1.
+    """Return the information divided by the squared Birge ratio where that is above 1.
 
     Args:
-        information: Sum of those of single guesses.
-        scatter: Sum of their squared differences from the mean, times their information.
+        information: Sum over views.
+        scatter: Sum of squared differences to the mean, times their information.
 
     Source: Birge, The calculation of errors by the method of least squares, 1932.
     """
@@ -99,7 +99,7 @@ def _in_patches(
     templates: Templates,
     in_world: bool,
 ) -> Float[Tensor, "patch height width 5"]:
-    """Sum up normals times their information, in the patch frame, the information, and views."""
+    """Return sums over views: normals (patch frame) times information, information, and count."""
     rotation = templates.patch_from_world[:, None, :3, :3].to(values)
     if not in_world:
         rotation = rotation @ cameras.cam_from_world[:, :3, :3].mT.to(values)
@@ -115,10 +115,10 @@ def _offsets(
     cameras: Cameras,
     templates: Templates,
 ) -> Float[Tensor, "patch height width 4"]:
-    """Sum up offsets times their information, their squares times it, that, and views.
+    """Return sums over views: offsets and their squares times information, that, and count.
 
-    A point that lies deeper in a view by a fraction of its depth lies as much further along its
-    ray, and off the template by the part of that along its normal.
+    A point deeper in a view by a fraction of its depth is farther along its ray by the same
+    fraction. Its offset from the template is the component of this along the normal.
     """
     world_from_patch = invert_rigid(templates.patch_from_world)
     points = transform(world_from_patch, templates.points_patch.flatten(1, 2))
@@ -131,10 +131,10 @@ def _offsets(
     rate = ((ray * outward).sum(dim=-1) / depth).reshape(values[:, :, 0].shape)
     weighted, precision = values.unbind(dim=2)
     usable = seen & (precision > 0) & (rate != 0)
-    # Of the offset: (d - z) rate, with a variance of rate^2 over the precision.
-    steep = torch.where(usable, rate, 1)
-    certain = torch.where(usable, precision / steep.square(), 0)
-    behind = weighted / torch.where(usable, precision, 1) - depth.reshape(rate.shape)
-    offset = torch.where(usable, behind * steep, 0)
-    total = certain * offset
-    return torch.stack([total, total * offset, certain, usable], dim=-1).sum(dim=1)
+    # The offset is (d - z) rate, with a variance of rate^2 over the precision.
+    slope = torch.where(usable, rate, 1)
+    information = torch.where(usable, precision / slope.square(), 0)
+    deeper = weighted / torch.where(usable, precision, 1) - depth.reshape(rate.shape)
+    offset = torch.where(usable, deeper * slope, 0)
+    total = information * offset
+    return torch.stack([total, total * offset, information, usable], dim=-1).sum(dim=1)

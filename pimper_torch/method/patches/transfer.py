@@ -1,4 +1,4 @@
-"""A surface transferred to templates: views are registered on it, not on the facets' planes."""
+"""Transfer of a surface to templates, on which views are then registered."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,32 +18,32 @@ SampleVectors = Float[Tensor, "patch sample 3"]
 
 
 def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
-    """Transfer the depth and the normals of a surface to every template.
+    """Return patches whose templates have the depth and normals of a surface.
 
-    A sample's point is where its line along the facet's normal meets the surface, facing as
-    the facet does, nearest to the facet's plane. Samples without one, or with one further off
-    than half the template's extent, are no longer ``inside``.
+    The point of a sample is the intersection of its line along the facet's normal with surface
+    that faces like the facet, nearest to the facet's plane. Samples without one, or with one
+    farther than half the template's extent, are no longer ``inside``.
 
-    Differentiable in the surface's vertices and normals and in the templates' frames; which face
-    a line meets is constant.
+    Differentiable in the surface's vertices and normals and in the templates' frames; the
+    intersected face is constant.
     """
     normals = surface.normals_world
     if normals is None:
         normals = vertex_normals(surface.vertices_world, surface.faces)
     caster = ray_caster(surface)
 
-    def one(templates: Templates) -> Templates:
+    def transferred(templates: Templates) -> Templates:
         with torch.no_grad():
-            # A little further, so that rounding does not decide.
+            # A little farther, so that rounding does not decide.
             hits, met = _nearest(caster, *_lines(templates), surface, 1.01 * _reach(templates))
         return recomputed(_on_surface, surface, normals, templates, hits, met)
 
-    buckets = tuple(side_by_side(one, patches.buckets, tracked=False))
+    buckets = tuple(side_by_side(transferred, patches.buckets, tracked=False))
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
 
 
 def _lines(templates: Templates) -> tuple[SampleVectors, SampleVectors]:
-    """Return places on the facets' planes, and the way inward through them; world."""
+    """Return sample positions on the facets' planes and their inward directions, world."""
     world_from_patch = invert_rigid(templates.patch_from_world)
     flat = templates.replace(depth=torch.zeros_like(templates.depth)).points_patch
     positions = transform(world_from_patch, flat.flatten(1, 2))
@@ -57,11 +57,11 @@ def _reach(templates: Templates) -> Float[Tensor, "patch 1"]:
 def _on_surface(
     surface: Mesh, normals: Vertices, templates: Templates, hits: Hits, met: SampleMask
 ) -> Templates:
-    """Put samples where their lines meet given faces of a surface."""
+    """Return templates with the depth and normals where their lines hit the given faces."""
     positions, inward = _lines(templates)
     hits = hits.refined(surface.vertices_world, surface.faces, positions, inward)
-    found = hits.interpolate(surface.vertices_world, surface.faces)
-    depth = transform(templates.patch_from_world, found)[..., 2]
+    points = hits.interpolate(surface.vertices_world, surface.faces)
+    depth = transform(templates.patch_from_world, points)[..., 2]
     rotated = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
     met = met & (depth.abs() <= _reach(templates))
     raster = templates.depth.shape
@@ -81,21 +81,21 @@ def _nearest(
     surface: Mesh,
     reach: Float[Tensor, "patch 1"],
 ) -> tuple[Hits, SampleMask]:
-    """Cast to both sides, and take the nearer hit of a face that looks outward."""
+    """Return the nearer of the hits on both sides among faces that face outward."""
     below, above = caster.cast(positions, inward, reach), caster.cast(positions, -inward, reach)
 
-    def looking_out(hits: Hits) -> SampleMask:
-        met = surface.faces[hits.face.clamp_min(0).flatten()]
-        outward = face_normals(surface.vertices_world, met).reshape(inward.shape)
+    def faces_outward(hits: Hits) -> SampleMask:
+        faces = surface.faces[hits.face.clamp_min(0).flatten()]
+        outward = face_normals(surface.vertices_world, faces).reshape(inward.shape)
         return (hits.face >= 0) & ((outward * inward).sum(dim=-1) < 0)
 
-    one, other = looking_out(below), looking_out(above)
-    first = one & (~other | (below.distance <= above.distance))
+    hit_below, hit_above = faces_outward(below), faces_outward(above)
+    first = hit_below & (~hit_above | (below.distance <= above.distance))
     return (
         Hits(
             face=torch.where(first, below.face, above.face),
             distance=torch.where(first, below.distance, above.distance),
             barycentric=torch.where(first[..., None], below.barycentric, above.barycentric),
         ),
-        one | other,
+        hit_below | hit_above,
     )

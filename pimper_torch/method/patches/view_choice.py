@@ -1,4 +1,4 @@
-"""The views that a facet is seen in, of many: the best ones, shared by blocks of like facets."""
+"""Selection of views for blocks of facets with similar position and direction."""
 
 import torch
 from jaxtyping import Float, Int
@@ -18,47 +18,47 @@ Weights = Float[Tensor, "facet view"]
 def view_blocks(
     mesh: Mesh, cameras: Cameras, spacing: Scalar, count: int
 ) -> list[tuple[Int[Tensor, " facet"], ViewMask]]:
-    """Divide facets into blocks of like place and direction, and choose the views of each.
+    """Divide facets into blocks of similar position and direction, and select views for each.
 
     Args:
-        spacing: Of samples, scene units.
-        count: Of views that a block has, at most.
+        spacing: Sample spacing, scene units.
+        count: Largest number of views of a block.
 
     Returns:
-        Facets of each block, and which views it has: one at least.
+        Facets of each block, and the mask of its views, at least one.
 
-    A constant to autograd. Bits do not depend on the number of threads.
+    Not differentiable. Bits do not depend on the number of threads.
     """
     vertices, faces = mesh.vertices_world.detach(), mesh.faces
     centres, normals = vertices[faces].mean(dim=1), face_normals(vertices, faces)
     offsets = centres - centres.mean(dim=0)
-    like = torch.cat([offsets / offsets.norm(dim=1).mean(), normalize(normals, dim=1)], dim=1)
+    features = torch.cat([offsets / offsets.norm(dim=1).mean(), normalize(normals, dim=1)], dim=1)
     caster, exact = RayCaster(vertices, faces), cameras.detach()
 
     def of_group(group: Int[Tensor, " facet"]) -> list[tuple[Tensor, Tensor]]:
         weight = view_weights(centres[group], normals[group], exact, spacing.detach(), caster)
         blocks, waiting = [], [torch.arange(len(group))]
         while waiting:
-            some = waiting.pop()
-            towards = exact.centers_world - centres[group[some]].mean(dim=0)
-            chosen = best_views(weight[some], normalize(towards, dim=1), count)
-            seen = weight[some] > 0
-            could = seen.sum(dim=1).clamp_max(count)
-            served = seen[:, chosen].sum(dim=1)[could > 0] / could[could > 0]
-            # In the mean facets are seen in nine of ten views that they could be seen in.
-            if len(some) == 1 or not bool(served.mean() < 0.9):
-                blocks.append((group[some], chosen))
+            block = waiting.pop()
+            towards = exact.centers_world - centres[group[block]].mean(dim=0)
+            chosen = best_views(weight[block], normalize(towards, dim=1), count)
+            seen = weight[block] > 0
+            possible = seen.sum(dim=1).clamp_max(count)
+            fraction = seen[:, chosen].sum(dim=1)[possible > 0] / possible[possible > 0]
+            # On average, facets have nine tenths of the views that they could have.
+            if len(block) == 1 or not bool(fraction.mean() < 0.9):
+                blocks.append((group[block], chosen))
             else:
-                waiting += [some[part] for part in halves(like[group[some]])]
+                waiting += [block[half] for half in halves(features[group[block]])]
         return blocks
 
     groups, waiting = [], [torch.arange(len(faces), device=faces.device)]
     while waiting:
-        some = waiting.pop()
-        parts = halves(like[some]) if len(some) > 512 else ()  # bounds memory
-        waiting += [some[part] for part in parts]
-        groups += [] if parts else [some]
-    return [block for found in side_by_side(of_group, groups, tracked=False) for block in found]
+        group = waiting.pop()
+        parts = halves(features[group]) if len(group) > 512 else ()  # bounds memory
+        waiting += [group[half] for half in parts]
+        groups += [] if parts else [group]
+    return [block for blocks in side_by_side(of_group, groups, tracked=False) for block in blocks]
 
 
 def view_weights(
@@ -68,14 +68,14 @@ def view_weights(
     spacing: Scalar,
     caster: RayCaster,
 ) -> Weights:
-    """Return the pixels that each view has on a sample of each facet, 1 at most.
+    """Return the number of pixels per sample of each facet in each view, at most 1.
 
     Args:
-        normals: Twice as long as the facet's area.
-        spacing: Of samples, scene units.
+        normals: Normals of twice the facet's area as length.
+        spacing: Sample spacing, scene units.
 
     Returns:
-        0 where the facet is turned away, out of the frame, or its centre hidden.
+        0 where the facet faces away, or its centre is out of the frame or occluded.
     """
     pixels, depth = project(centres[None], cameras.cam_from_world, cameras.intrinsics)
     towards = centres - cameras.centers_world[:, None]
@@ -94,24 +94,24 @@ def view_weights(
 
 
 def best_views(weight: Weights, directions: ViewVectors, count: int) -> ViewMask:
-    r"""Choose the views of a block of facets, one after the other.
+    r"""Return the views for a block of facets, selected one after the other.
 
-    The next is always the one of the largest gain
+    The next view is the one with the largest gain
 
     .. math:: \frac{1}{1 + \sum_u e^{4 k (d_u \cdot d_v - 1)}}
               \sum_f \frac{w_{fv}}{1 + \sum_u w_{fu}}
 
-    over the views :math:`u` that are chosen: facets that have few pixels come first, and views
-    from elsewhere, as both baselines and lights have to spread: those within about
-    :math:`1 / \sqrt{4 k}` radians of one that is chosen add little.
+    over the selected views :math:`u`. Facets with few pixels have priority, and so do views in new
+    directions, because both baselines and lights must spread: views within about
+    :math:`1 / \sqrt{4 k}` radians of a selected one add little.
 
     Args:
-        weight: Pixels on a sample of each facet, 0 where a view does not see it.
+        weight: Pixels per sample of each facet, 0 where a view does not see it.
         directions: From the block to the cameras, unit.
         count: ``k``, the largest number of views.
 
-    >>> front, beside = [0.0, 0.0, -1.0], [0.6, 0.0, -0.8]
-    >>> directions = torch.tensor([front, front, beside])
+    >>> front, side = [0.0, 0.0, -1.0], [0.6, 0.0, -0.8]
+    >>> directions = torch.tensor([front, front, side])
     >>> best_views(torch.tensor([[1.0, 0.9, 0.7]]), directions, 2)
     tensor([ True, False,  True])
     """
@@ -120,7 +120,7 @@ def best_views(weight: Weights, directions: ViewVectors, count: int) -> ViewMask
     chosen = torch.zeros_like(turn, dtype=torch.bool)
     for _ in range(min(count, len(chosen))):
         share = 1 / (1 + weight[:, chosen].sum(dim=1))
-        # Of views that are as good, not each pose has the same light chosen.
+        # Among equally good views, different poses select different lights.
         gain = (share @ weight) * (1 + 1e-3 * turn) / (1 + alike[:, chosen].sum(dim=1))
         gain = torch.where(chosen, -1, gain)
         best = gain.argmax()
@@ -131,6 +131,6 @@ def best_views(weight: Weights, directions: ViewVectors, count: int) -> ViewMask
 
 
 def halves(points: Float[Tensor, "point axis"]) -> tuple[Int[Tensor, " _"], ...]:
-    """Divide points at the median of the axis along which they vary most."""
+    """Return the indices of two halves, split at the median along the axis of largest variance."""
     order = points[:, points.var(dim=0).argmax()].argsort(stable=True)
     return order.tensor_split((len(order) // 2,))

@@ -55,14 +55,14 @@ def resampled(
     min_facing: float,
     dark_level: float,
 ) -> Observations:
-    """Resample views on a bucket of templates, without occlusion.
+    """Return the samples of views on a bucket of templates, without occlusion.
 
-    Pixels are computed in float64; images are looked up in float32. Differentiable once.
+    Pixels are computed in float64, and images are sampled in float32. Differentiable once.
 
     Args:
-        rows: Where each camera's photograph is among the sources.
-        min_facing: Cosine of the steepest angle between a normal and the way to the camera.
-        dark_level: Radiance at or below which a sample is missing.
+        rows: Index of each camera's photograph among the sources.
+        min_facing: Least cosine of the angle between a normal and the direction to the camera.
+        dark_level: Radiance at or below which a sample is invalid.
     """
     outward = templates.normals_patch
     if outward is None:
@@ -86,11 +86,11 @@ def resampled(
 
 
 class _Resampled(torch.autograd.Function):
-    """Samples as a function of pictures and geometry, by a kernel and its adjoint."""
+    """Samples as a function of images and geometry, by a kernel and its adjoint."""
 
     @staticmethod
     def forward(ctx: Any, call: _Call, channels: int, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the samples, and which of them are valid."""
+        """Return the samples, and the mask of valid ones."""
         from pimper_torch.ground.kernels import resampling
 
         projection, depth = call[3], inputs[-1]
@@ -106,27 +106,27 @@ class _Resampled(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, on_radiance: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
-        """Return gradients of pictures and geometry."""
+        """Return gradients of images and geometry."""
         from pimper_torch.ground.kernels import resampling_adjoint as adjoint
 
         valid, *inputs = ctx.saved_tensors
         pictures, _, levels, projection, samples, *_ = ctx.call
         call = pictures, levels, projection, samples, as_array(valid), as_array(on_radiance)
-        of_pictures = any(ctx.needs_input_grad[2:4])
+        of_images = any(ctx.needs_input_grad[2:4])
 
-        def add_to(*found: _Array) -> None:
-            adjoint.pull_back(*call, int(of_pictures), adjoint.ViewGradients(*found))
+        def add_to(*arrays: _Array) -> None:
+            adjoint.pull_back(*call, int(of_images), adjoint.ViewGradients(*arrays))
 
-        return None, None, *pulled_back(add_to, inputs, of_pictures)
+        return None, None, *pulled_back(add_to, inputs, of_images)
 
 
 def occluded(
     valid: PatchMasks, cameras: Cameras, caster: RayCaster, templates: Templates, stride: int
 ) -> PatchMasks:
-    """Find samples that a surface occludes; a constant to autograd.
+    """Return the samples that a surface occludes. Not differentiable.
 
-    One ray for every ``stride`` samples either way, from the camera to just before the surface,
-    where one of these samples is valid; all of a bucket at once.
+    A ray is cast for every block of ``stride`` by ``stride`` samples with a valid one, from the
+    camera to just in front of the surface.
     """
     middle = slice(stride // 2, None, stride)
     sparse = templates.points_patch.detach()[:, middle, middle].double()
@@ -139,16 +139,16 @@ def occluded(
         for sites, samples in zip(sparse.shape[1:3], valid.shape[2:], strict=True)
     )
     shape = *valid.shape[:2], len(points[0]), valid.shape[3]
-    near = valid.new_zeros(shape).index_add_(2, rows, valid)
-    near = near.new_zeros(*near.shape[:3], points.shape[2]).index_add_(3, columns, near)
-    patch, view, row, column = near.nonzero(as_tuple=True)
+    blocks = valid.new_zeros(shape).index_add_(2, rows, valid)
+    blocks = blocks.new_zeros(*blocks.shape[:3], points.shape[2]).index_add_(3, columns, blocks)
+    patch, view, row, column = blocks.nonzero(as_tuple=True)
     starts = cameras.centers_world.detach().double()[view]
     directions = points[patch, row, column] - starts
     length = directions.norm(dim=1)
-    # An enlarged triangle dips under its neighbours by the overlap's fraction of their slope.
+    # An enlarged triangle extends below its neighbours, by the overlap times their slope.
     reach = (length - 4 * stride * templates.spacing.detach()[patch]).clamp_min(0)
-    near[patch, view, row, column] = caster.blocked(starts, directions / length[:, None], reach)
-    return near[:, :, rows][..., columns]
+    blocks[patch, view, row, column] = caster.blocked(starts, directions / length[:, None], reach)
+    return blocks[:, :, rows][..., columns]
 
 
 def _nearest_site(sites: int, samples: int) -> Int[Tensor, " sample"]:
@@ -159,12 +159,11 @@ def _nearest_site(sites: int, samples: int) -> Int[Tensor, " sample"]:
 class Warp(Stage):
     """Resample all views on all templates.
 
-    Perspective-correct, because each sample's own 3D point is projected; anti-aliased,
-    because the level of an image pyramid is chosen by the pixels that a sample covers.
-    Missing: outside the frame or the mask, grazing or back-facing, behind another facet,
-    too dark, saturated, not finite.
+    Perspective-correct, because the 3D point of each sample is projected; anti-aliased, because
+    the pyramid level is selected by the pixels that a sample covers. Invalid samples are outside
+    the frame or the mask, grazing or back-facing, occluded, too dark, saturated, or not finite.
 
-    Differentiable in the images and in the templates' depth; what is missing is a constant.
+    Differentiable in the images and in the templates' depth; the mask of valid samples is constant.
     """
 
     def __init__(self, config: WarpConfig | None = None) -> None:
@@ -177,14 +176,15 @@ class Warp(Stage):
         """Return J and D of every patch.
 
         Args:
-            patches: All, or some buckets of them.
-            sources: Pyramids as :func:`~pimper_torch.ground.geometry.pyramids.prepare` builds them;
-                built here where not given.
+            patches: All patches, or a subset of buckets.
+            sources: Pyramids of :func:`~pimper_torch.ground.geometry.pyramids.prepare`; computed if
+                not given.
         """
         sources = sources or prepare(views, self.config.saturation_level)
         caster = ray_caster(patches.surface or patches.coarse.mesh)
-        one = partial(self._registered, cameras, sources, caster)
-        return PatchViews(patches=patches, buckets=tuple(side_by_side(one, patches.buckets)))
+        registered = partial(self._registered, cameras, sources, caster)
+        buckets = tuple(side_by_side(registered, patches.buckets))
+        return PatchViews(patches=patches, buckets=buckets)
 
     def _registered(
         self, cameras: Cameras, sources: Sources, caster: RayCaster, templates: Templates
@@ -192,30 +192,30 @@ class Warp(Stage):
         rows, cameras = templates.rows(cameras.num_views), templates.own(cameras)
         if sources.lights is not None:
             sources = sources.replace(lights=templates.own(sources.lights))
-        found = self._resampled(cameras, sources, rows, templates, self.config.dark_level)
-        guesses = [
-            (maps, self._resampled(maps.cameras(cameras), maps.maps, own, templates, -math.inf))
-            for maps, own in (each.of(rows) for each in sources.priors)
-            if len(own)
+        samples = self._resampled(cameras, sources, rows, templates, self.config.dark_level)
+        prior_samples = [
+            (maps, self._resampled(maps.cameras(cameras), maps.maps, index, templates, -math.inf))
+            for maps, index in (prior.of(rows) for prior in sources.priors)
+            if len(index)
         ]
-        shown = found.valid
-        for maps, guess in guesses:
-            shown = shown.index_add(1, maps.view, guess.valid)
+        tested = samples.valid
+        for maps, looked_up in prior_samples:
+            tested = tested.index_add(1, maps.view, looked_up.valid)
         stride = self.config.occlusion_stride
-        hidden = occluded(shown, cameras, caster, templates, stride)
-        found.radiance.masked_fill_(hidden[:, :, None], 0)
+        hidden = occluded(tested, cameras, caster, templates, stride)
+        samples.radiance.masked_fill_(hidden[:, :, None], 0)
         priors: PatchPriors | None = None
-        if guesses or sources.lights is not None:
-            priors = merged(guesses, hidden, cameras, templates, sources.lights)
-        valid = found.valid & ~hidden
+        if prior_samples or sources.lights is not None:
+            priors = merged(prior_samples, hidden, cameras, templates, sources.lights)
+        valid = samples.valid & ~hidden
         total = int(templates.inside.sum()) * cameras.num_views
         leave_out("warp", total - int(valid.count_nonzero()), total=total)
         centers = cameras.centers_world.to(templates.patch_from_world)
         viewers = transform(
             templates.patch_from_world, centers.expand(len(templates.facet), -1, -1)
         )
-        viewers = normalize(viewers, dim=-1).to(found.radiance)
-        return found.replace(valid=valid, priors=priors, viewers=viewers)
+        viewers = normalize(viewers, dim=-1).to(samples.radiance)
+        return samples.replace(valid=valid, priors=priors, viewers=viewers)
 
     def _resampled(
         self,
@@ -225,7 +225,7 @@ class Warp(Stage):
         templates: Templates,
         dark_level: float,
     ) -> Observations:
-        """Resample views on a bucket, without occlusion; ``rows`` of the sources are theirs."""
+        """Return samples of views on a bucket, without occlusion; ``rows`` index the sources."""
         images = sources.images.finest
         if images.dtype == torch.float32 and compiled_for(images.detach()):
             steepest = math.cos(math.radians(self.config.max_tilt_deg))
@@ -238,7 +238,7 @@ class Warp(Stage):
             transferred = templates.normals_patch.detach().flatten(1, 2)
             outward = rotate(world_from_patch, transferred).reshape(points_world.shape)
 
-        def seen_by(view: int, row: int) -> tuple[Tensor, PatchMask]:
+        def sample(view: int, row: int) -> tuple[Tensor, PatchMask]:
             center = cameras.centers_world[view]
             facing = (normalize(center - points_world, dim=-1) * outward).sum(-1)
             steepest = torch.deg2rad(facing.new_tensor(self.config.max_tilt_deg)).cos()
@@ -250,19 +250,19 @@ class Warp(Stage):
             if not wanted.any():
                 return images.new_zeros(len(facing), images.shape[1], *facing.shape[1:]), wanted
             level = pyramid_level(pixels)
-            # A sample whose footprint touches the border, or is unusable by a tenth, is missing.
+            # A sample is invalid if its footprint touches the border, or a tenth of it is unusable.
             margin = 0.5 * 2 ** level.detach()[..., None]
             size = cameras.sizes_px[view].to(pixels)
             wanted = wanted & ((pixels >= margin) & (pixels <= size - margin)).all(dim=-1)
-            found = look_up(sources.images.levels(row), pixels[wanted], level[wanted])
-            fractions = [fraction.to(found) for fraction in sources.unusable.levels(row)]
+            values = look_up(sources.images.levels(row), pixels[wanted], level[wanted])
+            fractions = [fraction.to(values) for fraction in sources.unusable.levels(row)]
             lost = look_up(fractions, pixels[wanted].detach(), level[wanted].detach())[:, 0] / 255
-            usable = (lost < 0.1) & (found.mean(dim=1) > dark_level)
-            radiance = found.new_zeros(*wanted.shape, found.shape[1])
-            radiance = radiance.index_put((wanted,), found).movedim(-1, 1)
+            usable = (lost < 0.1) & (values.mean(dim=1) > dark_level)
+            radiance = values.new_zeros(*wanted.shape, values.shape[1])
+            radiance = radiance.index_put((wanted,), values).movedim(-1, 1)
             valid = torch.zeros_like(wanted).index_put((wanted,), usable)
             return radiance * valid[:, None], valid
 
-        seen = [seen_by(view, row) for view, row in enumerate(rows.tolist())]
-        radiance, valid = (torch.stack(one, dim=1) for one in zip(*seen, strict=True))
+        per_view = [sample(view, row) for view, row in enumerate(rows.tolist())]
+        radiance, valid = (torch.stack(values, dim=1) for values in zip(*per_view, strict=True))
         return Observations(radiance=radiance, valid=valid)
