@@ -13,13 +13,13 @@ from pimper_torch.ground.linalg.sums import average
 from pimper_torch.ground.shapes import Scalar
 from pimper_torch.published.published_config import AlignConfig
 from pimper_torch.published.seams import (
-    Pulls,
+    AlignTerms,
     Seams,
     Transforms,
     by_facet,
     curvature_along,
     find_seams,
-    meet_overlaps,
+    intersect_overlaps,
     mismatches,
     seam_stiffness,
     solve_transforms,
@@ -136,25 +136,25 @@ class Align(Stage):
         transforms = identity.expand(patches.num_patches, 4)
         distances = []
         for done in range(config.iterations):
-            pulls = self._intersected(depths, seams, anchors, transforms)
-            if not bool((pulls.weight > 0).any()):
+            terms = self._intersected(depths, seams, anchors, transforms)
+            if not bool((terms.weight > 0).any()):
                 return depths
-            distances.append(_root_mean_square(pulls, transforms))
-            transforms = self._solve_round(pulls, transforms, fresh=done == 0)
+            distances.append(_root_mean_square(terms, transforms))
+            transforms = self._solve_round(terms, transforms, fresh=done == 0)
             report(done + 1, config.iterations)
         with torch.no_grad():
-            pulls = self._intersected(depths, seams, anchors, transforms)
-            status = patch_status(pulls.facets, pulls.weight > 0, len(transforms))
+            terms = self._intersected(depths, seams, anchors, transforms)
+            status = patch_status(terms.facets, terms.weight > 0, len(transforms))
         aligned = (status == int(AlignStatus.ALIGNED))[:, None]
         if not bool(aligned.all()):
             # Without seams, each height field follows its anchors.
-            zero = torch.zeros_like(pulls.curvature)
-            on_mesh = solve_transforms(pulls, identity.expand_as(transforms), zero[:, 0], zero)
+            zero = torch.zeros_like(terms.curvature)
+            on_mesh = solve_transforms(terms, identity.expand_as(transforms), zero[:, 0], zero)
             on_mesh = _limit_scales(on_mesh, config.scale_limit)
             transforms = torch.where(aligned, transforms, on_mesh)
             with torch.no_grad():
-                pulls = self._intersected(depths, seams, anchors, transforms)
-        mismatch = torch.stack([*distances, _root_mean_square(pulls, transforms)]) * seams.units[3]
+                terms = self._intersected(depths, seams, anchors, transforms)
+        mismatch = torch.stack([*distances, _root_mean_square(terms, transforms)]) * seams.units[3]
         return depths.replace(
             buckets=_apply(depths, transforms * seams.units, status),
             mismatch=mismatch.detach().to(depths.buckets[0].depth),
@@ -162,17 +162,17 @@ class Align(Stage):
 
     def _intersected(
         self, depths: DepthPatches, seams: Seams, anchors: Anchors, transforms: Transforms
-    ) -> Pulls:
+    ) -> AlignTerms:
         """Return the terms of seams with the current transforms, and of anchors at vertices."""
         unit, coarse = seams.units[3], depths.patches.coarse
         in_scene = transforms * seams.units
-        samples, feet, hit = meet_overlaps(seams, depths.patches, depths.buckets, in_scene)
+        samples, feet, hit = intersect_overlaps(seams, depths.patches, depths.buckets, in_scene)
         met = hit.flatten(1)
         prior = unit.new_full((4,), self.config.prior)
         prior[3] = torch.inf  # patches do not move along their normals
         count = met.sum(dim=1).clamp_min(met.shape[1] // 4)  # few rays have less weight
         corners = pad(anchors.samples / unit, (0, 1), value=1.0)
-        pulls = Pulls(
+        terms = AlignTerms(
             facets=seams.facets,
             normals=seams.normals,
             samples=pad(samples.flatten(2, 3) / unit, (0, 1), value=1.0),
@@ -184,32 +184,32 @@ class Align(Stage):
             prior_weight=prior,
         )
         # The error of a single height field, from the median distance of two.
-        distance = mismatches(pulls, transforms).norm(dim=-1).detach()[met]
+        distance = mismatches(terms, transforms).norm(dim=-1).detach()[met]
         noise = torch.ones_like(unit)
         if len(distance):
             noise = distance.median().clamp_min(5e-3) / 2**0.5
         # An exact anchor has weight 1. Vertices that are not points of the cloud are inaccurate.
         exactness = noise.square() / (noise.square() + anchors.variance / unit.square())
         weight = torch.where(coarse.is_point[coarse.mesh.faces], exactness, 0.1) * anchors.valid
-        return pulls.replace(corner_weight=self.config.anchor * weight)
+        return terms.replace(corner_weight=self.config.anchor * weight)
 
-    def _solve_round(self, pulls: Pulls, transforms: Transforms, fresh: bool) -> Transforms:
-        touching = pulls.facets[(pulls.weight > 0).any(dim=1)].flatten()
+    def _solve_round(self, terms: AlignTerms, transforms: Transforms, fresh: bool) -> Transforms:
+        touching = terms.facets[(terms.weight > 0).any(dim=1)].flatten()
         moves = torch.zeros_like(transforms[:, 0]).index_fill(0, touching, 1)
-        pulls = pulls.replace(corner_weight=pulls.corner_weight * moves[:, None])
-        prior = pulls.prior_weight.clone()
+        terms = terms.replace(corner_weight=terms.corner_weight * moves[:, None])
+        prior = terms.prior_weight.clone()
         prior[2] = torch.inf
-        fixed_scales = pulls.replace(prior_weight=prior)
+        fixed_scales = terms.replace(prior_weight=prior)
         for solve in range(_REWEIGHTINGS if fresh else _REWEIGHTINGS - 1):
-            distance = mismatches(pulls, transforms).norm(dim=-1)
-            square = (pulls.weight * distance.square()).sum(dim=1)
-            terms = seam_stiffness(pulls.curvature, transforms[pulls.facets, 2], square)
+            distance = mismatches(terms, transforms).norm(dim=-1)
+            square = (terms.weight * distance.square()).sum(dim=1)
+            stiffness = seam_stiffness(terms.curvature, transforms[terms.facets, 2], square)
             # Tilts and shifts first: the mismatches that they remove do not depend on scales.
-            problem = fixed_scales if fresh and solve == 0 else pulls
-            transforms = solve_transforms(problem, transforms, *terms)
+            problem = fixed_scales if fresh and solve == 0 else terms
+            transforms = solve_transforms(problem, transforms, *stiffness)
             limited = _limit_scales(transforms, self.config.scale_limit)
             if not torch.equal(limited, transforms):
-                transforms = solve_transforms(fixed_scales, limited, *terms)
+                transforms = solve_transforms(fixed_scales, limited, *stiffness)
         return transforms
 
 
@@ -218,9 +218,9 @@ def _limit_scales(transforms: Transforms, limit: float) -> Transforms:
     return torch.stack([hx, hy, hz.clamp(1 / limit, limit), h0], dim=-1)
 
 
-def _root_mean_square(pulls: Pulls, transforms: Transforms) -> Scalar:
-    square = mismatches(pulls, transforms).square().sum(dim=-1)
-    return average(square[pulls.weight > 0]).sqrt()
+def _root_mean_square(terms: AlignTerms, transforms: Transforms) -> Scalar:
+    square = mismatches(terms, transforms).square().sum(dim=-1)
+    return average(square[terms.weight > 0]).sqrt()
 
 
 def _apply(

@@ -16,7 +16,7 @@ PerPoint = Float[Tensor, " point"]
 Nearest = Int[Tensor, "point neighbour"]
 
 
-def behind_others(pixels: Pixels, points_cam: Points, observed: PointMask) -> PointMask:
+def occluded_points(pixels: Pixels, points_cam: Points, observed: PointMask) -> PointMask:
     """Return points that a nearer surface certainly or probably occludes in the image.
 
     Among the 24 nearest points in the image, those count that are nearer to the camera by more than
@@ -35,7 +35,7 @@ def behind_others(pixels: Pixels, points_cam: Points, observed: PointMask) -> Po
     return (front.sum(dim=1) >= 3) & ((gaps.amax(dim=1) < torch.pi) | ~observed)
 
 
-def neighbours_agree(
+def consistent_points(
     pixels: Pixels, points_cam: Points, *, neighbours: int = 12, max_slope: float = 6.0
 ) -> PointMask:
     """Return points on the same surface as their neighbours in the image.
@@ -77,7 +77,7 @@ def on_hull(pixels: Pixels) -> PointMask:
     return marked.to(pixels.device)
 
 
-def well_accompanied(pixels: Pixels) -> PointMask:
+def without_isolated_corners(pixels: Pixels) -> PointMask:
     """Return all points except isolated corners of the hull, which are removed repeatedly.
 
     A point is isolated if the distance to its third nearest point exceeds 3 times the median of

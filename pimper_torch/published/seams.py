@@ -92,7 +92,7 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
     )
 
 
-def meet_overlaps(
+def intersect_overlaps(
     seams: Seams, patches: PatchSet, buckets: tuple[Depths, ...], transforms: Transforms
 ) -> tuple[PerRay, PerRay, Met]:
     """Intersect the rays of every seam with both height fields, as currently transformed.
@@ -146,7 +146,7 @@ def by_facet(patches: PatchSet, values: Iterable[Tensor]) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Pulls(Record):
+class AlignTerms(Record):
     """The terms of the alignment.
 
     Attributes:
@@ -170,11 +170,11 @@ class Pulls(Record):
     prior_weight: Float[Tensor, " 4"]
 
 
-def mismatches(pulls: Pulls, transforms: Transforms) -> Float[Tensor, "seam ray 3"]:
+def mismatches(terms: AlignTerms, transforms: Transforms) -> Float[Tensor, "seam ray 3"]:
     r"""Return :math:`P_\mu + N_\mu h_\mu^T S_\mu - P_{\mu'} - N_{\mu'} h_{\mu'}^T S_{\mu'}`."""
-    heights = torch.einsum("perc,pec->per", pulls.samples, transforms[pulls.facets])
-    lifted = heights[..., None] * pulls.normals[:, :, None]
-    return pulls.gap + lifted[:, 0] - lifted[:, 1]
+    heights = torch.einsum("perc,pec->per", terms.samples, transforms[terms.facets])
+    lifted = heights[..., None] * terms.normals[:, :, None]
+    return terms.gap + lifted[:, 0] - lifted[:, 1]
 
 
 def curvature_along(
@@ -211,7 +211,7 @@ def seam_stiffness(curvature: PerSide, scales: PerSide, square: PerSeam) -> tupl
 
 
 def solve_transforms(
-    pulls: Pulls, transforms: Transforms, stiffness: PerSeam, uplift: PerSide
+    terms: AlignTerms, transforms: Transforms, stiffness: PerSeam, uplift: PerSide
 ) -> Transforms:
     r"""Return the transforms that minimize the weighted squares of all terms.
 
@@ -224,32 +224,32 @@ def solve_transforms(
         uplift: Added to the right-hand sides of both ``h_z`` of a seam; see
             :class:`~pimper_torch.published.align.Align`.
     """
-    free = torch.nonzero(pulls.prior_weight.isfinite()).flatten()
-    identity = pulls.prior_weight.new_tensor([0, 0, 1, 0])
-    fixed = torch.where(pulls.prior_weight.isfinite(), 0, transforms)
-    samples, corners = pulls.samples[..., free], pulls.corners[..., free]
+    free = torch.nonzero(terms.prior_weight.isfinite()).flatten()
+    identity = terms.prior_weight.new_tensor([0, 0, 1, 0])
+    fixed = torch.where(terms.prior_weight.isfinite(), 0, transforms)
+    samples, corners = terms.samples[..., free], terms.corners[..., free]
     # Contributions of the fixed components.
-    gap = mismatches(pulls, fixed)
-    height = (pulls.corners * fixed[:, None]).sum(dim=-1)
+    gap = mismatches(terms, fixed)
+    height = (terms.corners * fixed[:, None]).sum(dim=-1)
 
     # Derivative of the mismatch of each ray by the unknowns of both patches.
-    normals = torch.stack([pulls.normals[:, 0], -pulls.normals[:, 1]], dim=1)
+    normals = torch.stack([terms.normals[:, 0], -terms.normals[:, 1]], dim=1)
     slope = torch.einsum("perc,pex->prxec", samples, normals).flatten(3)
-    weighted = (stiffness[:, None] * pulls.weight)[..., None, None] * slope
+    weighted = (stiffness[:, None] * terms.weight)[..., None, None] * slope
     seam_rhs = uplift[..., None] * identity[free]
     seam_rhs = seam_rhs.flatten(1) - torch.einsum("prxk,prx->pk", weighted, gap)
-    anchored, prior = pulls.corner_weight[..., None] * corners, pulls.prior_weight[free]
+    anchored, prior = terms.corner_weight[..., None] * corners, terms.prior_weight[free]
     rhs = prior * identity[free] - torch.einsum("fvc,fv->fc", anchored, height)
     unknown = torch.arange(rhs.numel(), device=rhs.device).reshape(rhs.shape)
-    of_seam = unknown[pulls.facets].flatten(1)
+    of_seam = unknown[terms.facets].flatten(1)
     rhs = rhs.flatten().index_add(0, of_seam.flatten(), seam_rhs.flatten())
-    terms = [
+    blocks = [
         (unknown, torch.einsum("fvc,fvd->fcd", anchored, corners) + prior.diag()),
         (of_seam, torch.einsum("prxk,prxl->pkl", weighted, slope)),
     ]
-    rows = [index[:, :, None].expand_as(block).flatten() for index, block in terms]
-    cols = [index[:, None].expand_as(block).flatten() for index, block in terms]
-    values = torch.cat([block.flatten() for _, block in terms])
+    rows = [index[:, :, None].expand_as(block).flatten() for index, block in blocks]
+    cols = [index[:, None].expand_as(block).flatten() for index, block in blocks]
+    values = torch.cat([block.flatten() for _, block in blocks])
     name = "the alignment of the patches"
     factor = SparseCholesky(torch.cat(rows), torch.cat(cols), values, len(rhs), name)
     return fixed.index_copy(1, free, factor.solve(rhs).reshape(unknown.shape))

@@ -24,7 +24,7 @@ from pimper_torch.runtime.stage import Stage
 # an axis within this angle of the reference's.
 _MAX_VIEW_ANGLE_DEG = 40.0
 
-# A facet tilted more against the reference bridges a depth discontinuity; so does one tilted by more
+# A facet tilted more from the reference bridges a depth discontinuity; so does one tilted by more
 # than the second angle with an edge longer than this multiple of the median facet's.
 _MAX_TILT_DEG, _BRIDGE_TILT_DEG, _MAX_STRETCH = 80.0, 60.0, 3.0
 
@@ -101,14 +101,14 @@ class Triangulate(Stage):
 
         def visible(index: Int[Tensor, " point"]) -> Bool[Tensor, " point"]:
             seen = observed[index, reference]
-            return ~cloud_filters.behind_others(pixels[index], points_cam[index], seen)
+            return ~cloud_filters.occluded_points(pixels[index], points_cam[index], seen)
 
         filters = (
             lambda index: (within & observed[:, near].any(dim=1))[index],
             visible,
             visible,  # again, without points that seemed to be occluders
-            lambda index: cloud_filters.neighbours_agree(pixels[index], points_cam[index]),
-            lambda index: cloud_filters.well_accompanied(pixels[index]),
+            lambda index: cloud_filters.consistent_points(pixels[index], points_cam[index]),
+            lambda index: cloud_filters.without_isolated_corners(pixels[index]),
         )
         before = index = reliable_points(scene)
         for passes in filters:

@@ -1,4 +1,4 @@
-"""Every stage and chain, under one name: ``pt.stages.Warp``.
+"""All stages and chains in one namespace: ``pt.stages.Warp``.
 
 ``CoarseToFine`` (presets ``default`` and ``fast``) runs ``Reconstruct``, ``FindSilhouettes``,
 ``TraceContours``, ``CoarseSurface`` and ``DepthFromLight``; for each scale ``Decompose``, ``Warp``,

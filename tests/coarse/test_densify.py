@@ -11,17 +11,17 @@ from pimper_torch.ground.geometry.poisson import poisson_surface
 from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.topology import connected_to
 from pimper_torch.method.coarse.densify import (
-    agreeing,
     choose_sources,
+    count_agreeing,
     push_pull,
     step_for_one_pixel,
 )
 from pimper_torch.method.coarse.oriented import (
     OrientedPoints,
     no_points,
+    refit_normals,
     sparse_oriented,
     thinned,
-    with_common_normals,
 )
 from pimper_torch.method.coarse.trim import (
     ViewCounts,
@@ -119,13 +119,13 @@ def test_a_view_agrees_with_those_that_see_the_same_surface_and_with_none_that_s
     depth = truth.depth.float()
     inverse_depth = torch.where(depth.isfinite(), 1 / depth, 0.0)
     good, others = depth.isfinite(), torch.tensor([1, 3])
-    count = agreeing(level, inverse_depth, good, 2, others)
+    count = count_agreeing(level, inverse_depth, good, 2, others)
     inner = good[2] & (truth.normals_world[2][..., 2] > 0.7)
     assert float((count[inner] == 2).double().mean()) > 0.98
     assert not bool(count[~good[2]].any())
     wrong = inverse_depth.clone()
     wrong[3] *= 1.1
-    count = agreeing(level, wrong, good, 2, others)
+    count = count_agreeing(level, wrong, good, 2, others)
     assert float((count[inner] == 1).double().mean()) > 0.98
 
 
@@ -190,7 +190,7 @@ def sheets(generator, gap=0.055):
 
 def test_normals_follow_the_neighbours_positions_on_either_side_of_a_thin_wall():
     true, cloud = sheets(torch.Generator().manual_seed(4))
-    found = with_common_normals(cloud)
+    found = refit_normals(cloud)
     # Where more neighbours than usual are on the other sheet, normals disagree: points are dropped.
     assert len(found.points_world) > 0.8 * len(cloud.points_world)
     truth = torch.where(found.points_world[:, 2:] > 0.02, 1.0, -1.0) * true[:1]
@@ -204,7 +204,7 @@ def test_points_whose_neighbours_face_anywhere_are_dropped():
     generator = torch.Generator().manual_seed(5)
     _, cloud = sheets(generator)
     random = normalize(torch.randn(4000, 3, generator=generator, dtype=torch.float64), dim=1)
-    assert len(with_common_normals(cloud.replace(normals_world=random)).noise) < 0.2 * 4000
+    assert len(refit_normals(cloud.replace(normals_world=random)).noise) < 0.2 * 4000
 
 
 def test_sparse_points_far_from_dense_ones_get_normals_to_the_cameras():

@@ -13,8 +13,8 @@ from pimper_torch.ground.geometry.topology import face_components, face_pairs
 from pimper_torch.method.coarse.surface import (
     CoarseSurface,
     facets_of,
+    limit_faces_per_edge,
     smoothed_normals,
-    two_faces_an_edge,
 )
 from pimper_torch.records import Mesh, Silhouettes, Support
 from pimper_torch.runtime.errors import InputError, ReconstructionError
@@ -147,7 +147,7 @@ def test_a_cloud_without_reliable_points_is_refused(round_about):
 def test_of_three_faces_at_an_edge_the_smallest_goes():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.1]])
     faces = torch.tensor([[0, 1, 2], [1, 0, 4], [1, 0, 3]])
-    assert two_faces_an_edge(vertices, faces).tolist() == [[0, 1, 2], [1, 0, 3]]
+    assert limit_faces_per_edge(vertices, faces).tolist() == [[0, 1, 2], [1, 0, 3]]
 
 
 def test_smoothing_normals_leaves_a_plane_alone_and_halves_a_crease():

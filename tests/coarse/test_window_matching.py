@@ -46,7 +46,7 @@ def correlations(level, sources, inverse_depth):
     weight = weight * torch.stack([usable[place] for place in places])
     weight = weight / weight.sum(dim=0).clamp_min(1e-12)
     around = around - (weight * around).sum(dim=0)
-    pixels, ratio = pair(level, 2, sources).look(inverse_depth)
+    pixels, ratio = pair(level, 2, sources).project(inverse_depth)
     scores = []
     for index, source in enumerate(sources.tolist()):
         u, v = (pixels[index] - 0.5).double()

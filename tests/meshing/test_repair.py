@@ -17,7 +17,7 @@ from pimper_torch.ground.geometry.topology import (
 from pimper_torch.method.meshing import repair as repairing
 from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.method.meshing.faults import faults
-from pimper_torch.method.meshing.repair import Repair, least_bent, repair, surroundings
+from pimper_torch.method.meshing.repair import Repair, minimize_bending, repair, surroundings
 from pimper_torch.records import Mesh
 
 
@@ -191,7 +191,7 @@ def test_gradients_reach_fixed_vertices_and_no_repaired_ones():
     _, coarse = icosphere(1)
     free = torch.zeros(42, dtype=torch.bool)
     free[[0, 5]] = True
-    assert torch.autograd.gradcheck(lambda places: least_bent(places, coarse, free), clone)
+    assert torch.autograd.gradcheck(lambda places: minimize_bending(places, coarse, free), clone)
 
 
 def test_the_least_bent_positions_are_those_of_a_dense_solve(generator):
@@ -205,7 +205,7 @@ def test_the_least_bent_positions_are_those_of_a_dense_solve(generator):
     bending[~free & ~(near[:, free] > 0).any(dim=1)] = 0
     target = -bending[:, ~free] @ vertices[~free]
     best = np.linalg.lstsq(bending[:, free].numpy(), target.numpy(), rcond=None)[0]
-    placed = least_bent(vertices, faces, free)
+    placed = minimize_bending(vertices, faces, free)
     assert_close(placed[free], torch.from_numpy(best))
     assert torch.equal(placed[~free], vertices[~free])
 

@@ -7,10 +7,10 @@ from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
 from pimper_torch.published.align import Align, patch_status, vertex_anchors
 from pimper_torch.published.published_config import AlignConfig
 from pimper_torch.published.seams import (
-    Pulls,
+    AlignTerms,
     curvature_along,
     find_seams,
-    meet_overlaps,
+    intersect_overlaps,
     seam_stiffness,
     solve_transforms,
 )
@@ -205,7 +205,7 @@ def test_the_solution_is_where_the_published_energys_gradient_vanishes(generator
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     facets = torch.tensor([[0, 1], [2, 1], [0, 2]])
-    pulls = Pulls(
+    terms = AlignTerms(
         facets=facets,
         normals=normalize(random(3, 2, 3), dim=-1),
         samples=random(3, 2, 5, 4),
@@ -217,18 +217,18 @@ def test_the_solution_is_where_the_published_energys_gradient_vanishes(generator
         prior_weight=torch.tensor(prior, dtype=torch.float64),
     )
     start, k, none = random(4, 4), random(3).abs(), torch.zeros(3, 2).double()
-    found = solve_transforms(pulls, start, k, none).requires_grad_()
-    free = pulls.prior_weight.isfinite()
+    found = solve_transforms(terms, start, k, none).requires_grad_()
+    free = terms.prior_weight.isfinite()
     assert_close(found[:, ~free], start[:, ~free])
-    energy = (pulls.prior_weight * (found - IDENTITY).square())[:, free].sum()
-    energy += (pulls.corner_weight * (pulls.corners * found[:, None]).sum(-1).square()).sum()
+    energy = (terms.prior_weight * (found - IDENTITY).square())[:, free].sum()
+    energy += (terms.corner_weight * (terms.corners * found[:, None]).sum(-1).square()).sum()
     for seam in range(3):
         for ray in range(5):
-            apart = pulls.gap[seam, ray]
+            apart = terms.gap[seam, ray]
             for side, sign in ((0, 1), (1, -1)):
-                height = found[facets[seam, side]] @ pulls.samples[seam, side, ray]
-                apart = apart + sign * height * pulls.normals[seam, side]
-            energy += k[seam] * pulls.weight[seam, ray] * apart.square().sum()
+                height = found[facets[seam, side]] @ terms.samples[seam, side, ray]
+                apart = apart + sign * height * terms.normals[seam, side]
+            energy += k[seam] * terms.weight[seam, ray] * apart.square().sum()
     (gradient,) = torch.autograd.grad(energy, found)
     assert_close(gradient[:, free], 0 * gradient[:, free], atol=1e-10, rtol=0)
 
@@ -276,7 +276,7 @@ def test_two_height_fields_of_one_sphere_are_met_in_the_same_points(sphere):
     patches = sphere.patches
     seams = find_seams(patches, rows=5, columns=8, reach_samples=4.0)
     identity = IDENTITY.expand(patches.num_patches, 4)
-    samples, feet, met = meet_overlaps(seams, patches, sphere.buckets, identity)
+    samples, feet, met = intersect_overlaps(seams, patches, sphere.buckets, identity)
     assert met.float().mean() > 0.8
     points = feet + samples[..., 2:] * seams.normals[:, :, None, None]
     apart = (points[:, 0] - points[:, 1]).norm(dim=-1)[met]

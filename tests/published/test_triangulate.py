@@ -6,14 +6,14 @@ from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths
 from pimper_torch.ground.geometry.topology import face_components, half_edges
 from pimper_torch.published.cloud_filters import (
-    behind_others,
+    consistent_points,
     delaunay,
     facets_under,
-    neighbours_agree,
+    occluded_points,
     on_hull,
     spread,
     spread_to_count,
-    well_accompanied,
+    without_isolated_corners,
 )
 from pimper_torch.published.published_config import TriangulateConfig
 from pimper_torch.published.triangulate import Triangulate, peel
@@ -120,7 +120,7 @@ def test_points_of_another_layer_and_stray_points_disagree_with_their_neighbours
     depth[:10] += 2.0  # another layer
     depth[10:20] += 0.12  # badly triangulated: several radii of a neighbourhood
     points_cam = torch.cat([lateral, depth], dim=1)
-    agree = neighbours_agree(lateral * 500, points_cam, max_slope=3.0)
+    agree = consistent_points(lateral * 500, points_cam, max_slope=3.0)
     assert not agree[:20].any()
     assert agree[20:].float().mean() > 0.98
 
@@ -129,7 +129,7 @@ def test_neighbours_across_a_depth_edge_agree_each_with_its_own_side():
     lateral = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).double()
     depth = torch.where(lateral[:, :1] < 9.5, 100.0, 160.0).double()
     points_cam = torch.cat([lateral, depth], dim=1)
-    agree = neighbours_agree(lateral, points_cam, neighbours=8, max_slope=3.0)
+    agree = consistent_points(lateral, points_cam, neighbours=8, max_slope=3.0)
     assert agree.float().mean() > 0.95
 
 
@@ -140,12 +140,12 @@ def test_points_behind_a_layer_are_hidden_and_those_beside_its_contour_are_not(g
     on_wall = (radius > 1) | (uniform(generator, 1500) < 0.3)
     depth = torch.where(on_wall, 7.0, 4.0).double()
     points_cam = torch.cat([lateral, depth[:, None]], dim=1)
-    found = behind_others(lateral, points_cam, torch.ones_like(on_wall))
+    found = occluded_points(lateral, points_cam, torch.ones_like(on_wall))
     assert found[on_wall & (radius < 0.85)].float().mean() > 0.95
     assert not found[~on_wall].any()
     assert not found[on_wall & (radius > 1.02)].any()
     # Just inside the contour they have the disc on one side only; unseen, they are doubted.
-    unseen = behind_others(lateral, points_cam, ~on_wall)
+    unseen = occluded_points(lateral, points_cam, ~on_wall)
     edge = on_wall & (radius > 0.85) & (radius < 0.99)
     assert found[edge].float().mean() < 0.8 < 0.98 < unseen[edge].float().mean()
     assert not unseen[~on_wall].any()
@@ -158,7 +158,7 @@ def test_no_point_of_a_steep_dome_is_hidden(generator, seen, reach):
     lateral = lateral[lateral.norm(dim=1) < 0.999]
     depth = 5 - (1 - lateral.square().sum(dim=1, keepdim=True)).sqrt()
     observed = torch.full_like(lateral[:, 0], seen, dtype=torch.bool)
-    found = behind_others(lateral, torch.cat([lateral, depth], dim=1), observed)
+    found = occluded_points(lateral, torch.cat([lateral, depth], dim=1), observed)
     assert not found[lateral.norm(dim=1) < reach].any()
 
 
@@ -188,6 +188,6 @@ def test_lonely_corners_of_the_hull_are_dropped_shell_by_shell_and_no_inner_poin
     pixels = uniform(generator, 300, 2)
     pixels[0] = torch.tensor([3.0, 3.0])
     pixels[1] = torch.tensor([2.0, 2.5])  # in the first one's shadow until that is gone
-    kept = well_accompanied(pixels)
+    kept = without_isolated_corners(pixels)
     assert not kept[:2].any()
     assert kept[2:].float().mean() > 0.97

@@ -121,19 +121,19 @@ class CoarseToFine(Chain):
         mesh: Mesh | None,
     ) -> Iterator[Step]:
         """Run the stages after the coarse mesh once for each scale; see :meth:`Chain.passes`."""
-        every = self.placed(run, views, sparse_model, mesh)
+        complete = self.placed(run, views, sparse_model, mesh)
         needed = (*self.references(), *self.needed)
-        placed, held_out = split_held_out(every, self.config.hold_out, needed)
-        few = one_view_per_pose(placed, needed)
-        outlines = run(self.silhouettes, few.scene)
-        mesh = self.given_mesh(mesh, views, few.scene, outlines)
-        scene, silhouettes = of_all_photographs(placed, few, outlines)
+        placed, held_out = split_held_out(complete, self.config.hold_out, needed)
+        selected = one_view_per_pose(placed, needed)
+        outlines = run(self.silhouettes, selected.scene)
+        mesh = self.given_mesh(mesh, views, selected.scene, outlines)
+        scene, silhouettes = of_all_photographs(placed, selected, outlines)
         scene = resolve_prior_conventions(scene, silhouettes)
-        shown = scene if few.scene is placed else masked(few.scene, outlines)
-        contours = run(self.contours, outlines, shown.cameras)
-        coarse = run(self.coarse_surface, shown, contours, mesh)
-        if shown is not scene:
-            coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
+        per_pose = scene if selected.scene is placed else masked(selected.scene, outlines)
+        contours = run(self.contours, outlines, per_pose.cameras)
+        coarse = run(self.coarse_surface, per_pose, contours, mesh)
+        if per_pose is not scene:
+            coarse = coarse.replace(reference=int(selected.chosen[coarse.reference]))
         self.show(scene, coarse)
         run(explain, coarse.mesh, contours)
         cameras, surface = scene.cameras, None
@@ -145,10 +145,10 @@ class CoarseToFine(Chain):
             seen = run(self.warp, scene.views, cameras, thinned(patches), sources)
             light = run(self.light, seen)
             del seen
-            if surface is None and mesh is None and shown is scene:
-                found = run(self.depth_from_light, scene, contours, coarse.mesh, light.field)
-                if len(found.points_world):
-                    coarse = run(self.coarse_surface, scene, contours, None, found)
+            if surface is None and mesh is None and per_pose is scene:
+                points = run(self.depth_from_light, scene, contours, coarse.mesh, light.field)
+                if len(points.points_world):
+                    coarse = run(self.coarse_surface, scene, contours, None, points)
                     self.show(scene, coarse)
                     patches = run(self.decompose, coarse, cameras, surface, scale)
                     seen = run(self.warp, scene.views, cameras, thinned(patches), sources)
@@ -164,7 +164,7 @@ class CoarseToFine(Chain):
                 del sources  # takes as much memory as the photographs
             surface = run(self.fuse, heights, contours, last, *by_blocks)
             surface = run(self.repair, surface)
-            run(explain, surface, contours, shown.views.names if mesh is None else ())
+            run(explain, surface, contours, per_pose.views.names if mesh is None else ())
             yield Step(
                 scale=scale,
                 last=last,

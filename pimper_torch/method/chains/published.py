@@ -82,19 +82,19 @@ class Published(Chain):
     ) -> Iterator[Step]:
         """Run the stages once; see :meth:`Chain.passes`."""
         placed = self.placed(run, views, sparse_model, mesh)
-        few = one_view_per_pose(placed, tuple(self.references()))
-        outlines = run(self.silhouettes, few.scene)
-        mesh = self.given_mesh(mesh, views, few.scene, outlines)
-        scene, silhouettes = of_all_photographs(placed, few, outlines)
+        selected = one_view_per_pose(placed, tuple(self.references()))
+        outlines = run(self.silhouettes, selected.scene)
+        mesh = self.given_mesh(mesh, views, selected.scene, outlines)
+        scene, silhouettes = of_all_photographs(placed, selected, outlines)
         scene = resolve_prior_conventions(scene, silhouettes)
-        shown = scene if few.scene is placed else masked(few.scene, outlines)
+        per_pose = scene if selected.scene is placed else masked(selected.scene, outlines)
         if mesh is None:
-            coarse = run(self.triangulate, shown)
+            coarse = run(self.triangulate, per_pose)
         else:
-            contours = Contours.none(outlines, shown.cameras)
-            coarse = run(self.coarse_surface, shown, contours, mesh)
-        if shown is not scene:
-            coarse = coarse.replace(reference=int(few.chosen[coarse.reference]))
+            contours = Contours.none(outlines, per_pose.cameras)
+            coarse = run(self.coarse_surface, per_pose, contours, mesh)
+        if per_pose is not scene:
+            coarse = coarse.replace(reference=int(selected.chosen[coarse.reference]))
         self.show(scene, coarse)
         patches = run(self.decompose, coarse, scene.cameras, None, 1.0)
         seen = run(self.warp, scene.views, scene.cameras, patches)

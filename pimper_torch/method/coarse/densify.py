@@ -212,7 +212,7 @@ def _checked(
     good = (score >= _MIN_SCORE) & level.usable & (inverse_depth > 0)
 
     def counted(view: int) -> Int[Tensor, "height width"]:
-        return agreeing(level, inverse_depth, good, view, chosen[view])
+        return count_agreeing(level, inverse_depth, good, view, chosen[view])
 
     agreed = stacked(side_by_side(counted, range(len(chosen)), tracked=False), len(chosen))
     return DepthMaps(
@@ -226,7 +226,7 @@ def _checked(
     )
 
 
-def agreeing(
+def count_agreeing(
     level: MatchingLevel, inverse_depth: Maps, good: Masks, view: int, others: Int[Tensor, " other"]
 ) -> Int[Tensor, "height width"]:
     """Count the other views whose depths agree: reprojection there and back ends on the same pixel.
@@ -239,7 +239,7 @@ def agreeing(
         return count
     chosen, values = good[view], inverse_depth[view][good[view]]
     pairing = pair(level, view, others)
-    pixels, ratio = pairing.replace(ray=pairing.ray[:, :, chosen]).look(values)
+    pixels, ratio = pairing.replace(ray=pairing.ray[:, :, chosen]).project(values)
     grid = grid_from_pixels(pixels.movedim(1, -1), width, height)
     measured = nearest_pixels(inverse_depth[others], grid)
     valid = nearest_pixels(good[others].to(measured), grid) > 0.5
@@ -268,7 +268,7 @@ def filled(maps: DepthMaps, view: int) -> Map:
     sources = maps.sources[view]
     splat, index = torch.zeros_like(field), torch.tensor([view], device=field.device)
     for source in sources[sources >= 0].tolist():
-        pixels, ratio = pair(maps.level, source, index).look(maps.inverse_depth[source])
+        pixels, ratio = pair(maps.level, source, index).project(maps.inverse_depth[source])
         chosen = maps.valid[source] & (ratio[0] > 0)
         value = (maps.inverse_depth[source] / ratio[0].clamp_min(1e-6))[chosen]
         splat = torch.maximum(splat, _splatted(pixels[0][:, chosen].mT, value, field))
@@ -286,19 +286,19 @@ def _splatted(pixels: Pixels, values: Float[Tensor, " point"], like: Map) -> Map
     return flat.scatter_reduce(0, index, values.to(like)[inside], "amax").reshape(height, width)
 
 
-def push_pull(values: Map, known: Mask) -> Map:
-    """Return values with holes filled smoothly from a pyramid of averages; known values stay.
+def push_pull(values: Map, valid: Mask) -> Map:
+    """Return values with holes filled smoothly from a pyramid of averages; valid values stay.
 
     Source: Gortler et al., The Lumigraph, SIGGRAPH 1996, section 3.3.
     """
-    weight = known.to(values)
-    if bool(known.all()) or not bool(known.any()) or min(values.shape) == 1:
-        return values if bool(known.any()) else torch.zeros_like(values)
+    weight = valid.to(values)
+    if bool(valid.all()) or not bool(valid.any()) or min(values.shape) == 1:
+        return values if bool(valid.any()) else torch.zeros_like(values)
     stacked = torch.stack([values * weight, weight])[None]
     total, fraction = avg_pool2d(stacked, 2, ceil_mode=True, count_include_pad=False)[0]
     below = push_pull(total / fraction.clamp_min(1e-12), fraction > 0)
     up = interpolate(below[None, None], values.shape, mode="bilinear", align_corners=False)
-    return torch.where(known, values, up[0, 0])
+    return torch.where(valid, values, up[0, 0])
 
 
 def nearest_pixels(
@@ -317,8 +317,8 @@ def choose_sources(
         At most five views that share points, the best first.
     """
     observed = scene.observed[points]
-    own = observed[:, view]
-    points_world, shared = scene.points_world[points[own]], observed[own]
+    in_view = observed[:, view]
+    points_world, shared = scene.points_world[points[in_view]], observed[in_view]
     rays = normalize(points_world[:, None] - scene.cameras.centers_world, dim=-1)
     angle = torch.rad2deg((rays * rays[:, view, None]).sum(dim=-1).clamp(-1, 1).acos())
     away = angle - _BEST_ANGLE_DEG
@@ -341,6 +341,6 @@ def step_for_one_pixel(
     row = pixels[:, 1].long().clamp(0, height - 1)
     at_points = pairing.replace(ray=pairing.ray[:, :, row, column])
     change = 0.01 * inverse_depth.median()
-    before, after = (at_points.look(inverse_depth + sign * change)[0] for sign in (-1, 1))
+    before, after = (at_points.project(inverse_depth + sign * change)[0] for sign in (-1, 1))
     moved = (after - before).norm(dim=1).median()
     return float(2 * change / moved.clamp_min(1e-6))

@@ -17,7 +17,7 @@ from pimper_torch.ground.geometry.pixels import grid_from_pixels
 from pimper_torch.ground.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.ground.geometry.supporting_plane import fixation
 from pimper_torch.ground.shapes import Mask, Pixels, Points
-from pimper_torch.method.coarse.densify import DepthMaps, agreeing, depth_maps, nearest_pixels
+from pimper_torch.method.coarse.densify import DepthMaps, count_agreeing, depth_maps, nearest_pixels
 from pimper_torch.method.coarse.window_matching import Matcher, pair
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.runtime.errors import caution
@@ -162,16 +162,16 @@ def _in_source(
     index = torch.tensor([source], device=chosen.device)
     pairing = pair(maps.level, view, index)
     field, valid = maps.inverse_depth[view], maps.agreed > 0
-    agrees = agreeing(maps.level, maps.inverse_depth, valid, view, index)[chosen] > 0
+    agrees = count_agreeing(maps.level, maps.inverse_depth, valid, view, index)[chosen] > 0
     alike = Matcher(maps.level, pairing).scores(field, [0.0])[0, chosen] >= 0.5
     rays = pairing.replace(ray=pairing.ray[:, :, chosen])
     height, width = chosen.shape
-    grid = grid_from_pixels(rays.look(field[chosen])[0].movedim(1, -1), width, height)
+    grid = grid_from_pixels(rays.project(field[chosen])[0].movedim(1, -1), width, height)
     depth = 1 / nearest_pixels(maps.inverse_depth[index], grid).clamp_min(1e-9)
     # Inverse depth on the ray whose depth in the source is that of the source's map.
     by_source = (rays.ray[:, 2] / (depth - rays.shift[:, 2:]))[0]
     agrees = agrees & (by_source > 0)
-    pixels, _ = rays.look(torch.where(agrees, by_source, field[chosen]))
+    pixels, _ = rays.project(torch.where(agrees, by_source, field[chosen]))
     return pixels[0].mT, agrees | alike
 
 

@@ -210,17 +210,17 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     images = zeros(
         (*views.images.shape[:2], height, width), views.images.dtype, views.images.device
     )
-    shown = zeros((views.num_views, height, width), torch.bool, images.device)
+    visible = zeros((views.num_views, height, width), torch.bool, images.device)
     leave_out("coarse.cropping", by_view(lambda inside, mask: inside & ~mask, views.inside, masks))
     intrinsics = scene.cameras.intrinsics.clone()
     for view, (image, mask) in enumerate(each(views.images, masks)):
         (left, top), (w, h) = low[view].tolist(), size[view].tolist()
         rows, columns = slice(top, top + h), slice(left, left + w)
         images[view, :, :h, :w] = image[:, rows, columns]
-        shown[view, :h, :w] = mask[rows, columns]
+        visible[view, :h, :w] = mask[rows, columns]
         intrinsics[view] = crop_intrinsics(intrinsics[view], float(left), float(top))
     return scene.replace(
-        views=views.replace(images=images, masks=shown, sizes_px=size, priors=()),
+        views=views.replace(images=images, masks=visible, sizes_px=size, priors=()),
         cameras=scene.cameras.replace(intrinsics=intrinsics, sizes_px=size),
     )
 

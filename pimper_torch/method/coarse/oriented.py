@@ -234,7 +234,7 @@ def _of_slab(
     )
 
 
-def with_common_normals(cloud: OrientedPoints) -> OrientedPoints:
+def refit_normals(cloud: OrientedPoints) -> OrientedPoints:
     """Refit the normals to the positions of neighbours from all views.
 
     A window's slope is less accurate than its depth. Neighbours on the other side of a thin
@@ -317,7 +317,7 @@ def matched_cloud(
     maps = depth_maps(scene, reliable, levels)
     pixel = pixel_size(scene, reliable) * maps[-1].factor
     # The coarsest windows of three extend beyond contours: they only initialize the finer ones.
-    dense = with_common_normals(thinned(oriented_points(maps[-2:]), pixel))
+    dense = refit_normals(thinned(oriented_points(maps[-2:]), pixel))
     cloud = OrientedPoints.cat([dense, sparse_oriented(scene, reliable, dense, 3 * pixel)])
     return cloud, maps[-1], pixel
 

@@ -105,7 +105,7 @@ def remesh(
     with torch.no_grad():
         kept = _with_data(old, faces, surface, seen, config.max_hole)
         leave_out("remesh.data", ~kept, at=(old, faces))
-        severity = departures(corners, faces, surface) / (config.max_departure * spacing)
+        severity = plane_deviations(corners, faces, surface) / (config.max_departure * spacing)
         spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
         severity = torch.maximum(severity, spread.to(severity))
         if residual is not None:
@@ -182,7 +182,7 @@ def _with_data(
     return data | enclosed_holes(vertices, faces, data, max_hole * float(total(area)))
 
 
-def departures(vertices: Vertices, faces: Faces, surface: Surface) -> Float[Tensor, " face"]:
+def plane_deviations(vertices: Vertices, faces: Faces, surface: Surface) -> Float[Tensor, " face"]:
     """Return the 90th percentile of the surface's distances to each facet's plane."""
     normals = unit_face_normals(vertices, faces)
     centre = vertices[faces].mean(dim=1)

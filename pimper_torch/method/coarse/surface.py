@@ -91,7 +91,7 @@ class CoarseSurface(Stage):
             fine = fine_surface(scene, reliable, contours, self.config.levels, more)
             simple = reduced(Mesh(vertices_world=fine.vertices_world, faces=fine.faces), count)
             vertices, total = simple.vertices_world, len(simple.faces)
-            faces = two_faces_an_edge(vertices, simple.faces)
+            faces = limit_faces_per_edge(vertices, simple.faces)
             leave_out("coarse.crowded", total - len(faces), total=total)
             supported = torch.ones_like(faces[:, 0], dtype=torch.bool)
             kept = supported_components(vertices, faces, supported, min_fraction(contours))
@@ -148,7 +148,7 @@ def smoothed_normals(vertices: Vertices, faces: Faces) -> Vertices:
     return normalize(normals + normalize(total, dim=-1), dim=-1)
 
 
-def two_faces_an_edge(vertices: Vertices, faces: Faces) -> Int[Tensor, "kept 3"]:
+def limit_faces_per_edge(vertices: Vertices, faces: Faces) -> Int[Tensor, "kept 3"]:
     """Return faces, at most two per edge: of others the smallest is dropped, repeatedly."""
     while True:
         _, face_edge = face_edges(faces)

@@ -85,7 +85,7 @@ class Pairing(Record):
     ray: Float[Tensor, "source 3 *pixel"]
     shift: Float[Tensor, "source 3"]
 
-    def look(
+    def project(
         self, inverse_depth: Float[Tensor, "*pixel"]
     ) -> tuple[Float[Tensor, "source 2 *pixel"], Float[Tensor, " source *pixel"]]:
         """Return the pixels in the sources, and the depth there over the depth in the view."""

@@ -36,8 +36,8 @@ def protruding(
 ) -> FaceMask:
     """Return undetermined faces that protrude from the borders, found repeatedly until none do.
 
-    Borders shorter than a circle of radius ``length`` are small holes and are ignored. Nothing is
-    returned if half of the faces are as large. Not differentiable.
+    Borders shorter than a circle of radius ``length`` are small holes and are ignored. The result
+    is empty if the median side of faces is not shorter than ``length``. Not differentiable.
 
     Args:
         length: Approximate largest width of a protrusion, scene units.

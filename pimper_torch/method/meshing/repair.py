@@ -18,7 +18,7 @@ from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
 
-def least_bent(vertices: Vertices, faces: Faces, free: VertexMask) -> Vertices:
+def minimize_bending(vertices: Vertices, faces: Faces, free: VertexMask) -> Vertices:
     r"""Return vertices with free ones moved to where the surface bends least, a clamped thin plate.
 
     Minimizes the sum of :math:`\lVert x_i - \tfrac{1}{d_i} \sum_{j \sim i} x_j \rVert^2` over
@@ -130,7 +130,7 @@ def repair(
     free = topology.corners_of(faces, broken(before), count)
     free = _with_neighbours(faces, free & ~_components_with(faces, free, fixed))
     for ring in range(_RINGS + 1):
-        positions = least_bent(before, faces, free)
+        positions = minimize_bending(before, faces, free)
         fixed = fixed | (free & ~small_groups(positions, faces, free, max_extent))
         free = free & ~fixed
         defective = broken(positions) | (side_lengths(positions[faces]).amax(dim=1) < shortest)
@@ -139,7 +139,7 @@ def repair(
             break
         wider = topology.corners_of(faces, failed[faces].any(dim=1), count) & ~fixed
         free = free & ~failed if ring == _RINGS else _with_neighbours(faces, free | wider)
-    return least_bent(vertices, faces, free), free
+    return minimize_bending(vertices, faces, free), free
 
 
 def surroundings(faces: Faces, broken: FaceMask, num_vertices: int) -> FaceMask:
