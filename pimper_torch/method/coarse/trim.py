@@ -55,7 +55,7 @@ class ViewCounts(Record):
 
     Attributes:
         seen: Views in which the face is unoccluded, within the image, and facing the camera.
-        lit: Those of them in which its pixel is illuminated.
+        lit: Views among these in which its pixel is illuminated.
         behind: Views that see through the face: their depth map has a matched point behind it.
     """
 

@@ -35,8 +35,8 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     def transferred(templates: Templates) -> Templates:
         with torch.no_grad():
             # A little farther, so that rounding does not decide.
-            hits, met = _nearest(caster, *_lines(templates), surface, 1.01 * _reach(templates))
-        return recomputed(_on_surface, surface, normals, templates, hits, met)
+            hits, valid = _nearest(caster, *_lines(templates), surface, 1.01 * _reach(templates))
+        return recomputed(_on_surface, surface, normals, templates, hits, valid)
 
     buckets = tuple(side_by_side(transferred, patches.buckets, tracked=False))
     return patches.replace(buckets=buckets, surface=surface.replace(normals_world=normals))
@@ -55,7 +55,7 @@ def _reach(templates: Templates) -> Float[Tensor, "patch 1"]:
 
 
 def _on_surface(
-    surface: Mesh, normals: Vertices, templates: Templates, hits: Hits, met: SampleMask
+    surface: Mesh, normals: Vertices, templates: Templates, hits: Hits, valid: SampleMask
 ) -> Templates:
     """Return templates with the depth and normals where their lines hit the given faces."""
     positions, inward = _lines(templates)
@@ -63,14 +63,14 @@ def _on_surface(
     points = hits.interpolate(surface.vertices_world, surface.faces)
     depth = transform(templates.patch_from_world, points)[..., 2]
     rotated = rotate(templates.patch_from_world, hits.interpolate(normals, surface.faces))
-    met = met & (depth.abs() <= _reach(templates))
+    valid = valid & (depth.abs() <= _reach(templates))
     raster = templates.depth.shape
     return templates.replace(
-        depth=torch.where(met, depth, 0).reshape(raster),
+        depth=torch.where(valid, depth, 0).reshape(raster),
         normals_patch=normalize(
-            torch.where(met[..., None], rotated, rotated.new_tensor([0, 0, -1])), dim=-1
+            torch.where(valid[..., None], rotated, rotated.new_tensor([0, 0, -1])), dim=-1
         ).reshape(*raster, 3),
-        inside=templates.inside & met.reshape(raster),
+        inside=templates.inside & valid.reshape(raster),
     )
 
 
