@@ -44,8 +44,7 @@ class Anchors(Record):
     """The vertices of every facet, which its height field should pass through.
 
     Attributes:
-        samples: ``(x, y, z)`` of the height field at the vertex, before any transform, patch
-            frame.
+        samples: ``(x, y, z)`` of the untransformed height field at the vertex, patch frame.
         variance: Variance of the vertex along the facet's normal, scene units squared.
         valid: True if the height field is valid at the vertex.
     """
@@ -111,8 +110,7 @@ class Align(Stage):
 
     Invariant to rigid motions and the scale of the world. Differentiable in the depths.
 
-    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k; anchors and rounds are
-    additions.
+    Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k, not anchors and rounds.
     """
 
     def __init__(self, config: AlignConfig | None = None) -> None:

@@ -20,9 +20,8 @@ def occluded_points(pixels: Pixels, points_cam: Points, observed: PointMask) -> 
     """Return points that a nearer surface certainly or probably occludes in the image.
 
     Among the 24 nearest points in the image, those count that are nearer to the camera by more than
-    3 times their lateral distance. If three or more surround the point, it is occluded. If they are
-    all in one half-plane, as at a contour or on a steep surface, it is occluded only if the view
-    does not observe it.
+    3 times their lateral distance. If three or more surround the point, it is occluded; if all are
+    in one half-plane, as at a contour or on a steep surface, only if the view does not observe it.
     """
     nearest = nearest_in_image(pixels, 24)
     steps = points_cam[nearest] - points_cam[:, None]
@@ -41,9 +40,8 @@ def consistent_points(
     """Return points on the same surface as their neighbours in the image.
 
     A point on a different surface has a steep slope to most neighbours: ``|dz|`` over the lateral
-    distance exceeds ``max_slope``. A badly triangulated point is farther from the plane of its
-    neighbours than half the neighbourhood's radius. The worst are dropped first, in rounds, so that
-    an outlier does not affect its neighbours.
+    distance exceeds ``max_slope``. A badly triangulated point is farther from its neighbours' plane
+    than half their radius. The worst are dropped first, in rounds, to protect their neighbours.
     """
     keep = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
     neighbours = min(neighbours, len(pixels) - 1)

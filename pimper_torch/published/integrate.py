@@ -107,8 +107,7 @@ class Integrate(Stage):
 
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
         """Return the height fields, ``valid`` inside enlarged triangles with data."""
-        # A normal beyond the warp's limit is at a contour or wrong, and a single one can bend its
-        # complete patch.
+        # A normal beyond the warp's limit is at a contour or wrong, and can bend its whole patch.
         steepest = math.tan(math.radians(75))
         mesh = photometric.patches.coarse.mesh
         pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))

@@ -112,8 +112,7 @@ def intersect_overlaps(
         directions_world = seams.directions[seam][:, :, None].expand_as(origins_world)
         origins = transform(patch_from_world, origins_world.flatten(1, 2))
         directions = rotate(patch_from_world, directions_world.flatten(1, 2))
-        # A ray hits the transformed height field where the inversely transformed ray hits the
-        # height field.
+        # The inversely transformed ray is intersected with the untransformed height field.
         hx, hy, hz, h0 = transforms[templates.facet][:, :, None].unbind(dim=1)
         height = origins[..., 2] - hx * origins[..., 0] - hy * origins[..., 1] - h0
         sinking = directions[..., 2] - hx * directions[..., 0] - hy * directions[..., 1]

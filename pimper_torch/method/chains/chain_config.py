@@ -35,8 +35,7 @@ class CoarseToFineConfig:
     Attributes:
         chain: Name of the chain.
         on_failure: If a patch, view or solver fails, omit it and continue (skip), or stop (fail).
-        max_memory: For example 4GB: a surface that needs more is fused in blocks, or refused in
-            the first pass.
+        max_memory: Such as 4GB. A larger surface is fused in blocks, or refused in the first pass.
         hold_out: Every N-th photograph is held out, and predicted at the end; 0 holds out none.
         scales: Scale of the photographs in each pass, coarse to fine; 1 is full size.
         photographs: ``encoding`` of :func:`~pimper_torch.doors.io.photographs.load_views`.

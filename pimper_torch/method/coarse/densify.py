@@ -44,14 +44,12 @@ _RANGE_MARGIN = 0.15
 # determined, above about 25 windows look different.
 _BEST_ANGLE_DEG = 12.0
 
-# Requirements for a valid depth: correlation of its windows; number of other views that agree, and
-# their reprojection error. Choices: two views seldom agree by chance; the finest step resolves a
-# pixel.
+# Requirements for a valid depth: correlation of its windows; other views that agree, and their
+# reprojection error. Choices: two views seldom agree by chance; the finest step resolves a pixel.
 _MIN_SCORE, _MIN_AGREEING, _MAX_ERROR_PX = 0.5, 2, 1.0
 
-# Steps between hypotheses, in pixels of the sources: over the full range; around the field from the
-# coarser resolution; around the best of either. Choices: the peak of the correlation of windows is
-# a pixel or two wide.
+# Steps between hypotheses, in pixels of the sources: over the full range; around the coarser field;
+# around the best of either. Choices: the peak of the correlation is a pixel or two wide.
 _FULL_STEP, _NEAR_STEP, _LAST_STEP = 0.7, 0.8, 0.5
 
 
@@ -88,8 +86,7 @@ def depth_maps(
     """Compute depth maps of all views: the full range at low resolution, then near the last depth.
 
     Args:
-        levels: Number of resolutions; each doubles the one before, from a longer side of about 100
-            pixels.
+        levels: Number of resolutions, doubling from a longer side of about 100 pixels.
 
     Returns:
         The maps of every resolution, the coarsest first.
@@ -181,8 +178,7 @@ def sweep(matcher: Matcher, field: Map, offsets: Sequence[float]) -> tuple[Map, 
     """Return the best inverse depth at every pixel among evenly spaced offsets of a field.
 
     Returns:
-        Inverse depth, interpolated by the parabola through the best offset and its neighbours, and
-        the best score.
+        Inverse depth, by the parabola through the best offset and its neighbours; best score.
     """
     smallest = torch.finfo(field.dtype).tiny
     scores = matcher.scores(field, offsets)
@@ -244,8 +240,7 @@ def count_agreeing(
     measured = nearest_pixels(inverse_depth[others], grid)
     valid = nearest_pixels(good[others].to(measured), grid) > 0.5
     expected = values / ratio.clamp_min(1e-6)
-    # Reprojection error to first order in the error of inverse depth: without the rounding to the
-    # source's nearest pixel.
+    # Reprojection error to first order in inverse depth, without rounding to the source's pixel.
     rotation, shift = pixels_from_pixels(level.cameras, view, others)
     shift = shift.to(pixels)[:, :, None]
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)

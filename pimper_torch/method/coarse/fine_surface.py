@@ -72,9 +72,8 @@ def fine_surface(
 ) -> FineSurface:
     """Compute a surface through matched points and contours, smooth where there are neither.
 
-    It is closed except where no view sees it, and where views look into an opening. If the
-    silhouettes constrain nothing, faces without points must be near points and illuminated in
-    two views.
+    It is closed except where no view sees it, and where views look into an opening. If silhouettes
+    constrain nothing, faces without points must be near points and illuminated in two views.
 
     Args:
         reliable: Points of the cloud inside the visual hull; an object without texture has none.
@@ -192,9 +191,8 @@ def cropped(scene: SparseScene, silhouettes: Silhouettes) -> SparseScene:
     """Return the scene cropped to the silhouettes, with them and occluders as masks.
 
     The images share one size, that of the largest bounding box. Views without a silhouette keep
-    their upper left corner, masked. Cameras are adjusted. Priors are removed, because their maps
-    cover the full photographs. Observations keep their pixels, which are those of the photographs
-    before undistortion.
+    their upper left corner, masked. Cameras are adjusted. Priors are removed: their maps cover full
+    photographs. Observations keep their pixels, those of the photographs before undistortion.
 
     Args:
         silhouettes: Of all views; unreliable ones mask their photographs, too. If they constrain

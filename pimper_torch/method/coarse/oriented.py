@@ -179,12 +179,10 @@ def count_contradictions(maps: DepthMaps, view: int, points: Points) -> Int[Tens
 def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     """Average the points in each grid cell that face the same way.
 
-    Noisy points share larger cells, up to eight times as wide, so that a surface through them
-    is smooth.
+    Noisy points share larger cells, up to eight times as wide, so a surface through them is smooth.
 
     Args:
-        cell: Side of the finest cells, scene units. They contain the points with noise of at most
-            a third of it.
+        cell: Side of the finest cells, scene units; for points with noise up to a third of it.
     """
     if len(cloud.points_world) == 0:
         return cloud

@@ -19,8 +19,7 @@ from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.stage import Stage
 
-# Barycentric coordinate below which a subdivided mesh vertex is on an edge: edges have far fewer
-# than a million parts.
+# Barycentric coordinate of a vertex on an edge, at most: edges have far fewer than a million parts.
 _ON_EDGE = 1e-6
 
 # The corners of a facet do not move if its area would shrink below this fraction, or its longest
@@ -38,9 +37,8 @@ class Remesh(Stage):
     def forward(self, swept: SweptPatches, surface: Surface, contours: Contours) -> CoarseMesh:
         """Return the patches' coarse mesh fitted to the surface that was reconstructed on it.
 
-        Lengths are in sample spacings of these patches. Inside a visual hull all facets stay, seen
-        or not, because the coarse surface is already trimmed. Without a hull, a facet has data if
-        two views see it, lit or not.
+        Lengths are in sample spacings of these patches. Inside a visual hull all facets stay: the
+        coarse mesh is already trimmed. Without one, facets in two views have data, lit or not.
         """
         patches = swept.patches
         residual = surface.information.new_full((patches.num_patches,), torch.nan)
@@ -88,9 +86,8 @@ def remesh(
         cloud see :func:`~pimper_torch.method.coarse.splitting.with_points`. Unused vertices are
         dropped, and parts of the mesh that are joined only at a vertex get a copy of it each.
 
-    If the surface has no support at all, no facet is dropped. Vertices and normals are
-    differentiable in those of the surface and the old mesh. Which facets are split, dropped or
-    moved is constant.
+    If the surface has no support at all, no facet is dropped. Differentiable: vertices and normals,
+    in those of the surface and the old mesh; which facets are split, dropped or moved is constant.
     """
     config = config or RemeshConfig()
     old, faces = coarse.mesh.vertices_world, coarse.mesh.faces

@@ -35,8 +35,7 @@ from pimper_torch.runtime.stage import Stage
 _ON_FACET_PX = 4.0
 
 # Requirements for a reliable point: views, mean reprojection error, widest angle between its rays.
-# Choices: two views of a wrong match always agree, three seldom; with a narrower angle the depth is
-# uncertain.
+# Choices: two views of a wrong match always agree, three seldom; narrower angles: poor depth.
 _MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 3, 1.5, 4.0
 
 
@@ -215,8 +214,7 @@ def point_covariances(
     inward = intrinsics.new_tensor([0, 0, 1])
     rate = (intrinsics[:, :2] - pixel * inward) / depth @ frames[:, :3, :3]
     information = rate.new_zeros(count, 3, 3).index_add(0, point, rate.mT @ rate)[index]
-    # Bounds the standard deviation along the rays, infinite in one view, to some 1,000 times that
-    # across them.
+    # Bounds the standard deviation along rays, infinite in one view, to 1,000 times that across.
     least = 1e-6 * information.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
     eye = torch.eye(3, dtype=rate.dtype, device=rate.device)
     covariance = torch.linalg.inv(information + least[:, None, None] * eye)

@@ -74,8 +74,7 @@ def view_counts(
 ) -> ViewCounts:
     """Count the views that see the centre of each face, see it lit, and see through it.
 
-    Without texture, depth maps of single views have errors: a depth counts only if its point is
-    near the cloud of all views.
+    Depth maps without texture have errors: a depth counts only if near the cloud of all views.
 
     Args:
         level: Photographs, at the resolution of the depth maps.

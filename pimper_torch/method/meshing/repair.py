@@ -22,8 +22,7 @@ def minimize_bending(vertices: Vertices, faces: Faces, free: VertexMask) -> Vert
     r"""Return vertices with free ones moved to where the surface bends least, a clamped thin plate.
 
     Minimizes the sum of :math:`\lVert x_i - \tfrac{1}{d_i} \sum_{j \sim i} x_j \rVert^2` over
-    free vertices and their neighbours. Weights are uniform, because edge lengths of folded faces
-    are meaningless.
+    free vertices and their neighbours, with uniform weights: lengths in folds are meaningless.
 
     Args:
         free: Vertices to move; every connected component needs a fixed neighbour.

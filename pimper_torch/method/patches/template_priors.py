@@ -23,8 +23,7 @@ def merged(
     """Return the priors of all samples, averaged over views with inverse variances, which add up.
 
     If values scatter more than their variances indicate, over views or from pixel to pixel, the
-    information is that of their scatter. A common error of all maps does not scatter: it raises the
-    noise factor in the fusion.
+    information is that of their scatter. A common error raises the noise factor in the fusion.
 
     Args:
         prior_samples: Maps, and the samples looked up in them.

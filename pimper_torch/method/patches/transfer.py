@@ -24,8 +24,7 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
     that faces like the facet, nearest to the facet's plane. Samples without one, or with one
     farther than half the template's extent, are no longer ``inside``.
 
-    Differentiable in the surface's vertices and normals and in the templates' frames; the
-    intersected face is constant.
+    Differentiable in the surface's vertices and normals and in the frames; hit faces are constant.
     """
     normals = surface.normals_world
     if normals is None:

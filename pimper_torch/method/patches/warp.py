@@ -177,8 +177,7 @@ class Warp(Stage):
 
         Args:
             patches: All patches, or a subset of buckets.
-            sources: Pyramids of :func:`~pimper_torch.ground.geometry.pyramids.prepare`; computed if
-                not given.
+            sources: As :func:`~pimper_torch.ground.geometry.pyramids.prepare` returns; or computed.
         """
         sources = sources or prepare(views, self.config.saturation_level)
         caster = ray_caster(patches.surface or patches.coarse.mesh)

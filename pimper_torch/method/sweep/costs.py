@@ -49,8 +49,7 @@ def inconsistency(
     Args:
         radiance: Radiance of the sample in each view under the hypothesis.
         shading: For albedo 1, the same for all hypotheses; positive where seen.
-        seen: Views that are compared; the same for all hypotheses, because costs of different
-            sets are not comparable.
+        seen: Views that are compared; common to all hypotheses, so that costs are comparable.
         scale: ``c``, in units of radiance.
 
     Differentiable in radiance, shading and scale, through the iterations of the albedo.
@@ -114,8 +113,7 @@ def view_scores(facing: PerView, footprint: PerView, shading: PerView) -> PerVie
 
     Args:
         facing: Cosine between the normal and the direction to the camera.
-        footprint: Pixels that a sample would span if it faced the camera; more than one counts
-            as one.
+        footprint: Pixels that a sample would span if it faced the camera; above 1 counts as 1.
         shading: Radiance for albedo 1; the mean over views and more count as 1.
     """
     typical = shading.clamp_min(0).mean(dim=1, keepdim=True)
