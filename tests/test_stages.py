@@ -48,10 +48,10 @@ def spoilt(normals):
     [
         (lambda found: None, "photometric is NoneType; needed: PhotometricPatches"),
         (lambda found: found.patches, "photometric is PatchSet; needed: PhotometricPatches"),
-        (lambda found: found.replace(buckets=()), "buckets are 0; needed: one for each of"),
+        (lambda found: found.replace(buckets=()), "buckets has 0 entries; needed: one for each of"),
         (
             lambda found: found.replace(buckets=found.buckets[::-1]),
-            r"buckets\[0\] has patches, height, width .*as its templates",
+            r"buckets\[0\] has patches, height, width .*like its templates",
         ),
         (
             lambda found: changed(found, normals_patch=lambda n: n.float()),
@@ -64,7 +64,7 @@ def spoilt(normals):
         (lambda found: changed(found, normals_patch=lambda n: 2 * n), "of length 2 to 2"),
         (
             lambda found: changed(found, normals_patch=lambda n: 0.5 + 0.5 * opengl(n)),
-            "coded as colours, 0 to 1: decode them as 2 n - 1",
+            "look like colours from 0 to 1: decode them as 2 n - 1",
         ),
         (
             lambda found: changed(found, normals_patch=opengl),
@@ -123,7 +123,7 @@ def test_patches_are_counted_indexed_and_walked_through(factorized):
     assert torch.equal(one.buckets[0].albedo[0], found.buckets[place].albedo[row])
     assert torch.equal(seen[7].buckets[0].valid[0], seen.buckets[place].valid[row])
     assert [int(each.patches.buckets[0].facet) for each in found] == list(range(len(found)))
-    with pytest.raises(IndexError, match="no patch stands on facet 99"):
+    with pytest.raises(IndexError, match="facet 99 has no patch"):
         found[99]
 
 

@@ -73,14 +73,14 @@ def test_a_point_is_taken_to_be_seen_where_it_falls_on_the_object(given):
         ({"images": torch.zeros(3, 3)}, r"images has shape \(3, 3\); needed: view channel"),
         ({"images": torch.zeros(6, 3, 48, 64, dtype=torch.uint8)}, "images is uint8; .*load_views"),
         ({"intrinsics": torch.eye(3)[:2]}, r"intrinsics is float32\[2, 3\]; needed: "),
-        ({"intrinsics": -torch.eye(3)}, "6 matrices that are no K, the first"),
+        ({"intrinsics": -torch.eye(3)}, "6 matrices that are not K, the first"),
         ({"cam_from_world": torch.eye(4).repeat(5, 1, 1)}, r"cam_from_world is float32\[5, 4, 4\]"),
         (
             {"cam_from_world": 2 * torch.eye(4).repeat(6, 1, 1)},
             "6 of 6 matrices that are not rigid",
         ),
         ({"masks": torch.ones(6, 4, 4)}, r"masks is bool\[6, 4, 4\]"),
-        ({"names": ["a"] * 6}, "names are 6, 1 of them different"),
+        ({"names": ["a"] * 6}, "names has 6 entries, 1 of which"),
         ({"points_world": [[0.0, 0, 1]], "observed": [[True]]}, r"observed has shape \(1, 1\)"),
     ],
 )

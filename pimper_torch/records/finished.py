@@ -13,11 +13,12 @@ from pimper_torch.records.scene import Mesh
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Closed(Record):
-    """A mesh without borders.
+    """A mesh with capped borders.
 
     Attributes:
-        mesh: The former faces first, in their order.
-        measured: Faces that were there; the others are caps.
+        mesh: The faces before capping first, in the same order.
+        measured: True for these faces; the others are caps.
+        borders: Number of capped borders.
     """
 
     mesh: Mesh
@@ -27,15 +28,15 @@ class Closed(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Finished(Record):
-    """A surface as it is written.
+    """A surface as written to files.
 
     Attributes:
-        mesh: Without caps; what pictures show.
-        few: The same in about 50,000 faces, where it has more: what people edit and browsers draw.
-        closed: With caps, if it shall have some.
-        how: ``"simplified"``, ``"reduced"`` to a number of faces, or nothing where it is whole.
-        counts: Of vertices and faces, and how far simplification moved the surface.
-        caps: Borders that were closed, faces and fraction of the area that they have.
+        mesh: Without caps; images show it.
+        few: The same with about 50,000 faces if it has more, for editing and for browsers.
+        closed: With caps, if requested.
+        how: ``"simplified"``, ``"reduced"`` to a number of faces, or empty if unchanged.
+        counts: Numbers of vertices and faces, and how far simplification moved the surface.
+        caps: Number of capped borders, faces of the caps and their fraction of the area.
     """
 
     mesh: Mesh
@@ -48,13 +49,13 @@ class Finished(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ViewLights(Record):
-    """The light of every view, for base colours as the files have them.
+    """The light of every view, for base colours as written to files.
 
     Attributes:
         direction_world: Unit, from the surface's centre towards the light.
-        closeness: The surface's radius over the light's distance; 0 for a light at infinity.
+        inverse_distance: The surface's radius over the light's distance; 0 for a light at infinity.
         ambient: Radiance of a white matte surface in shadow.
-        directed: Added where it faces the light, at the distance of the centre.
+        directed: Added radiance where it faces the light, at the distance of the centre.
     """
 
     direction_world: Float[Tensor, "view 3"]
@@ -65,12 +66,12 @@ class ViewLights(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Materials(Record):
-    """Materials of a surface in glTF's terms, one for every cluster of albedo.
+    """Materials of a surface in glTF's terms, one per cluster of albedo.
 
     Attributes:
         roughness: In [0, 1]; its square is GGX's alpha.
-        specular: Times what glTF's dielectric mirrors head on; ``KHR_materials_specular``'s
-            ``specularFactor`` up to 1, ``specularColorFactor`` above.
+        specular: Factor on the reflectance of glTF's dielectric at normal incidence;
+            ``KHR_materials_specular``'s ``specularFactor`` up to 1, ``specularColorFactor`` above.
     """
 
     cluster: Int[Tensor, " vertex"]
@@ -96,7 +97,7 @@ class Materials(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ViewErrors(Record):
-    """Errors of a surface in photographs, each under the light that suits it best.
+    """Errors of a rendered surface in photographs, each under its best-fitting light.
 
     Attributes:
         psnr_db: Of sRGB values in [0, 1], over the object's pixels.
@@ -109,12 +110,14 @@ class ViewErrors(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Relighting(Record):
-    """The lights and materials of a result, and what they are worth.
+    """The lights and materials of a result, and its errors in photographs.
 
     Attributes:
-        lights: Of the photographs that the surface was made from.
-        held_out: Whether these photographs were held out, or the surface was made from them.
-        textured: With materials, and the asset's textures in place of values of vertices.
+        lights: Of the photographs from which the surface was made.
+        errors: With materials.
+        matte: Without materials.
+        held_out: True if the errors are in held-out photographs, not in those of the surface.
+        textured: With materials, and the asset's textures instead of vertex values.
     """
 
     lights: ViewLights
@@ -127,17 +130,17 @@ class Relighting(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Textured(Record):
-    """A mesh with textures, as glTF wants them.
+    """A mesh with textures, as glTF requires.
 
     Attributes:
-        mesh: Its vertices are copied along seams.
-        vertex: That each copy is of.
-        normals: Of its vertices, unit; those that the normal map is relative to.
+        mesh: Vertices are duplicated along seams.
+        vertex: Index of the original vertex of each copy.
+        normals: Unit, of every vertex; the normal map is relative to them.
         uv: Right and down over the textures, in [0, 1].
         tangent: Unit along ``u``, and the sign of the bitangent.
         normal: Along tangent, bitangent and normal: 0 is -1, and 255 is 1.
-        doubt: About the base colour: 0 where light determines it, 128 where too few lights do, and
-            255 where it is the neighbours'.
+        uncertainty: Of the base colour: 0 where light determines it, 128 where too few lights do,
+            and 255 where it is inpainted from neighbours.
         reflectance: Metallic, roughness and specular in [0, 1]; ``None`` for matte.
     """
 
@@ -154,7 +157,7 @@ class Textured(Record):
 
     @property
     def summary(self) -> dict[str, int | float]:
-        """Return counts and sizes, for ``summary.json``."""
+        """Counts and sizes for ``summary.json``."""
         height, width = self.normal.shape[:2]
         faces = len(self.mesh.faces)
         return {"faces": faces, "charts": self.charts, "width_px": width, "height_px": height}

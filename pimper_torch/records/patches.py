@@ -1,10 +1,10 @@
-"""Everything that is known facet by facet, from templates to the joined surface.
+"""Records of all patches, from templates to the joined surface.
 
-Patches are kept in buckets: templates of like size, padded to one raster and batched.
+Patches are grouped in buckets: templates of similar size, padded to one raster and batched.
 Records of later stages have the same buckets in the same order.
 
-The patch frame is x right, y down, z forward into the surface: the facet lies in the
-plane z = 0 and its outward normal is -z. A depth on the template is a coordinate along z.
+The patch frame is x right, y down, z forward into the surface: the facet is in the plane z = 0
+and its outward normal is -z. A depth on the template is a coordinate along z.
 """
 
 import math
@@ -22,12 +22,12 @@ from pimper_torch.records.record import AnyRecord, Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
 from pimper_torch.records.value_checks import (
     Faults,
-    beyond,
+    facing_away,
     faults_in,
     not_finite,
     not_unit,
+    out_of_range,
     outside,
-    turned_away,
 )
 from pimper_torch.runtime.errors import InputError
 
@@ -41,19 +41,18 @@ class Templates(Record):
     """A bucket of templates: rasters in the planes of their facets.
 
     Attributes:
-        facet: Which facet of the coarse mesh each template belongs to.
+        facet: Index of each template's facet in the coarse mesh.
         patch_from_world: Rigid.
         origin: x and y of the first sample's centre, patch frame.
         spacing: Scene units between neighbouring samples; the paper's 1/zeta.
-        depth: z of every sample, 0 while the template is flat.
-        barycentric: Coordinates of every sample with respect to the facet itself; outside
-            the facet one of them is negative.
-        inside: True in the enlarged triangle; of a template that carries a surface, only where
-            it has some.
-        normals_patch: Of the surface that a template carries, unit, facing the viewer. ``None``
-            while the template is flat: the coarse mesh's smoothed normals stand in.
-        views: Which of all views the bucket is seen in, where it is not all of them: later records
-            of it have these alone, in their order.
+        depth: z of every sample, 0 if the template is flat.
+        barycentric: Coordinates of every sample in the facet; one is negative outside the facet.
+        inside: True in the enlarged triangle; if the template follows a surface, only where that
+            surface exists.
+        normals_patch: Normals of the surface that the template follows, unit, facing the viewer.
+            ``None`` if the template is flat: the coarse mesh's smoothed normals are used instead.
+        views: True for views selected for the bucket, ``None`` if all are. Later records of the
+            bucket contain only the selected views, in order.
     """
 
     facet: Int[Tensor, " patch"]
@@ -67,20 +66,17 @@ class Templates(Record):
     views: Bool[Tensor, " view"] | None = None
 
     def rows(self, num_views: int) -> Int[Tensor, " row"]:
-        """Return the numbers of the views, of ``num_views``, that the bucket is seen in."""
+        """Return the indices of the bucket's views, among ``num_views``."""
         if self.views is None:
             return torch.arange(num_views, device=self.facet.device)
         return self.views.nonzero()[:, 0]
 
     def own(self, record: AnyRecord) -> AnyRecord:
-        """Take the views that the bucket is seen in from a record of all views."""
+        """Select the bucket's views from a record of all views."""
         return record if self.views is None else record.take(self.views)
 
     def among_all(self, values: Shaped[Tensor, "..."]) -> Shaped[Tensor, "..."]:
-        """Put values of the bucket's views, along the second axis, among those of all views.
-
-        Zero in those that the bucket is not seen in.
-        """
+        """Scatter values of the bucket's views, on the second axis, to all views; others are 0."""
         if self.views is None:
             return values
         shape = len(values), len(self.views), *values.shape[2:]
@@ -88,7 +84,7 @@ class Templates(Record):
 
     @property
     def points_patch(self) -> Float[Tensor, "patch height width 3"]:
-        """The samples' positions in the patch frame."""
+        """Positions of the samples in the patch frame."""
         height, width = self.depth.shape[-2:]
         columns = torch.arange(width, device=self.depth.device, dtype=self.depth.dtype)
         rows = torch.arange(height, device=self.depth.device, dtype=self.depth.dtype)
@@ -99,9 +95,9 @@ class Templates(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OverPatches(Record):
-    """A result over all patches, in buckets like those of the templates.
+    """Values of all patches, in the same buckets as the templates.
 
-    ``len`` counts patches, and indexing by a facet's number, or iterating, gives records of one
+    ``len`` counts patches. Indexing by a facet's number, or iterating, returns records of one
     patch each.
     """
 
@@ -109,7 +105,7 @@ class OverPatches(Record):
         return self._templates.num_patches
 
     def lengths(self) -> dict[str, int]:
-        """Return the number of patches: their rasters differ."""
+        """Return the number of patches; their rasters differ."""
         return {"patch": len(self)}
 
     def __getitem__(self: AnyPatches, facet: int) -> AnyPatches:
@@ -117,7 +113,7 @@ class OverPatches(Record):
             row = (bucket.facet == facet).nonzero()[:, 0]
             if len(row):
                 return self._part({index: row[:1]})
-        raise IndexError(f"no patch stands on facet {facet}; there are {len(self)} patches")
+        raise IndexError(f"facet {facet} has no patch; there are {len(self)} patches")
 
     def __iter__(self: AnyPatches) -> Iterator[AnyPatches]:
         facets = torch.cat([bucket.facet for bucket in self._templates.buckets])
@@ -125,11 +121,11 @@ class OverPatches(Record):
 
     @property
     def _templates(self) -> "PatchSet":
-        found: PatchSet = self.patches  # type: ignore[attr-defined]
-        return found
+        templates: PatchSet = self.patches  # type: ignore[attr-defined]
+        return templates
 
     def of_facets(self: AnyPatches, facets: Bool[Tensor, " facet"]) -> AnyPatches:
-        """Return the patches of some facets, which keep their numbers."""
+        """Return the patches of some facets; patches keep their facet numbers."""
         if bool(facets.all()):
             return self
         rows = {
@@ -139,7 +135,7 @@ class OverPatches(Record):
         return self._part({index: row for index, row in rows.items() if len(row)})
 
     def _part(self: AnyPatches, rows: Mapping[int, Tensor]) -> AnyPatches:
-        """Take rows of buckets, by the number of each, here and in the patches that it is over."""
+        """Select rows of buckets, by bucket index, also in the patches that this record is over."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         changes = {
             name: value._part(rows)
@@ -150,18 +146,18 @@ class OverPatches(Record):
         return self.replace(**changes, buckets=kept)
 
     def faults(self) -> Faults:
-        """List buckets that are not those of the templates, and what is wrong in one."""
+        """List buckets that differ from the templates', and faults of their values."""
         yield from super(OverPatches, self).faults()
         buckets: tuple[Any, ...] = self.buckets  # type: ignore[attr-defined]
         templates = self._templates.buckets
         if len(buckets) != len(templates):
-            needed = f"one for each of {len(templates)} buckets of templates, in their order"
-            yield "buckets", f"are {len(buckets)}", needed
-        for index, (bucket, own) in enumerate(zip(buckets, templates, strict=False)):
+            needed = f"one for each of {len(templates)} buckets of templates, in the same order"
+            yield "buckets", f"has {len(buckets)} entries", needed
+        for index, (bucket, template) in enumerate(zip(buckets, templates, strict=False)):
             lengths = bucket.lengths()
             shape = tuple(lengths.get(axis, 0) for axis in ("patch", "height", "width"))
-            if shape != tuple(own.inside.shape):
-                needed = f"{tuple(own.inside.shape)}, as its templates"
+            if shape != tuple(template.inside.shape):
+                needed = f"{tuple(template.inside.shape)}, like its templates"
                 yield f"buckets[{index}]", f"has patches, height, width {shape}", needed
             for name, found, needed in bucket.faults():
                 yield f"buckets[{index}].{name}", found, needed
@@ -169,10 +165,10 @@ class OverPatches(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PatchSet(OverPatches):
-    """The decomposition: every facet of the coarse mesh has one template.
+    """Templates of all facets of the coarse mesh, one each.
 
     Attributes:
-        surface: Surface that the templates carry and that occludes; ``None`` for the facets.
+        surface: Surface that the templates follow and that occludes; ``None`` for the facets.
     """
 
     coarse: CoarseMesh
@@ -181,7 +177,7 @@ class PatchSet(OverPatches):
 
     @property
     def num_patches(self) -> int:
-        """Number of facets."""
+        """Number of patches."""
         return sum(len(bucket.facet) for bucket in self.buckets)
 
     @property
@@ -189,34 +185,34 @@ class PatchSet(OverPatches):
         return self
 
     def faults(self) -> Faults:
-        """List templates of facets that are none, and of no size."""
+        """List invalid facet indices and spacings."""
         yield from Record.faults(self)
         if not self.buckets:
-            yield "buckets", "are none", "a bucket of templates at least"
+            yield "buckets", "is empty", "at least one bucket of templates"
         count = len(self.coarse.mesh.faces)
         for index, bucket in enumerate(self.buckets):
             name, needed = f"buckets[{index}]", f"indices of {count} facets"
-            yield from faults_in(f"{name}.facet", needed, beyond, bucket.facet, count)
+            yield from faults_in(f"{name}.facet", needed, out_of_range, bucket.facet, count)
             if not bool((bucket.spacing > 0).all()):
                 yield f"{name}.spacing", "is not above 0 everywhere", "scene units"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PatchPriors(Record):
-    """A bucket of priors on its templates, those of all views that see a sample merged.
+    """A bucket of priors on its templates, merged from all views of a sample.
 
     Attributes:
-        normals_patch: Unit, in the patch frame; anything where the information is 0.
+        normals_patch: Unit, in the patch frame; arbitrary where the information is 0.
         normal_information: Inverse variance of the normals, one over squared radians.
-        offset: How far outside the template the surface is, along the outward normal of what the
-            template carries; scene units.
+        offset: Distance of the surface outside the template, along the template's outward normal;
+            scene units.
         offset_information: Inverse variance of the offset, one over scene units squared.
-        albedo: Gray, up to a factor; 0 where nothing is guessed.
-        albedo_variance: Relative; infinite where nothing is guessed.
+        albedo: Gray, up to a factor; 0 without a prior.
+        albedo_variance: Relative; infinite without a prior.
         inlier: Probability that a view shows diffuse reflection of its light; 1 where unknown.
             ``None`` without such a prior.
-        lights_patch: First-order harmonics in the patch frame, up to a factor. ``None`` without.
-        light_variance: Relative; infinite where nothing is guessed.
+        lights_patch: First-order harmonics in the patch frame, up to a factor; ``None`` without.
+        light_variance: Relative; infinite without a prior.
     """
 
     normals_patch: Float[Tensor, "patch height width 3"]
@@ -235,10 +231,10 @@ class Observations(Record):
     """A bucket of views resampled on templates: the matrices J and D of its patches.
 
     Attributes:
-        radiance: ``J`` before its samples are put in a row; zero where missing.
-        valid: ``D``: true where a view has the sample.
-        priors: What was guessed of the photographs, if anything.
-        viewers: Direction to each camera, unit, patch frame; ``None`` where unknown.
+        radiance: ``J`` as rasters; zero where missing.
+        valid: ``D``: true where the sample is valid in the view.
+        priors: Priors of the photographs, if any.
+        viewers: Direction to each camera, unit, patch frame; ``None`` if unknown.
     """
 
     radiance: Float[Tensor, "patch view channel height width"]
@@ -254,7 +250,7 @@ class Observations(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PatchViews(OverPatches):
-    """Views, registered on all templates: all of them, or those of a template's bucket."""
+    """Views resampled on all templates: all views, or those selected for a template's bucket."""
 
     patches: PatchSet
     buckets: tuple[Observations, ...]
@@ -264,22 +260,22 @@ class StopCause(IntEnum):
     """Why an iteration ended."""
 
     CONVERGED = 0
-    """Its steps became smaller than the tolerance."""
+    """The steps became smaller than the tolerance."""
     STALLED = 1
-    """No step descends any more, as rounding is reached."""
+    """No step decreases the cost any more, at the limit of rounding."""
     LIMIT = 2
-    """The limit of iterations stopped it."""
+    """The maximum number of iterations was reached."""
     EMPTY = 3
     """There was nothing to fit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Convergence(Record):
-    """End of an iteration, one entry a problem of the batch.
+    """End of an iteration, one entry per problem of the batch.
 
     Attributes:
-        iterations: Taken until it stopped.
-        residual: Root mean square over what was observed, in the units of the data.
+        iterations: Number of iterations.
+        residual: Root mean square over the observed samples, in the units of the data.
     """
 
     iterations: Int[Tensor, " patch"]
@@ -288,7 +284,7 @@ class Convergence(Record):
 
     @property
     def converged(self) -> Bool[Tensor, " patch"]:
-        """Whether a minimum was reached: neither the limit nor lack of data stopped it."""
+        """True if a minimum was reached: neither the limit nor a lack of data ended it."""
         return self.cause <= int(StopCause.STALLED)
 
 
@@ -298,19 +294,19 @@ class PatchStatus(IntEnum):
     DETERMINED = 0
     """Normals and albedo come from the photographs."""
     UNSEEN = 1
-    """No view has a valid sample: all are masked, hidden, too dark or saturated."""
+    """No view has a valid sample: all are masked, occluded, too dark or saturated."""
     NOT_FINITE = 2
-    """Every radiance that views have there is NaN or infinite."""
+    """All its radiance is NaN or infinite."""
     FEW_VIEWS = 3
     """No sample is lit in as many views as it has unknowns."""
     CONSTANT_LIGHT = 4
     """The light varied too little between the views, such as under one point light."""
     FAILED = 5
-    """The solver's answer is not finite or has no albedo anywhere."""
+    """The solution is not finite, or its albedo is zero everywhere."""
 
 
 def confidence_of(information: Scalars) -> Scalars:
-    r"""Return a score in [0, 1] for people: :math:`1 / (1 + (\sigma / 8°)^2)`.
+    r"""Return a score in [0, 1] for display: :math:`1 / (1 + (\sigma / 8°)^2)`.
 
     >>> confidence_of(1 / torch.tensor([8.0, 24.0]).deg2rad().square())
     tensor([0.5000, 0.1000])
@@ -325,16 +321,16 @@ class Photometry(Record):
 
     Attributes:
         normals_patch: Unit, facing the viewer (``n_z < 0``).
-        albedo: Linear, up to one scale shared by all patches; 0 where no view shows it lit.
+        albedo: Linear, up to one scale shared by all patches; 0 where it is lit in no view.
         lights_patch: First-order harmonics ``l`` with radiance = albedo * l . (1, n), n in the
-            patch frame, constants folded in. A view without samples has zeros.
-        valid: True where the sample was determined by the photographs.
-        information: Inverse variance of the normals, the mean square of their angular error;
-            one over squared radians, 0 where not valid.
-        status: A :class:`PatchStatus` each. The normals of a patch that is not determined
-            are those of the coarse mesh, and none of its samples is valid.
-        convergence: Of the factorization; the residual is one of radiance over exposure.
-        exposure: Of each view, relative to the median; ``None`` where all are 1.
+            patch frame, constants included. A view without samples has zeros.
+        valid: True where photographs determine the sample.
+        information: Inverse variance of the normals (mean square angular error), one over squared
+            radians; 0 where not valid.
+        status: A :class:`PatchStatus` each. A patch that is not determined has the normals of the
+            coarse mesh and no valid sample.
+        convergence: Of the factorization; the residual is in units of radiance over exposure.
+        exposure: Of each view, relative to the median; ``None`` if all are 1.
     """
 
     normals_patch: Float[Tensor, "patch height width 3"]
@@ -347,35 +343,35 @@ class Photometry(Record):
     exposure: Float[Tensor, "patch view"] | None = None
 
     def faults(self) -> Faults:
-        """List values that are no normals, albedo or information."""
+        """List invalid normals, albedo or information."""
         normals, valid = self.normals_patch, self.valid
         needed = "unit normals where valid"
         yield from faults_in("normals_patch", needed, not_unit, normals, valid)
         needed = "n_z < 0: x right, y down, z into the surface"
-        yield from faults_in("normals_patch", needed, turned_away, normals, valid)
+        yield from faults_in("normals_patch", needed, facing_away, normals, valid)
         yield from faults_in("albedo", "finite where valid", not_finite, self.albedo, valid)
         yield from faults_in("information", _INFORMATION, outside, self.information, torch.inf)
 
     @property
     def predicted(self) -> Float[Tensor, "patch view channel height width"]:
-        """Radiance of every sample in every view, as albedo, normal and light say."""
+        """Radiance of every sample in every view, predicted from albedo, normal and light."""
         basis = torch.cat([torch.ones_like(self.normals_patch[..., :1]), self.normals_patch], -1)
         shading = torch.einsum("pvi,phwi->pvhw", self.lights_patch, basis)
         return shading[:, :, None] * self.albedo.movedim(-1, 1)[:, None]
 
     @property
     def observed(self) -> Bool[Tensor, "patch height width"]:
-        """Where views show the sample lit, so that it has albedo, with or without a normal."""
+        """True for samples with albedo: lit in some view, with or without a photometric normal."""
         return (self.albedo > 0).any(dim=-1)
 
     @property
     def confidence(self) -> Float[Tensor, "patch height width"]:
-        """For people: in [0, 1], a half for a standard error of 8 degrees."""
+        """For display: in [0, 1], 0.5 for a standard error of 8 degrees."""
         return confidence_of(self.information)
 
     @property
     def determined(self) -> Bool[Tensor, " patch"]:
-        """Whether light determines the patch's shape."""
+        """True if light determines the patch's shape."""
         return self.status == int(PatchStatus.DETERMINED)
 
 
@@ -396,55 +392,55 @@ class PhotometricPatches(OverPatches):
         albedo: Sequence[Float[Tensor, "_ _ _ _"]] | None = None,
         information: Sequence[Float[Tensor, "_ _ _"]] | float = 1 / math.radians(8) ** 2,
     ) -> "PhotometricPatches":
-        """Put normals, albedo and lights of one's own on patches.
+        """Build a record from custom normals, albedo and lights.
 
         Samples inside their templates whose normal is finite, not zero, and faces the viewer are
-        valid. A patch without any is ``UNSEEN``.
+        valid. A patch without valid samples is ``UNSEEN``.
 
         Args:
-            patches: Templates, or views on them: then a sample has to be seen, too, and residuals
-                are those of the views. Of templates alone they are 0.
-            normals: Patch frame (x right, y down, z into the surface), of any length; one tensor a
-                bucket.
+            patches: Templates, or views on them. With views, a valid sample must be valid in a
+                view, and residuals are computed; with templates, residuals are 0.
+            normals: Patch frame (x right, y down, z into the surface), of any length; one tensor
+                per bucket.
             lights: First-order harmonics, radiance = albedo * l . (1, n): of every view in the
-                world frame, or of every view on every patch in the patch frame, one tensor a
+                world frame, or of every view on every patch in the patch frame, one tensor per
                 bucket.
-            albedo: Linear; one tensor a bucket. 1 unless given.
-            information: Inverse variance of the normals, one over squared radians: one tensor a
-                bucket, or a number for all. A standard error of 8 degrees unless given.
+            albedo: Linear; one tensor per bucket. 1 by default.
+            information: Inverse variance of the normals, one over squared radians: one tensor per
+                bucket, or a number for all. By default, that of a standard error of 8 degrees.
 
         Raises:
-            InputError: A number of buckets, a shape or a value that does not belong to the patches.
+            InputError: A number of buckets, a shape or a value does not match the patches.
         """
         templates = patches._templates.buckets
 
-        def each(name: str, values: Any) -> Sequence[Any]:  # noqa: ANN401
-            """Return one value a bucket: those given, or the one for all."""
-            several = values if isinstance(values, Sequence) else [values] * len(templates)
-            if len(several) != len(templates):
+        def by_bucket(name: str, values: Any) -> Sequence[Any]:  # noqa: ANN401
+            """Return one value per bucket; repeat a single value."""
+            tensors = values if isinstance(values, Sequence) else [values] * len(templates)
+            if len(tensors) != len(templates):
                 raise InputError(
-                    f"PhotometricPatches.of: {name} are {len(several)}; needed: one tensor for "
-                    f"each of {len(templates)} buckets of patches, in their order."
+                    f"PhotometricPatches.of: {name} has {len(tensors)} entries; needed: one tensor "
+                    f"for each of {len(templates)} buckets of patches, in the same order."
                 )
-            return several
+            return tensors
 
         views = patches.buckets if isinstance(patches, PatchViews) else None
         columns: dict[str, Any] = {"normals": normals, "lights": lights, "albedo": albedo}
         columns |= {"information": information, "views": views}
-        rows = zip(templates, *(each(*column) for column in columns.items()), strict=True)
-        found = cls(patches=patches._templates, buckets=tuple(_given(*row) for row in rows))
-        found.check("PhotometricPatches.of")
-        return found
+        rows = zip(templates, *(by_bucket(*column) for column in columns.items()), strict=True)
+        record = cls(patches=patches._templates, buckets=tuple(_given(*row) for row in rows))
+        record.check("PhotometricPatches.of")
+        return record
 
     def faults(self) -> Faults:
-        """List normals of another floating-point type than the templates, too."""
+        """List faults, including normals whose floating-point type differs from the templates'."""
         yield from super(PhotometricPatches, self).faults()
         pairs = zip(self.buckets, self.patches.buckets, strict=False)
-        for index, (bucket, own) in enumerate(pairs):
-            found, needed = bucket.normals_patch.dtype, own.depth.dtype
+        for index, (bucket, template) in enumerate(pairs):
+            found, needed = bucket.normals_patch.dtype, template.depth.dtype
             if found != needed:
                 name = f"buckets[{index}].normals_patch"
-                yield name, f"is of {found}", f"{needed}, as its templates"
+                yield name, f"is of {found}", f"{needed}, like its templates"
 
 
 def _given(
@@ -455,7 +451,7 @@ def _given(
     information: Tensor | float,
     views: Observations | None,
 ) -> Photometry:
-    """Make the photometry of a bucket, see :meth:`PhotometricPatches.of`."""
+    """Build the photometry of a bucket for :meth:`PhotometricPatches.of`."""
     like = templates.depth
     normals = normals.to(like)
     if normals.shape != (*like.shape, 3):
@@ -475,7 +471,7 @@ def _given(
         rotated = torch.einsum("pij,vj->pvi", templates.patch_from_world[:, :3, :3], lights[:, 1:])
         lights = torch.cat([lights[:, :1].expand(len(like), -1, 1), rotated], dim=-1)
     determined = valid.flatten(1).any(dim=1)
-    found = Photometry(
+    photometry = Photometry(
         normals_patch=unit,
         albedo=torch.ones_like(like)[..., None] if albedo is None else albedo.to(like),
         lights_patch=lights,
@@ -489,22 +485,22 @@ def _given(
         ),
     )
     if views is None:
-        return found
+        return photometry
     counted = views.valid & valid[:, None]
-    off = torch.where(counted, views.gray - found.predicted.mean(dim=2), 0).flatten(1)
-    square = off.square().sum(dim=1) / counted.flatten(1).sum(dim=1).clamp_min(1)
-    return found.replace(convergence=found.convergence.replace(residual=square.sqrt()))
+    residual = torch.where(counted, views.gray - photometry.predicted.mean(dim=2), 0).flatten(1)
+    square = residual.square().sum(dim=1) / counted.flatten(1).sum(dim=1).clamp_min(1)
+    return photometry.replace(convergence=photometry.convergence.replace(residual=square.sqrt()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class OverPhotometry(OverPatches):
-    """Further results over the photometry of all patches."""
+    """Further values over the photometry of all patches."""
 
     photometric: PhotometricPatches
 
     @property
     def patches(self) -> PatchSet:
-        """The decomposition underneath."""
+        """The underlying templates."""
         return self.photometric.patches
 
 
@@ -513,12 +509,12 @@ class Heights(Record):
     """A bucket of patches swept for height under their light.
 
     Attributes:
-        offset: How far outside the template the surface is at every sample, along the outward
-            normal of what the template carries; scene units, 0 where unknown.
+        offset: Distance of the surface outside the template at every sample, along the template's
+            outward normal; scene units, 0 where unknown.
         information: Inverse variance of the offset, one over scene units squared; 0 where unknown.
-            A sample's own share: neighbours that were averaged with it have theirs.
-        num_views: In how many views a sample of the patch shows, lit or not.
-        priors: What was guessed of the photographs, if anything.
+            Only the sample's share: averaged neighbours have their own.
+        num_views: Number of views that contain a sample of the patch, lit or not.
+        priors: Priors of the photographs, if any.
     """
 
     offset: Float[Tensor, "patch height width"]
@@ -527,7 +523,7 @@ class Heights(Record):
     priors: PatchPriors | None = None
 
     def faults(self) -> Faults:
-        """List heights that are nowhere, and weights that are none."""
+        """List offsets that are not finite, and invalid information."""
         yield from faults_in("offset", "finite, 0 where unknown", not_finite, self.offset)
         yield from faults_in("information", _INFORMATION, outside, self.information, torch.inf)
 
@@ -537,7 +533,7 @@ class SweptPatches(OverPhotometry):
     """Heights of all patches, with the photometry they were swept under.
 
     Attributes:
-        averaged: Samples in the window that costs were averaged over.
+        averaged: Number of samples in the window over which costs were averaged.
     """
 
     buckets: tuple[Heights, ...]
@@ -545,24 +541,24 @@ class SweptPatches(OverPhotometry):
 
 
 class AlignStatus(IntEnum):
-    """Whether a patch's height field meets a neighbour's."""
+    """Whether a patch's height field overlaps a neighbour's."""
 
     ALIGNED = 0
-    """Moved to where it agrees best with its neighbours."""
+    """Moved to best agreement with its neighbours."""
     ALONE = 1
-    """No neighbour's height field overlaps its own: it stays on the mesh."""
+    """No neighbour's height field overlaps it: it stays on the mesh."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Depths(Record):
-    """A bucket of patches with height field.
+    """A bucket of patches with height fields.
 
     Attributes:
-        depth: z of every sample in the patch frame, replacing the template's own.
+        depth: z of every sample in the patch frame, replacing the template's.
         valid: True where the height field was integrated or filled from neighbours; false
             outside the enlarged triangle.
         transform: The alignment's ``(h_x, h_y, h_z, h_0)``: ``depth`` is
-            ``h . (x, y, z, 1)`` of what integration gave; identity (0, 0, 1, 0) before.
+            ``h . (x, y, z, 1)`` of the integrated depth; identity (0, 0, 1, 0) before.
         status: An :class:`AlignStatus` each; ``None`` before alignment.
     """
 
@@ -572,12 +568,12 @@ class Depths(Record):
     status: Int[Tensor, " patch"] | None = None
 
     def faults(self) -> Faults:
-        """List depths that are nowhere."""
+        """List depths that are not finite."""
         yield from faults_in("depth", "finite where valid", not_finite, self.depth, self.valid)
 
     @property
     def aligned(self) -> Bool[Tensor, " patch"]:
-        """Whether the height field meets a neighbour's; false before alignment."""
+        """True if the height field was aligned to a neighbour's; false before alignment."""
         if self.status is None:
             return torch.zeros_like(self.transform[:, 0], dtype=torch.bool)
         return self.status == int(AlignStatus.ALIGNED)
@@ -588,8 +584,8 @@ class DepthPatches(OverPhotometry):
     """Relief of all patches, with the photometry it was integrated from.
 
     Attributes:
-        mismatch: Root mean square distance of neighbouring height fields where they overlap, scene
-            units: before alignment, then after each of its rounds. ``None`` before it.
+        mismatch: Root mean square distance of overlapping neighbouring height fields, scene
+            units: before alignment, then after each of its rounds. ``None`` before alignment.
     """
 
     buckets: tuple[Depths, ...]
@@ -598,23 +594,23 @@ class DepthPatches(OverPhotometry):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Surface(Record):
-    """The joined surface: every facet subdivided, subdivided mesh points on shared edges shared.
+    """The joined surface: every facet subdivided, with vertices shared along common edges.
 
     Attributes:
-        vertices_world: Where the subdivided mesh points came to lie.
+        vertices_world: Positions of the subdivision's vertices.
         faces: Counter-clockwise from outside.
-        facet: A facet each vertex lies in; a shared vertex names one of its facets.
-        barycentric: Where in that facet.
-        normals_world: Unit, outward: vertex normals of this mesh, which the result keeps; those
-            of factorization only shaped it. ``paper`` keeps photometric normals where there are.
-        albedo: Linear, up to one scale; continued from round about where no light tells it.
+        facet: A facet that contains each vertex; for a shared vertex, one of its facets.
+        barycentric: Position in that facet.
+        normals_world: Unit, outward: vertex normals of this mesh, kept in the result;
+            photometric normals only shaped it. ``paper`` keeps the latter where they exist.
+        albedo: Linear, up to one scale; inpainted where no light determines it.
         information: Inverse variance of the photometric normals, one over squared radians; 0
             where light does not determine them.
         height_information: Inverse variance of the swept heights, one over squared scene units;
             0 where not swept.
         convergence: Of the refinement, one entry.
-        expected_error: Standard error of each vertex across the surface, scene units, given the
-            cameras; ``None`` where unknown.
+        expected_error: Standard error of each vertex along the surface normal, scene units, with
+            the cameras taken as exact; ``None`` if unknown.
     """
 
     vertices_world: Vertices
@@ -629,23 +625,23 @@ class Surface(Record):
     expected_error: PerVertex | None = None
 
     def faults(self) -> Faults:
-        """List faces that name no vertex, vertices that are nowhere, and what is no normal."""
+        """List invalid faces, vertices and normals."""
         yield from self.mesh.faults()
         yield from faults_in("normals_world", "unit, outward", not_unit, self.normals_world, None)
 
     @property
     def supported(self) -> VertexMask:
-        """Where photographs determine the normal or the height."""
+        """True where photographs determine the normal or the height."""
         return (self.information > 0) | (self.height_information > 0)
 
     @property
     def confidence(self) -> PerVertex:
-        """For people: in [0, 1], a half for a standard error of 8 degrees."""
+        """For display: in [0, 1], 0.5 for a standard error of 8 degrees."""
         return confidence_of(self.information)
 
     @property
     def mesh(self) -> Mesh:
-        """The whole of it, as triangles."""
+        """The complete surface as triangles."""
         return Mesh(
             vertices_world=self.vertices_world,
             faces=self.faces,

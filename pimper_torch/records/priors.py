@@ -1,8 +1,8 @@
-"""Guesses about photographs from elsewhere, such as learned ones, each with its variance.
+"""External estimates for photographs, such as a network's, each with its variance.
 
-Maps belong to photographs by name, cover the whole photograph at any resolution, and those of
-unlike sizes are padded on the right and at the bottom. Variance is infinite where nothing is
-guessed. Axes of a camera are x right, y down, z forward: what faces it has normal (0, 0, -1).
+Maps are matched to photographs by name and cover the complete photograph at any resolution. Maps of
+different sizes are padded on the right and at the bottom. Variance is infinite without an estimate.
+Camera axes are x right, y down, z forward: a surface facing the camera has normal (0, 0, -1).
 :func:`~pimper_torch.priors.conventions.resolve_prior_conventions` finds axes that are not given.
 """
 
@@ -29,19 +29,19 @@ AXES: dict[Axes, tuple[tuple[int, int, int], str]] = {
     "opengl": ((1, -1, -1), "x right, y up, z to the viewer"),
     "lub": ((-1, -1, -1), "x left, y up, z to the viewer"),
 }
-"""Signs that turn normals of a camera's axes to ours, and back; and where the axes point."""
+"""Signs that convert normals between a camera's axes and ours, and a description of the axes."""
 
-_VARIANCE = "above 0, infinite where nothing is guessed"
+_VARIANCE = "above 0, infinite without an estimate"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MapPrior(Record):
-    """Guessed maps of some photographs.
+    """Estimated maps of some photographs.
 
     Attributes:
         sizes_px: Width and height of each map inside the raster.
-        undistorted: Whether the maps are of the photographs that structure from motion has
-            undistorted, or of the original ones.
+        undistorted: True if the maps are of the photographs that structure from motion has
+            undistorted, false for the original photographs.
     """
 
     names: tuple[str, ...]
@@ -49,22 +49,22 @@ class MapPrior(Record):
     undistorted: bool = False
 
     def faults(self) -> Faults:
-        """List names that are not one a map, and what is no variance."""
+        """List invalid names and variances."""
         yield from faults_of_names(self.names, len(self.sizes_px), "maps")
         variance = getattr(self, "variance", None)
-        if variance is not None:  # of chances it follows
+        if variance is not None:  # that of probabilities follows from them
             yield from faults_in("variance", _VARIANCE, not_above_zero, variance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class NormalPrior(MapPrior):
-    """Guessed normals.
+    """Estimated normals.
 
     Attributes:
-        normals: Unit, outward; anything where the variance is infinite.
+        normals: Unit, outward; arbitrary where the variance is infinite.
         variance: Mean square of their angular error, squared radians.
         frame: Of the normals: each photograph's camera, or the scene's world.
-        axes: Of the cameras; ``None`` leaves these and the frame open.
+        axes: Of the cameras; ``None`` if unknown, as is then the frame.
     """
 
     normals: Float[Tensor, "map height width 3"]
@@ -73,7 +73,7 @@ class NormalPrior(MapPrior):
     axes: Axes | None = "opencv"
 
     def faults(self) -> Faults:
-        """List what is no normal, too."""
+        """List invalid names, variances and normals."""
         yield from super(NormalPrior, self).faults()
         needed = "unit normals where the variance is finite"
         yield from faults_in("normals", needed, _not_unit, self.normals, self.variance)
@@ -81,16 +81,16 @@ class NormalPrior(MapPrior):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DepthPrior(MapPrior):
-    """Guessed depth.
+    """Estimated depth.
 
     Attributes:
-        depth: Of what each pixel shows, or one over it.
+        depth: Depth of every pixel, or its inverse.
         variance: Squared units of ``depth``.
-        along: Whether depth counts along the camera's axis, or along the pixel's ray.
-        inverse: Whether ``depth`` is one over depth; ``None`` leaves this, ``along`` and ``gauge``
-            open.
-        gauge: Whether ``depth`` is in scene units, up to a factor each map, or up to a factor and
-            an offset each map; both are fitted.
+        along: Whether depth is measured along the camera's axis or along the pixel's ray.
+        inverse: Whether ``depth`` is inverse depth; ``None`` if unknown, as are then ``along`` and
+            ``gauge``.
+        gauge: Whether ``depth`` is in scene units, up to a factor per map, or up to a factor and
+            an offset per map; both are fitted.
     """
 
     depth: Float[Tensor, "map height width"]
@@ -100,7 +100,7 @@ class DepthPrior(MapPrior):
     gauge: Literal["scene", "scale", "affine"] = "affine"
 
     def faults(self) -> Faults:
-        """List depth that is nowhere, too."""
+        """List invalid names, variances and depths."""
         yield from super(DepthPrior, self).faults()
         needed = "finite where the variance is"
         yield from faults_in("depth", needed, _not_finite, self.depth, self.variance)
@@ -108,10 +108,10 @@ class DepthPrior(MapPrior):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class AlbedoPrior(MapPrior):
-    """Guessed albedo.
+    """Estimated albedo.
 
     Attributes:
-        albedo: Linear, up to one factor a map, which is fitted.
+        albedo: Linear, up to one factor per map, which is fitted.
         variance: Squared units of ``albedo``.
     """
 
@@ -121,9 +121,9 @@ class AlbedoPrior(MapPrior):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class InlierPrior(MapPrior):
-    """Guessed probability that a pixel shows diffuse reflection of the light of its photograph.
+    """Estimated probability that a pixel shows diffuse reflection of its photograph's light.
 
-    Shadow, highlight and interreflection do not. Its variance is that of a coin: p (1 - p).
+    Shadow, highlight and interreflection do not. Its variance is Bernoulli's: p (1 - p).
 
     Attributes:
         probability: In [0, 1].
@@ -132,14 +132,14 @@ class InlierPrior(MapPrior):
     probability: Float[Tensor, "map height width"]
 
     def faults(self) -> Faults:
-        """List what is no probability, too."""
+        """List invalid names and probabilities."""
         yield from super(InlierPrior, self).faults()
         yield from faults_in("probability", "probabilities", outside, self.probability, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SilhouettePrior(MapPrior):
-    """Guessed silhouettes of the object. Its variance is that of a coin: p (1 - p).
+    """Estimated silhouettes of the object. The variance is Bernoulli's: p (1 - p).
 
     Attributes:
         inside: Probability that a pixel shows the object, in [0, 1].
@@ -148,14 +148,14 @@ class SilhouettePrior(MapPrior):
     inside: Float[Tensor, "map height width"]
 
     def faults(self) -> Faults:
-        """List what is no probability, too."""
+        """List invalid names and probabilities."""
         yield from super(SilhouettePrior, self).faults()
         yield from faults_in("inside", "probabilities", outside, self.inside, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class LightPrior(Record):
-    """Guessed light of some photographs.
+    """Estimated light of some photographs.
 
     Attributes:
         lights: First-order harmonics ``l``, radiance = albedo * l . (1, n), up to one factor that
@@ -170,14 +170,14 @@ class LightPrior(Record):
     frame: Literal["camera", "world"] = "camera"
 
     def faults(self) -> Faults:
-        """List lights that are none, and what is no variance."""
+        """List invalid names, lights and variances."""
         yield from faults_of_names(self.names, len(self.lights), "lights")
         yield from faults_in("lights", "finite", not_finite, self.lights)
         yield from faults_in("variance", _VARIANCE, not_above_zero, self.variance)
 
 
 Prior = NormalPrior | DepthPrior | AlbedoPrior | InlierPrior | SilhouettePrior | LightPrior
-"""Kinds of guesses that views carry in ``priors``."""
+"""Kinds of estimates in ``Views.priors``."""
 
 
 def _not_unit(normals: Tensor, variance: Tensor) -> str:

@@ -1,4 +1,4 @@
-"""The whole result of a run, its failures, and estimates of any method to compare it with."""
+"""The complete result of a run, its failures, and estimates of other methods for comparison."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -20,12 +20,12 @@ What = Literal[
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure(Record):
-    """One patch, view, point or solver that failed, while the rest went on.
+    """One patch, view, point or solver that failed while the run continued.
 
     Attributes:
         what: ``view``, ``points``, ``patch`` or ``solver``.
-        name: Of the view, the system or the work; the facet's number for a patch.
-        done: What was done in its place.
+        name: Name of the view, system or task; the facet's number for a patch.
+        done: What was done instead.
     """
 
     stage: str
@@ -37,12 +37,12 @@ class Failure(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeftOut(Record):
-    """Items that a guard left out or doubted; see :mod:`pimper_torch.runtime.ledger`.
+    """Items that a guard removed or reported; see :mod:`pimper_torch.runtime.ledger`.
 
     Attributes:
-        guard: Room and name, such as ``extract.borders``.
-        what: Was left out; samples of photographs are pixels.
-        names: Of photographs, where they are known.
+        guard: Stage and name, such as ``extract.borders``.
+        what: Kind of the items; samples of photographs are pixels.
+        names: Names of the photographs, if known.
     """
 
     guard: str
@@ -59,8 +59,8 @@ class StageReport(Record):
 
     Attributes:
         peak_memory_mb: Highest resident memory of the process up to the stage's end.
-        figures: Counts and shares worth telling, such as ``samples`` or ``missing_samples``.
-        kept: Whether an earlier run found the record; time and memory are that run's.
+        figures: Counts and fractions, such as ``samples`` or ``missing_samples``.
+        kept: Whether the record is an earlier run's; time and memory are then that run's.
     """
 
     name: str
@@ -72,19 +72,18 @@ class StageReport(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Reconstruction(Record):
-    """The surface, and everything that was found on the way.
+    """The surface and all intermediate results.
 
     Attributes:
         mesh: One connected surface with vertex normals, albedo and confidence.
         scene: Cameras, undistorted photographs and the sparse cloud, in the mesh's frame.
         patches: Relief or swept heights, normals, albedo, confidence and lights of every patch.
-        report: One entry a stage, in the order they ran.
-        failures: What was left out, as it failed.
-        left_out: What guards left out or doubted, in order.
-        held_out: Photographs that took no part but in finding cameras, to judge the surface by;
-            None without any.
-        finished: The surface as it is written; it, lights and materials, and the textured surface
-            are there once :meth:`~pimper_torch.method.chains.chain.Chain.finish` made them.
+        report: One entry per stage, in the order they ran.
+        failures: Items that failed and were skipped.
+        left_out: Items that guards removed or reported, in order.
+        held_out: Photographs for evaluation, used only to estimate cameras; ``None`` without any.
+        finished: The surface as written. ``finished``, ``relighting`` and ``asset`` are ``None``
+            until :meth:`~pimper_torch.method.chains.chain.Chain.finish` has made them.
     """
 
     mesh: Mesh
@@ -102,20 +101,20 @@ class Reconstruction(Record):
 
     @property
     def cameras(self) -> Cameras:
-        """The registered views' pinholes."""
+        """Pinhole cameras of the registered views."""
         return self.scene.cameras
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Estimate(Record):
-    """A method's estimate of an object, in a frame of its own.
+    """A method's estimate of an object, in an arbitrary frame.
 
     Attributes:
-        mesh: The surface; may have no faces if the method gives points only.
-        names: Of the views it found cameras for, as the photographs are called.
-        cameras: One a name, in the same order; ``None`` if the method gives none.
+        mesh: The surface; may have no faces if the method gives only points.
+        names: Names of the photographs that have cameras.
+        cameras: One per name, in the same order; ``None`` if the method gives none.
         lights_world: First-order light of each view, up to one scale; ``None`` if unknown.
-        reference: Name of the view the surface was made in, if there is one.
+        reference: Name of the view in which the surface was estimated, if any.
     """
 
     mesh: Mesh

@@ -1,4 +1,4 @@
-"""The base of every record that travels between stages."""
+"""Base class of the records that stages exchange."""
 
 import dataclasses
 import types
@@ -24,18 +24,18 @@ Index = Sequence[int] | slice | Tensor
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Record:
-    """Frozen data with a few verbs: move it, take a part of it, change a field in a copy.
+    """Frozen dataclass of tensors that can be moved, indexed, concatenated and copied with changes.
 
-    Shapes and kinds of tensors are checked against the fields when a record is made; what
-    their values have to be, :meth:`check` asks where a record enters a stage. Frozen stops
-    rebinding, not writing into a tensor; stages never write into what they were handed.
+    Shapes and dtypes of tensors are checked against the annotations when a record is made;
+    :meth:`check` verifies the values where a record enters a stage. Fields cannot be rebound,
+    but tensors are not write-protected; stages never write into their inputs.
 
-    Every record is a pytree (``torch.utils._pytree``), whose leaves are its tensors.
+    Every record is a pytree (``torch.utils._pytree``) with its tensors as leaves.
     """
 
-    def __init_subclass__(cls, **settings: Any) -> None:  # noqa: ANN401 - whatever a base takes
+    def __init_subclass__(cls, **settings: Any) -> None:  # noqa: ANN401 - depends on the base
         super(Record, cls).__init_subclass__(**settings)
-        if "__slots__" in cls.__dict__:  # what `dataclass` makes of the class that was written
+        if "__slots__" in cls.__dict__:  # the class that `dataclass` creates, not the written one
             pytree.register_pytree_node(
                 cls,
                 _flatten,
@@ -50,21 +50,21 @@ class Record:
                 value = getattr(self, name)
                 if not isinstance(value, hint):
                     raise InputError(
-                        f"{type(self).__name__}.{name} is {_brief(value)}; needed: {_wanted(hint)}"
-                        f"{_others(self, name)}."
+                        f"{type(self).__name__}.{name} is {_brief(value)}; needed: "
+                        f"{_expected(hint)}{_preceding(self, name)}."
                     )
 
     def check(self, where: str) -> None:
-        """Refuse values that no stage can use, such as normals that are not unit.
+        """Raise if a value is invalid for every stage, such as a normal that is not unit.
 
         Raises:
-            InputError: Names the field, what was found and what was needed.
+            InputError: Names the field, the value found and the value needed.
         """
         for name, found, needed in self.faults():
             raise InputError(f"{where}: {type(self).__name__}.{name} {found}; needed: {needed}.")
 
     def faults(self) -> Faults:
-        """List what is wrong with the values: the field, what was found, what is needed."""
+        """List invalid values: field, value found, value needed."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Record):
@@ -74,10 +74,10 @@ class Record:
     def to(
         self: AnyRecord, target: torch.device | str | torch.dtype, dtype: torch.dtype | None = None
     ) -> AnyRecord:
-        """Copy every tensor, in nested records and tuples too, to a device, a dtype, or both.
+        """Copy every tensor, also in nested records and tuples, to a device, a dtype, or both.
 
         Args:
-            target: A device, or a dtype alone: ``to("cuda")``, ``to(torch.float64)``,
+            target: A device, or only a dtype: ``to("cuda")``, ``to(torch.float64)``,
                 ``to("cuda", torch.float64)``.
             dtype: Of floating-point tensors. Integers and masks keep theirs.
         """
@@ -90,7 +90,7 @@ class Record:
         return pytree.tree_map_only(Tensor, moved, self)
 
     def detach(self: AnyRecord) -> AnyRecord:
-        """Return the same values, cut off from what they were computed from."""
+        """Return a copy that is detached from the autograd graph."""
         return pytree.tree_map_only(Tensor, Tensor.detach, self)
 
     def replace(self: AnyRecord, **changes: object) -> AnyRecord:
@@ -98,10 +98,10 @@ class Record:
         return dataclasses.replace(self, **changes)
 
     def take(self: AnyRecord, index: Index) -> AnyRecord:
-        """Keep some entries of the first axis, in the order given, of every field that has it.
+        """Index the first axis, of every field that has it.
 
-        The first axis is that of the first tensor, such as ``view``; names go with it. All entries
-        in their order are not copied.
+        The first axis is that of the first tensor, such as ``view``; tuples of names with one entry
+        per index are indexed, too. Selecting all entries in order makes no copy.
         """
         fields, count = _along(self)
         if not isinstance(index, Tensor | slice):
@@ -117,21 +117,21 @@ class Record:
             elif isinstance(value, Record):
                 changes[name] = value.take(index)
             elif value is not None:
-                place = index.to(value.device) if isinstance(index, Tensor) else index
-                changes[name] = take_rows(value, place)
+                rows = index.to(value.device) if isinstance(index, Tensor) else index
+                changes[name] = take_rows(value, rows)
         return self.replace(**changes)
 
     @classmethod
     def cat(cls: type[AnyRecord], records: Sequence[AnyRecord]) -> AnyRecord:
-        """Put records one behind the other along their first axis; inverse of :meth:`take`.
+        """Concatenate records along their first axis; inverse of :meth:`take`.
 
-        Serves as ``collate_fn`` of a ``DataLoader``. Fields without that axis are the first's.
+        Usable as ``collate_fn`` of a ``DataLoader``. Fields without that axis are the first's.
 
         Raises:
-            InputError: There is no record, or some have a field that others lack.
+            InputError: ``records`` is empty, or only some of them have a field.
         """
         if not records:
-            raise InputError(f"{cls.__name__}.cat got no record; needed: one at least.")
+            raise InputError(f"{cls.__name__}.cat got no record; needed: at least one.")
         fields, _ = _along(records[0])
         changes: dict[str, object] = {}
         for name in fields:
@@ -140,8 +140,8 @@ class Record:
                 continue
             if any(value is None for value in values):
                 raise InputError(
-                    f"{cls.__name__}.cat: some records have {name}, others none; needed: it in all "
-                    "or in none."
+                    f"{cls.__name__}.cat: some records have {name} and others do not; needed: "
+                    "all or none."
                 )
             if isinstance(values[0], tuple):
                 changes[name] = tuple(item for value in values for item in value)
@@ -152,33 +152,33 @@ class Record:
         return records[0].replace(**changes)
 
     def __str__(self) -> str:
-        shown = [field for field in dataclasses.fields(self) if field.repr]
-        lines = [f"  {field.name}: {_told(getattr(self, field.name))}" for field in shown]
+        fields = [field for field in dataclasses.fields(self) if field.repr]
+        lines = [f"  {field.name}: {_summary(getattr(self, field.name))}" for field in fields]
         return "\n".join([type(self).__name__, *lines])
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:  # noqa: ANN401 - IPython's
         printer.text("..." if cycle else str(self))
 
     def lengths(self) -> dict[str, int]:
-        """Return the length of every named axis, of its own tensors before those of records inside.
+        """Return the length of every named axis; tensors of the record precede nested records.
 
         >>> from pimper_torch.records import Mesh
         >>> Mesh(vertices_world=torch.zeros(4, 3), faces=torch.zeros(2, 3).long()).lengths()
         {'vertex': 4, 'face': 2}
         """
-        found: dict[str, int] = {}
+        lengths: dict[str, int] = {}
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         for name, hint in _arrays(type(self)).items():
             if values[name] is not None:
                 words = _array_of(hint).dim_str.split()
-                found |= {
+                lengths |= {
                     word: size
                     for word, size in zip(words, values[name].shape, strict=False)
                     if word.isidentifier() and size
                 }
         for value in values.values():
-            found = found | value.lengths() | found if isinstance(value, Record) else found
-        return found
+            lengths = lengths | value.lengths() | lengths if isinstance(value, Record) else lengths
+        return lengths
 
     def __repr__(self) -> str:
         fields = ", ".join(
@@ -189,32 +189,32 @@ class Record:
         return f"{type(self).__name__}({fields})"
 
 
-def _remembered(function: Function) -> Function:
-    """Ask a function once for each class; mypy takes classes of dataclasses for unhashable."""
+def _cached(function: Function) -> Function:
+    """Cache a function of a class; mypy treats dataclass types as unhashable."""
     return cache(function)  # type: ignore[return-value]
 
 
-@_remembered
+@_cached
 def _hints(cls: type[Record]) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
-@_remembered
+@_cached
 def _arrays(cls: type[Record]) -> dict[str, Any]:
-    """Return the fields that are tensors of a stated shape, or may be."""
+    """Return the annotations of fields that are shaped tensors or optional ones."""
     return {name: hint for name, hint in _hints(cls).items() if _array_of(hint) is not None}
 
 
 def choices(hint: object) -> tuple[Any, ...]:
-    """List the annotations that a union is of; any other is the only one."""
+    """Return the members of a union; any other annotation is its only member."""
     blend = typing.get_origin(hint) in (typing.Union, types.UnionType)
     return typing.get_args(hint) if blend else (hint,)
 
 
-def _array_of(hint: Any) -> Any:  # noqa: ANN401 - jaxtyping's types have no name of their own
-    arrays = (one for one in choices(hint) if isinstance(one, type))
-    return next((one for one in arrays if issubclass(one, AbstractArray)), None)
+def _array_of(hint: Any) -> Any:  # noqa: ANN401 - jaxtyping's types have no common name
+    types_of = (choice for choice in choices(hint) if isinstance(choice, type))
+    return next((choice for choice in types_of if issubclass(choice, AbstractArray)), None)
 
 
 def _axis(hint: Any) -> str:  # noqa: ANN401
@@ -222,41 +222,41 @@ def _axis(hint: Any) -> str:  # noqa: ANN401
 
 
 def _along(record: Record) -> tuple[list[str], int]:
-    """Name the fields that have the first axis of the first tensor, and give its length."""
+    """Return the names of the fields along the first tensor's first axis, and its length."""
     cls = type(record)
     hints, arrays = _hints(cls), _arrays(cls)
     if not arrays:
-        raise InputError(f"{cls.__name__} has no tensors to take a part of.")
+        raise InputError(f"{cls.__name__} has no tensors to index.")
     first = next(iter(arrays))
     axis, count = _axis(arrays[first]), len(getattr(record, first))
-    found = []
+    names = []
     for field in dataclasses.fields(cls):
         value = getattr(record, field.name)
         along = field.name in arrays and _axis(arrays[field.name]) == axis
-        names = hints[field.name] == tuple[str, ...] and len(value) == count
+        labels = hints[field.name] == tuple[str, ...] and len(value) == count
         inner = isinstance(value, Record) and bool(_arrays(type(value)))
-        if along or names or (inner and _axis(next(iter(_arrays(type(value)).values()))) == axis):
-            found.append(field.name)
-    return found, count
+        if along or labels or (inner and _axis(next(iter(_arrays(type(value)).values()))) == axis):
+            names.append(field.name)
+    return names, count
 
 
 def _nodes(record: Record) -> tuple[list[tuple[str, Any]], tuple[object, ...]]:
-    """Separate the fields for tensors from the rest, whatever stands in them."""
+    """Separate the fields annotated as tensors from the rest."""
     cls = type(record)
     children: list[tuple[str, Any]] = []
     rest: list[tuple[str, Any]] = []
     for name, hint in _hints(cls).items():
         value = getattr(record, name)
-        place = children if _holds_tensors(hint) and value is not None else rest
-        place.append((name, value))
+        fields = children if _holds_tensors(hint) and value is not None else rest
+        fields.append((name, value))
     return children, (cls, tuple(name for name, _ in children), tuple(rest))
 
 
-@_remembered
+@_cached
 def _holds_tensors(hint: object) -> bool:
     if isinstance(hint, type) and issubclass(hint, AbstractArray | Tensor | Record):
         return True
-    return any(_holds_tensors(part) for part in typing.get_args(hint))
+    return any(_holds_tensors(argument) for argument in typing.get_args(hint))
 
 
 def _flatten(record: Record) -> tuple[list[Any], Any]:
@@ -270,12 +270,12 @@ def _flatten_with_keys(record: Record) -> tuple[list[tuple[Any, Any]], Any]:
 
 
 def _unflatten(values: Any, context: Any) -> Record:  # noqa: ANN401 - torch's signature
-    """Make a record of any leaves: what stands for tensors, such as axes, has no shape."""
+    """Make a record of any leaves, unchecked: pytree functions replace tensors by other objects."""
     cls, names, rest = context
-    made: Record = object.__new__(cls)
+    record: Record = object.__new__(cls)
     for name, value in (*zip(names, values, strict=True), *rest):
-        object.__setattr__(made, name, value)
-    return made
+        object.__setattr__(record, name, value)
+    return record
 
 
 def _brief(value: object) -> str:
@@ -287,7 +287,7 @@ def _brief(value: object) -> str:
     return repr(value)
 
 
-def _told(value: object) -> str:
+def _summary(value: object) -> str:
     if isinstance(value, Record):
         axes = ", ".join(f"{axis} {size:,}" for axis, size in value.lengths().items())
         return f"{type(value).__name__}({axes})"
@@ -296,15 +296,15 @@ def _told(value: object) -> str:
     return _brief(value)
 
 
-def _wanted(hint: Any) -> str:  # noqa: ANN401
+def _expected(hint: Any) -> str:  # noqa: ANN401
     array = _array_of(hint)
     optional = " or None" if type(None) in choices(hint) else ""
     return f"{array.__name__.partition('[')[0]} of shape ({array.dim_str}){optional}"
 
 
-def _others(record: Record, name: str) -> str:
-    """Report the fields before, whose shapes bind the same names."""
+def _preceding(record: Record, name: str) -> str:
+    """Describe the preceding tensors, which bind the axes' names."""
     names = [*_arrays(type(record))]
     values = ((other, getattr(record, other)) for other in names[: names.index(name)])
     before = [f"{other} {_brief(value)}" for other, value in values if isinstance(value, Tensor)]
-    return f", beside {', '.join(before)}" if before else ""
+    return f", next to {', '.join(before)}" if before else ""

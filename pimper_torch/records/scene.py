@@ -10,20 +10,20 @@ from torch import Tensor
 
 from pimper_torch.ground.shapes import Faces, PerVertex, Points, VertexMask, Vertices
 from pimper_torch.records.record import Record
-from pimper_torch.records.value_checks import Faults, beyond, faults_in, not_finite
+from pimper_torch.records.value_checks import Faults, faults_in, not_finite, out_of_range
 from pimper_torch.records.views import Cameras, Views
 from pimper_torch.runtime.renamed import renamed_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CameraModel(Record):
-    """Intrinsics of one photograph before undistortion, in COLMAP's words.
+    """Intrinsics of one photograph before undistortion, in COLMAP's terms.
 
     Attributes:
         camera: Number of the camera; views taken by one camera share it.
         model: COLMAP's name of the camera model, such as ``SIMPLE_RADIAL``.
         params: The model's parameters in COLMAP's order.
-        width: Pixels, as is the height.
+        width: In pixels, like ``height``.
     """
 
     camera: int
@@ -34,12 +34,12 @@ class CameraModel(Record):
 
 
 def no_maps() -> Float[Tensor, "0 3 3"]:
-    """Return no maps."""
+    """Return an empty stack of maps."""
     return torch.zeros(0, 3, 3)
 
 
 def no_sessions() -> Int[Tensor, "0"]:
-    """Return no numbers of series."""
+    """Return an empty tensor of session numbers."""
     return torch.zeros(0, dtype=torch.long)
 
 
@@ -50,23 +50,22 @@ class SparseScene(Record):
 
     Attributes:
         views: The registered photographs, undistorted to the pinholes in ``cameras``.
-        cameras: Pinholes, one a registered view.
+        cameras: Pinholes, one per registered view.
         reprojection_errors_px: Mean over each point's track.
-        observation_point: Which point each observation sees.
-        observation_view: Which view it is made in.
-        observation_pixels: Where, in the photograph before undistortion.
-        lenses: The photographs' own intrinsics.
-        unregistered: Names of the photographs that found no place in the model.
-        doubt: Why the cameras may be wrong, and what to do; empty where nothing speaks against
-            them.
-        background_from_view: Maps from homogeneous pixels of each undistorted photograph to those
-            where the background is at rest before which the object turns; NaN where a view shows
-            too little of it. Empty without such a background.
-        offset_world: Added to this scene's coordinates, gives those of the model it was read from.
-            Scenes far from that model's origin have one of their own, see
+        observation_point: Index of the observed point.
+        observation_view: Index of the observing view.
+        observation_pixels: Position in the photograph before undistortion.
+        lenses: Intrinsics of the photographs before undistortion.
+        unregistered: Names of the photographs that were not registered.
+        diagnosis: Why the cameras may be wrong, and what to do; empty without such evidence.
+        background_from_view: Homographies from pixels of each undistorted photograph to pixels of
+            the static background of a turntable; NaN where a view contains too little of it. Empty
+            without such a background.
+        offset_world: Added to this scene's coordinates, it gives those of the model that was read.
+            Scenes far from that model's origin have a local one, see
             :func:`~pimper_torch.ground.geometry.local_frame.local_origin`.
-        series: Number of each view's series, where the object was moved on what it stands on
-            between several: in each its surroundings are elsewhere. Empty where it was not.
+        sessions: Number of each view's capture session if the object was moved relative to its
+            surroundings between sessions. Empty otherwise.
     """
 
     views: Views
@@ -84,18 +83,18 @@ class SparseScene(Record):
     sessions: Int[Tensor, " divided"] = field(default_factory=no_sessions)
 
     def faults(self) -> Faults:
-        """List what does not belong together."""
+        """List inconsistent numbers and indices, and cameras that look away from the cloud."""
         yield from super(SparseScene, self).faults()
         count, views = len(self.points_world), self.cameras.num_views
         if self.views.num_views != views:
-            yield "cameras", f"are {views}", f"one for each of {self.views.num_views} views"
+            yield "cameras", f"has {views} entries", f"one for each of {self.views.num_views} views"
         yield from faults_in("points_world", "finite points", not_finite, self.points_world)
         for what, of in (("point", count), ("view", views)):
             name, needed = f"observation_{what}", f"indices of {of} {what}s"
-            yield from faults_in(name, needed, beyond, getattr(self, name), of)
+            yield from faults_in(name, needed, out_of_range, getattr(self, name), of)
         for name in ("background_from_view", "sessions"):
-            if len(found := getattr(self, name)) not in (0, views):
-                yield name, f"are {len(found)}", f"none, or one for each of {views} views"
+            if (length := len(getattr(self, name))) not in (0, views):
+                yield name, f"has {length} entries", f"none, or one for each of {views} views"
         if count:
             pose, points = self.cameras.cam_from_world.detach(), self.points_world.detach()
             depth = pose[:, 2, :3] @ points.mT + pose[:, 2, 3:]
@@ -104,13 +103,13 @@ class SparseScene(Record):
                 yield (
                     "cameras.cam_from_world",
                     f"look away from the cloud: {behind:.0%} of its points are behind them",
-                    "axes x right, y down, z forward; those of OpenGL and Blender have y up and z "
-                    "back: negate the second and third row",
+                    "axes x right, y down, z forward; for the axes of OpenGL and Blender (y up, z "
+                    "back), negate the second and third row",
                 )
 
     @property
     def observed(self) -> Bool[Tensor, "point view"]:
-        """True where a view sees a point."""
+        """True where a view observes a point."""
         shape = len(self.points_world), self.cameras.num_views
         return pairs_table(self.observation_point, self.observation_view, shape)
 
@@ -118,14 +117,14 @@ class SparseScene(Record):
 def pairs_table(
     point: Int[Tensor, " observation"], view: Int[Tensor, " observation"], shape: tuple[int, int]
 ) -> Bool[Tensor, "point view"]:
-    """Find the pairs of point and view that are observations."""
+    """Return a table that is true for the observed pairs of point and view."""
     table = torch.zeros(shape, dtype=torch.bool, device=point.device)
     table[point, view] = True
     return table
 
 
 def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
-    """Keep some of the views, and what these observe; the others count as not registered."""
+    """Keep some views and their observations; the others count as unregistered."""
     index = kept.nonzero()[:, 0].tolist()
     observed = kept.to(scene.observation_view.device)[scene.observation_view]
     number = kept.long().cumsum(dim=0).to(scene.observation_view.device) - 1
@@ -145,7 +144,7 @@ def with_views(scene: SparseScene, kept: Bool[Tensor, " view"]) -> SparseScene:
 
 
 def with_points(scene: SparseScene, kept: Bool[Tensor, " point"]) -> SparseScene:
-    """Keep some of the points, and where they were observed."""
+    """Keep some points and their observations."""
     observed = kept[scene.observation_point]
     number = kept.long().cumsum(dim=0) - 1
     return scene.replace(
@@ -161,8 +160,9 @@ class ViewPerPose(NamedTuple):
     """A scene with one photograph of every pose.
 
     Attributes:
-        scene: Those photographs alone, with what all of their poses observe.
-        of: Which of them has the pose of each view of the whole scene.
+        scene: One photograph per pose, with the observations of all photographs of the pose.
+        chosen: Indices of these photographs in the complete scene.
+        of: For each view of the complete scene, the index in ``scene`` of the view with its pose.
     """
 
     scene: SparseScene
@@ -172,14 +172,14 @@ class ViewPerPose(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Mesh(Record):
-    """Triangles; counter-clockwise seen from outside.
+    """Triangle mesh; faces are counter-clockwise seen from outside.
 
     Attributes:
-        normals_world: Unit, outward, one a vertex.
-        albedo: Linear, one a vertex, up to one scale for the whole mesh.
-        confidence: In [0, 1], one a vertex: how well the photographs determine it.
-        expected_error: Scene units, one a vertex: its standard error across the surface, given
-            the cameras.
+        normals_world: Unit, outward, one per vertex.
+        albedo: Linear, one per vertex, up to one scale for the mesh.
+        confidence: In [0, 1], one per vertex: how well the photographs determine it.
+        expected_error: Standard error of each vertex along the normal, scene units, with the
+            cameras taken as exact.
     """
 
     vertices_world: Vertices
@@ -190,20 +190,22 @@ class Mesh(Record):
     expected_error: PerVertex | None = None
 
     def faults(self) -> Faults:
-        """List faces that name no vertex, and vertices that are nowhere."""
+        """List faces with invalid vertex indices, and vertices that are not finite."""
         count = len(self.vertices_world)
-        yield from faults_in("faces", f"indices of {count} vertices", beyond, self.faces, count)
+        yield from faults_in(
+            "faces", f"indices of {count} vertices", out_of_range, self.faces, count
+        )
         yield from faults_in("vertices_world", "finite vertices", not_finite, self.vertices_world)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class FacetPoints(Record):
-    """Points of the sparse cloud that lie on facets without being their vertices.
+    """Points of the sparse cloud on facets, other than their vertices.
 
     Attributes:
-        points_world: Where they were triangulated.
+        points_world: Triangulated positions.
         covariance_world: Of each position, scene units squared.
-        facet: The facet each point lies on, as the reference view sees it.
+        facet: The facet that each point is on, as seen from the reference view.
     """
 
     points_world: Points
@@ -212,30 +214,30 @@ class FacetPoints(Record):
 
 
 class Support(IntEnum):
-    """The best evidence of where a facet lies."""
+    """The best evidence of a facet's position."""
 
     NOTHING = 0
-    """It closes the surface."""
+    """None; it closes the surface."""
     LIGHT = 1
-    """Views show it lit, so that shading can tell its shape."""
+    """Views contain it lit, so shading determines its shape."""
     CONTOUR = 2
-    """Rays through the silhouettes touch it."""
+    """Rays through the outlines touch it."""
     POINTS = 3
-    """Points matched between views lie on it."""
+    """Points matched between views are on it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class CoarseMesh(Record):
-    """The coarse surface, up to a few thousand facets, that patches are laid on.
+    """The coarse surface, up to a few thousand facets, on which patches are defined.
 
     Attributes:
         mesh: The facets, with vertex normals smoothed over the mesh.
-        reference: The view that the facets were triangulated in; the frontal one.
+        reference: The frontal view, in which the facets were triangulated.
         is_point: True for vertices that are points of the sparse cloud.
-        covariance_world: Of each vertex that is a point, scene units squared; zero for the
-            others. ``None`` for a mesh that comes from elsewhere.
-        points: The cloud between the vertices; ``None`` for a mesh from elsewhere.
-        support: The best evidence of where each facet lies, a value of :class:`Support`; ``None``
+        covariance_world: Of each vertex that is a point, scene units squared; zero for other
+            vertices. ``None`` for a given mesh.
+        points: The cloud between the vertices; ``None`` for a given mesh.
+        support: The best evidence of each facet's position, a value of :class:`Support`; ``None``
             if unknown.
     """
 

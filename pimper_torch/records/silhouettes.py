@@ -1,4 +1,4 @@
-"""Where every view shows the object."""
+"""Silhouettes of the object in every view, and the contours they give."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -18,15 +18,15 @@ class Silhouettes(Record):
     """The object's silhouette in every view.
 
     Attributes:
-        inside: Probability that the pixel's ray meets the object; 0 in the padding. Below a half
-            it weighs the view's denial in the visual hull.
+        inside: Probability that the pixel's ray meets the object; 0 in the padding. Values below
+            0.5 weight the view's exclusion in the visual hull.
         reliable: True for views whose silhouette agrees with the hull of the others.
-        source: ``masks`` that a person gave, ``found`` in the photographs, or ``everything``: no
+        source: ``masks`` given by a person, ``found`` in the photographs, or ``everything``: no
             view constrains the object.
-        planes_world: The object is where each has a positive product with ``(x, y, z, 1)``: above
-            the plane that it stands on, one for each series between which it was moved. None
-            where silhouettes tell, or no plane is known.
-        hidden: Pixels inside that show something before the object; ``None`` where none do.
+        planes_world: The object is where every plane has a positive product with ``(x, y, z, 1)``:
+            above the supporting plane, one plane per capture session if the object was moved
+            between sessions. Empty if silhouettes suffice or no plane is known.
+        hidden: Pixels of the silhouette in which something occludes the object; ``None`` if none.
     """
 
     inside: Float[Tensor, "view height width"]
@@ -39,10 +39,10 @@ class Silhouettes(Record):
     def everything(
         cls, views: Views, planes_world: Float[Tensor, "plane 4"] | None = None
     ) -> "Silhouettes":
-        """Return silhouettes that leave nothing out.
+        """Return silhouettes that exclude nothing.
 
         Args:
-            planes_world: What lies below one of them is not the object.
+            planes_world: Anything below one of the planes is not the object.
         """
         planes = torch.zeros(0, 4) if planes_world is None else planes_world
         return cls(
@@ -54,27 +54,27 @@ class Silhouettes(Record):
 
     @property
     def shown(self) -> Masks:
-        """True where the pixel shows the object itself, not what hides it."""
+        """True where the object itself is visible, not an occluder."""
         if self.hidden is None:
             return self.masks
         return by_view(lambda mask, hidden: mask & ~hidden, self.masks, self.hidden)
 
     @property
     def masks(self) -> Masks:
-        """True where the pixel more likely shows the object than not."""
+        """True where the object is more likely than not."""
         return by_view(lambda inside: inside > 0.5, self.inside)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ContourRays(Record):
-    """Rays through the silhouettes of the object, to which its surface is tangent.
+    """Rays through the outlines of the object's silhouettes, to which its surface is tangent.
 
     Attributes:
-        pixels: Where the silhouette is, to a fraction of a pixel.
-        rays_world: Directions, as long as the ray goes while its depth grows by 1.
-        normals_world: Outward unit normal of the surface where it touches the ray: across the
-            ray and the silhouette's tangent.
-        sigma_px: Standard deviation of the silhouette's position, across it.
+        pixels: Subpixel positions on the outline.
+        rays_world: Directions, scaled to a depth of 1 in the camera.
+        normals_world: Outward unit normal of the surface at the tangent point: perpendicular to the
+            ray and to the outline's tangent.
+        sigma_px: Standard deviation of the outline's position, across it.
     """
 
     view: Int[Tensor, " ray"]
@@ -86,13 +86,13 @@ class ContourRays(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ContourPoints(Record):
-    """Points where the surface touches contour rays.
+    """Points where the surface is tangent to contour rays.
 
     Attributes:
-        normals_world: Of the surface there, unit, outward.
+        normals_world: Of the surface, unit, outward.
         variance: Along the normal, scene units squared.
-        view: Whose silhouette each belongs to.
-        ray: Index of its ray among the :class:`ContourRays`.
+        view: The view of each point's silhouette.
+        ray: Index of each point's ray in :class:`ContourRays`.
     """
 
     points_world: Points
@@ -118,11 +118,11 @@ class OrientedPoints(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SilhouetteCoverage(Record):
-    """How a surface differs from silhouettes, in fractions of the area of each.
+    """Disagreement of a surface and silhouettes, as fractions of each silhouette's area.
 
     Attributes:
-        uncovered: Of the silhouette, where the view sees no surface, or its back.
-        outside: Of surface beside it, by how sure the silhouette is there.
+        uncovered: Part of the silhouette in which the view sees no surface, or its back.
+        outside: Area of the surface outside the silhouette, weighted by the silhouette's certainty.
     """
 
     uncovered: Float[Tensor, " view"]

@@ -1,9 +1,9 @@
 """Records as files: tensors as safetensors, everything else as JSON in the file's header.
 
-The JSON is an entry of the metadata in the header, whose name has the version of the format. There
-a record is ``{"record": class, "fields": {name: value}}``, a tensor ``{"tensor": name}``, and a
-tuple a list; the rest stands for itself. Classes are found by the annotations of the fields: a file
-can name no other, and holds no code.
+The JSON is an entry of the header's metadata, under a key that contains the format's version. A
+record is ``{"record": class, "fields": {name: value}}``, a tensor ``{"tensor": name}``, and a tuple
+a list; other values are plain JSON. Classes are found by the annotations of the fields: a file can
+name no others, and contains no code.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from pimper_torch.records.record import AnyRecord, Record, choices
 from pimper_torch.runtime.errors import InputError, OutputError
 
 _KEY = "pimper_torch record 2"
-# A choice: the structure of a run's last step is below 1 MB, and a stranger's file can't make
+# A choice: a run's last record has less than 1 MB of structure, and a malicious file must not make
 # the parser fill the memory.
 _MAX_STRUCTURE = 2**25
 _AGAIN = "Save the record again with `save_record`."
@@ -36,19 +36,19 @@ _AGAIN = "Save the record again with `save_record`."
 def save_record(record: Record, path: str | Path, about: Mapping[str, str] | None = None) -> None:
     """Write a record, with all records inside it, to one file for :func:`load_record`.
 
-    The file is safetensors, which other programs read too; a tensor is called by the fields that
-    lead to it, such as ``cameras.intrinsics``. Tensors are written from their own memory, those of
-    a GPU by way of the CPU. A tensor that several fields share is written once. What tensors were
-    computed from is not kept.
+    The file is safetensors, readable by other programs; a tensor is named by the path of its
+    fields, such as ``cameras.intrinsics``. Tensors are written from their own memory, those of
+    a GPU via the CPU. A tensor that several fields share is written once. The autograd graph is
+    not kept.
 
     Args:
-        path: A former file is replaced when the new one is complete. Folders are made.
+        path: An existing file is replaced when the new one is complete. Folders are created.
         about: More entries of the header's metadata.
 
     Raises:
-        InputError: A field holds something else than records, dense tensors, tuples, mappings by
-            texts, numbers, texts and ``None``.
-        OutputError: The disk refuses; then a former file is as it was.
+        InputError: A field contains a type other than records, dense tensors, tuples, mappings with
+            string keys, numbers, strings and ``None``.
+        OutputError: Writing failed; an existing file is unchanged.
     """
     path = Path(path)
     tensors: dict[int, tuple[str, Tensor]] = {}
@@ -56,7 +56,7 @@ def save_record(record: Record, path: str | Path, about: Mapping[str, str] | Non
         if isinstance(leaf, Tensor):
             tensors.setdefault(id(leaf), (pytree.keystr(keys).removeprefix("."), leaf))
     text = as_json(record, {key: name for key, (name, _) in tensors.items()})
-    # What could not be read again is refused here.
+    # Refuses values that could not be read back.
     of_json(json.loads(text), type(record), type(record).__name__, dict(tensors.values()))
     trial = path.with_name(f".{path.name}.new-{secrets.token_hex(4)}")
     try:
@@ -65,28 +65,28 @@ def save_record(record: Record, path: str | Path, about: Mapping[str, str] | Non
         trial.replace(path)
     except (OSError, SafetensorError) as error:
         raise OutputError(
-            f"{path}: writing failed ({error}); nothing was left there. Free space or write "
+            f"{path}: writing failed ({error}); no file was left behind. Free space or write "
             "elsewhere."
         ) from error
     finally:
-        with suppress(OSError):  # it is gone where all went well
+        with suppress(OSError):  # already renamed if all went well
             trial.unlink()
 
 
 def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
     """Read a record that :func:`save_record` wrote, bit for bit.
 
-    The file is mapped into memory: pages are read when they are used, and writing into a tensor
-    does not change the file. Fields that shared a tensor share one again. All structure, names and
-    shapes are checked before a tensor's memory is touched; values are checked by the stages that
-    take the record (:meth:`~pimper_torch.records.record.Record.check`).
+    The file is memory-mapped: pages are read on first use, and writing into a tensor does not
+    change the file. Fields that shared a tensor share it again. Structure, names and shapes are
+    checked before a tensor's memory is read; values are checked by the stages that
+    use the record (:meth:`~pimper_torch.records.record.Record.check`).
 
     Returns:
         The record, on the CPU.
 
     Raises:
-        InputError: There is no such file, it is damaged, of another format, or holds another record
-            than ``cls``, as its fields are annotated.
+        InputError: The file does not exist, is damaged, has another format, or contains a record
+            other than ``cls`` as its fields are annotated.
     """
     return load_with_metadata(cls, path)[0]
 
@@ -94,26 +94,26 @@ def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
 def load_with_metadata(
     cls: type[AnyRecord], path: str | Path
 ) -> tuple[AnyRecord, Mapping[str, str]]:
-    """Read a record as :func:`load_record`, and the metadata in the file's header."""
+    """Read a record like :func:`load_record`, and the metadata in the file's header."""
     if not Path(path).is_file():
-        raise InputError(f"{path}: is no file; needed: a file that `save_record` wrote.")
+        raise InputError(f"{path}: is not a file; needed: a file that `save_record` wrote.")
     try:
         with safe_open(path, framework="pt") as file:
             metadata: dict[str, str] = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         text = metadata.get(_KEY, "")
         if not 0 < len(text) <= _MAX_STRUCTURE:
-            found = ", ".join(sorted(metadata))[:60] or "tensors alone"
+            keys = ", ".join(sorted(metadata))[:60] or "only tensors"
             raise InputError(
-                f"holds {found}; needed: {_KEY!r}, as this version of pimper_torch writes it, of "
-                f"{_MAX_STRUCTURE} bytes at most."
+                f"contains {keys}; needed: {_KEY!r}, as this version of pimper_torch writes it, of "
+                f"at most {_MAX_STRUCTURE} bytes."
             )
         record: AnyRecord = of_json(json.loads(text), cls, cls.__name__, tensors)
     except InputError as error:
         raise InputError(f"{path}: {error} {_AGAIN}") from error
     except (OSError, SafetensorError, ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: cannot be read ({error}), it seems cut short or damaged; needed: a whole "
+            f"{path}: cannot be read ({error}), it seems truncated or damaged; needed: a complete "
             f"file. {_AGAIN}"
         ) from error
     return record, metadata
@@ -123,62 +123,63 @@ def as_json(value: object, names: Mapping[int, str] | None = None) -> str:
     """Write a value as JSON for :func:`of_json`.
 
     Args:
-        names: Of tensors, by their identity.
+        names: Names of tensors, by their ``id``.
     """
 
     def plain(value: object) -> object:
         if isinstance(value, Record):
-            fields = {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
+            fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
             return {"record": type(value).__name__, "fields": fields}
         kind = ""
         if isinstance(value, Tensor):
-            # safetensors holds dense tensors of every type but complex128.
+            # safetensors supports dense tensors of every type but complex128.
             dense = value.layout == torch.strided and not value.is_meta
             if names and id(value) in names and dense and value.dtype != torch.complex128:
                 return {"tensor": names[id(value)]}
             kind = f"{value.dtype} {value.layout} "
         raise InputError(
-            f"A file cannot hold a {kind}{type(value).__name__}; needed: records, dense tensors "
-            "with values, tuples, mappings by texts, numbers, texts or None."
+            f"A file cannot contain a {kind}{type(value).__name__}; needed: records, dense tensors "
+            "with values, tuples, mappings with string keys, numbers, strings or None."
         )
 
     return json.dumps(value, default=plain)
 
 
-def of_json(found: Any, hint: Any, where: str, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - JSON
-    """Turn parsed JSON of :func:`as_json` into what an annotation asks for, or refuse it."""
-    kind = next((choice for choice in choices(hint) if _fits(found, choice, tensors)), None)
+def of_json(value: Any, hint: Any, where: str, tensors: Mapping[str, Tensor]) -> Any:  # noqa: ANN401 - JSON
+    """Convert parsed JSON of :func:`as_json` to the annotated type, or raise."""
+    kind = next((choice for choice in choices(hint) if _fits(value, choice, tensors)), None)
     if kind is None:
         needed = getattr(hint, "__name__", hint)
-        raise InputError(f"{where} is {json.dumps(found)[:60]}; needed: {needed}.")
+        raise InputError(f"{where} is {json.dumps(value)[:60]}; needed: {needed}.")
 
-    def inner(part: object, hint: object, name: object) -> Any:  # noqa: ANN401
-        return of_json(part, hint, f"{where}.{name}", tensors)
+    def inner(item: object, hint: object, name: object) -> Any:  # noqa: ANN401
+        return of_json(item, hint, f"{where}.{name}", tensors)
 
     hints = typing.get_args(kind)
     if _is_a(kind, Record):
-        own, of = [field.name for field in dataclasses.fields(kind)], typing.get_type_hints(kind)
-        fields = found["fields"]
-        if fields.keys() != set(own):
-            has = ", ".join(fields)[:200]
-            raise InputError(f"{where} has the fields {has}; needed: {', '.join(own)}.")
-        return kind(**{name: inner(fields[name], of[name], name) for name in own})
-    if isinstance(found, list):
-        each = hints[:1] * len(found) if hints[-1:] == (...,) else hints
-        return tuple(map(inner, found, each, range(len(found))))
+        names = [field.name for field in dataclasses.fields(kind)]
+        hint_of = typing.get_type_hints(kind)
+        fields = value["fields"]
+        if fields.keys() != set(names):
+            keys = ", ".join(fields)[:200]
+            raise InputError(f"{where} has the fields {keys}; needed: {', '.join(names)}.")
+        return kind(**{name: inner(fields[name], hint_of[name], name) for name in names})
+    if isinstance(value, list):
+        items = hints[:1] * len(value) if hints[-1:] == (...,) else hints
+        return tuple(map(inner, value, items, range(len(value))))
     if _is_a(kind, AbstractArray | Tensor):
-        return tensors[found["tensor"]]
-    if isinstance(found, dict):
-        return {key: inner(item, hints[1], key) for key, item in found.items()}
-    return found
+        return tensors[value["tensor"]]
+    if isinstance(value, dict):
+        return {key: inner(item, hints[1], key) for key, item in value.items()}
+    return value
 
 
-def _fits(found: Any, hint: Any, tensors: Mapping[str, Tensor]) -> bool:  # noqa: ANN401
-    """Return whether JSON is of the kind of an annotation, whatever is inside."""
+def _fits(value: Any, hint: Any, tensors: Mapping[str, Tensor]) -> bool:  # noqa: ANN401
+    """Return whether JSON has the annotated type, regardless of its items."""
     origin, hints = typing.get_origin(hint) or hint, typing.get_args(hint)
     if origin is typing.Literal:
-        return any(type(found) is type(one) and found == one for one in hints)
-    match found:
+        return any(type(value) is type(choice) and value == choice for choice in hints)
+    match value:
         case {"record": name, "fields": dict()} if _is_a(hint, Record):
             return bool(name == hint.__name__)
         case {"tensor": str(name)} if _is_a(hint, AbstractArray | Tensor):
@@ -186,8 +187,8 @@ def _fits(found: Any, hint: Any, tensors: Mapping[str, Tensor]) -> bool:  # noqa
         case dict():
             return _is_a(origin, Mapping) and hints[:1] == (str,)
         case list():
-            return origin is tuple and (hints[-1:] == (...,) or len(hints) == len(found))
-    return type(found) is origin or (type(found) is int and origin is float)
+            return origin is tuple and (hints[-1:] == (...,) or len(hints) == len(value))
+    return type(value) is origin or (type(value) is int and origin is float)
 
 
 def _is_a(hint: object, cls: type | types.UnionType) -> bool:
@@ -196,14 +197,14 @@ def _is_a(hint: object, cls: type | types.UnionType) -> bool:
 
 def _apart(tensors: Iterable[tuple[str, Tensor]]) -> dict[str, Tensor]:
     """Return contiguous tensors on the CPU that share no memory, as safetensors needs them."""
-    found = {
+    separate = {
         name: tensor.detach().cpu().resolve_conj().resolve_neg().contiguous()
         for name, tensor in tensors
     }
     end = 0
-    for name, tensor in sorted(found.items(), key=lambda item: item[1].data_ptr()):
+    for name, tensor in sorted(separate.items(), key=lambda item: item[1].data_ptr()):
         if tensor.data_ptr() < end:
-            found[name] = tensor.clone()
+            separate[name] = tensor.clone()
         else:
             end = tensor.data_ptr() + tensor.nbytes
-    return found
+    return separate

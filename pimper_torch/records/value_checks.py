@@ -1,4 +1,4 @@
-"""Checks of the values of a record; each tensor is read once."""
+"""Checks of the values of a record, once for each tensor."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -10,51 +10,51 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from pimper_torch.ground.shapes import Vectors
 
-_sound: Any = WeakIdKeyDictionary()  # torch does not type it
+_passed: Any = WeakIdKeyDictionary()  # by tensor: its passed checks; torch does not type it
 
 Faults = Iterator[tuple[str, str, str]]
-"""What is wrong with a record: the field, what was found, what is needed."""
+"""Invalid values of a record: the field, the value found, the value needed."""
 
 
 def faults_in(
     field: str, needed: str, test: Callable[..., str], tensor: Tensor, *context: object
 ) -> Faults:
-    """List what ``test(tensor, *context)`` finds wrong with the values of a field.
+    """List the fault that ``test(tensor, *context)`` finds in the values of a field.
 
     Args:
-        test: Returns what it found; nothing if all is well.
-        tensor: Looked through again only if it is another one, not if it was written into.
-        context: What else the answer depends on, such as a number of vertices or a mask.
+        test: Returns a description of the fault; empty if there is none.
+        tensor: Not checked again once it passed, even if it was written into since.
+        context: Further arguments of ``test``, such as a number of vertices or a mask.
     """
-    key = (test, *(id(one) if isinstance(one, Tensor) else one for one in context))
-    known = _sound.setdefault(tensor, set())
-    if key in known:
+    key = (test, *(id(item) if isinstance(item, Tensor) else item for item in context))
+    passed = _passed.setdefault(tensor, set())
+    if key in passed:
         return
     with torch.no_grad():
         found = test(tensor, *context)
     if found:
         yield field, found, needed
     else:
-        known.add(key)
+        passed.add(key)
 
 
 def faults_of_names(names: Sequence[str], count: int, what: str) -> Faults:
-    """List names that are not one of its own for each of so many."""
+    """List a fault unless ``names`` are ``count`` different names."""
     if len(names) != count or len(set(names)) < len(names):
-        found = f"are {len(names)}, {len(set(names))} of them different"
-        yield "names", found, f"a name of its own for each of {count} {what}"
+        found = f"has {len(names)} entries, {len(set(names))} of which are different"
+        yield "names", found, f"a unique name for each of {count} {what}"
 
 
-def beyond(index: Int[Tensor, "..."], count: int) -> str:
-    """State which indices name nothing among so many."""
+def out_of_range(index: Int[Tensor, "..."], count: int) -> str:
+    """Return the range of indices if it exceeds ``count`` entries."""
     if index.numel() == 0:
         return ""
     low, high = (int(value) for value in index.aminmax())
-    return f"reach from {low} to {high}" if low < 0 or high >= count else ""
+    return f"range from {low} to {high}" if low < 0 or high >= count else ""
 
 
 def not_finite(values: Float[Tensor, "..."], where: Bool[Tensor, "..."] | None = None) -> str:
-    """State how many values are NaN or infinite."""
+    """Return how many values are NaN or infinite."""
     if values.numel() == 0 or bool(torch.stack(values.aminmax()).isfinite().all()):
         return ""
     bad = ~values.isfinite()
@@ -65,7 +65,7 @@ def not_finite(values: Float[Tensor, "..."], where: Bool[Tensor, "..."] | None =
 
 
 def outside(values: Float[Tensor, "..."], high: float) -> str:
-    """State how many values are not finite, below 0 or above ``high``."""
+    """Return how many values are not finite, below 0 or above ``high``."""
     rounding = 1e-5
     bad = ~((values >= -rounding) & (values <= high + rounding) & values.isfinite())
     count = int(bad.sum())
@@ -76,19 +76,19 @@ def outside(values: Float[Tensor, "..."], high: float) -> str:
 
 
 def not_unit(normals: Vectors, where: Bool[Tensor, "*batch"] | None) -> str:
-    """State how many normals are not of unit length, and what they look like."""
+    """Return how many normals are not of unit length, and a likely cause."""
     length = normals.norm(dim=-1)
-    bad = ~((length - 1).abs() <= 0.02)  # NaN is bad; parts of 8 bits are 0.4 % off
+    bad = ~((length - 1).abs() <= 0.02)  # also true for NaN; components of 8 bits are 0.4 % off
     if where is not None:
         bad = bad & where
     count = int(bad.sum())
     if count == 0:
         return ""
-    some = normals[bad]
-    if not bool(some.isfinite().all()):
-        return f"has {count} of {bad.numel()} normals that are not unit, some of them NaN"
-    coded = bool((some >= 0).all() and (some <= 1).all()) and count > 1
-    hint = "; they look coded as colours, 0 to 1: decode them as 2 n - 1" if coded else ""
+    invalid = normals[bad]
+    if not bool(invalid.isfinite().all()):
+        return f"has {count} of {bad.numel()} normals that are not unit, some with NaN"
+    coded = bool((invalid >= 0).all() and (invalid <= 1).all()) and count > 1
+    hint = "; they look like colours from 0 to 1: decode them as 2 n - 1" if coded else ""
     return (
         f"has {count} of {bad.numel()} normals that are not unit, of length "
         f"{float(length[bad].min()):.3g} to {float(length[bad].max()):.3g}{hint}"
@@ -96,19 +96,19 @@ def not_unit(normals: Vectors, where: Bool[Tensor, "*batch"] | None) -> str:
 
 
 def not_above_zero(variance: Float[Tensor, "..."]) -> str:
-    """State how many variances are not above 0."""
+    """Return how many variances are not above 0."""
     count = int((~(variance > 0)).sum())
     return f"has {count} of {variance.numel()} values that are not above 0" if count else ""
 
 
-def turned_away(normals: Vectors, where: Bool[Tensor, "*batch"]) -> str:
-    """State how many normals of patches face away from the viewer."""
+def facing_away(normals: Vectors, where: Bool[Tensor, "*batch"]) -> str:
+    """Return how many normals of patches face away from the viewer."""
     away = where & (normals[..., 2] >= 0)
     count, among = int(away.sum()), int(where.sum())
     if count == 0:
         return ""
     opengl = (
-        "; nearly all do: they look like OpenGL's, with y up and z to the viewer: negate both"
+        "; they look like OpenGL's, with y up and z to the viewer: negate both"
         if count > 0.9 * among
         else ""
     )
@@ -116,7 +116,7 @@ def turned_away(normals: Vectors, where: Bool[Tensor, "*batch"]) -> str:
 
 
 def not_rigid(cam_from_world: Float[Tensor, "view 4 4"]) -> str:
-    """State which matrices are no rotation and shift."""
+    """Return how many matrices are not a rotation and a translation, and the first of them."""
     rotation = cam_from_world[:, :3, :3].double()
     eye = torch.eye(3, dtype=torch.float64, device=rotation.device)
     off = (rotation @ rotation.mT - eye).abs().amax(dim=(1, 2))
@@ -124,7 +124,7 @@ def not_rigid(cam_from_world: Float[Tensor, "view 4 4"]) -> str:
     bad = ~(off <= 1e-3) | (cam_from_world[:, 3] != last).any(dim=1)
     mirrored = torch.linalg.det(rotation) < 0
     if bool((mirrored & ~bad).any()):
-        return f"has {int(mirrored.sum())} matrices that mirror: their determinant is -1"
+        return f"has {int(mirrored.sum())} matrices that mirror (determinant -1)"
     if not bool(bad.any()):
         return ""
     view = int(bad.nonzero()[0, 0])
@@ -134,8 +134,8 @@ def not_rigid(cam_from_world: Float[Tensor, "view 4 4"]) -> str:
     )
 
 
-def no_pinhole(intrinsics: Float[Tensor, "view 3 3"]) -> str:
-    """State which matrices are no ``K``."""
+def not_pinhole(intrinsics: Float[Tensor, "view 3 3"]) -> str:
+    """Return how many matrices are not a pinhole's ``K``, and the first of them."""
     last = intrinsics.new_tensor([0.0, 0.0, 1.0])
     focal = intrinsics.diagonal(dim1=1, dim2=2)[:, :2]
     bad = ~(focal > 0).all(dim=1) | (intrinsics[:, 2] != last).any(dim=1)
@@ -143,4 +143,4 @@ def no_pinhole(intrinsics: Float[Tensor, "view 3 3"]) -> str:
     if not bool(bad.any()):
         return ""
     view = int(bad.nonzero()[0, 0])
-    return f"has {int(bad.sum())} matrices that are no K, the first {intrinsics[view].tolist()}"
+    return f"has {int(bad.sum())} matrices that are not K, the first {intrinsics[view].tolist()}"

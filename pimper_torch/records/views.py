@@ -13,7 +13,7 @@ from pimper_torch.records.value_checks import (
     Faults,
     faults_in,
     faults_of_names,
-    no_pinhole,
+    not_pinhole,
     not_rigid,
 )
 from pimper_torch.runtime.mapped import by_view
@@ -23,22 +23,22 @@ from pimper_torch.runtime.mapped import by_view
 class Views(Record):
     """Photographs of one object as linear radiance.
 
-    Photographs of unlike sizes share one raster: the smaller ones are padded with zeros on
-    the right and at the bottom, so that pixel coordinates stay what they were.
+    Photographs of different sizes share one raster: smaller ones are padded with zeros on
+    the right and at the bottom, so pixel coordinates do not change.
 
     Attributes:
-        images: Linear radiance; 1 is the level at which the sensor saturates.
+        images: Linear radiance; the sensor saturates at 1.
         sizes_px: Width and height of each photograph inside the raster.
         names: File names, unique, in the order of the views.
-        masks: True on the object; ``None`` where there are none.
-        focals_px: Focal length from EXIF in pixels; NaN where the file does not say.
+        masks: True on the object; ``None`` without masks.
+        focals_px: Focal length from EXIF in pixels; NaN if unknown.
         orientations: EXIF's number of the orientation that was applied to each file's pixels;
-            ``None`` where none was.
-        folder: Path that the files lie in, by which a model's images of one name are told apart.
-        poses: Number of the pose that each photograph was taken from, where several were, each
-            under another light; ``None`` where every photograph has a pose of its own.
-        priors: What is guessed of some photographs, such as normals by a network. Maps of
-            photographs that are left out are not looked at.
+            ``None`` if none was.
+        folder: Path of the files' folder; distinguishes images of the same name in a model.
+        poses: Number of the camera pose of each photograph, if several lights were photographed
+            from one pose; ``None`` if every photograph has a different pose.
+        priors: Estimates for some photographs, such as a network's normals. Maps of photographs
+            that are not in ``names`` are ignored.
     """
 
     images: Float[Tensor, "view channel height width"]
@@ -57,12 +57,12 @@ class Views(Record):
         return self.images.shape[0]
 
     def faults(self) -> Faults:
-        """List what is wrong with names and sizes; radiance may be anything, stages mask it."""
+        """List invalid names, sizes and priors; stages mask invalid radiance."""
         yield from faults_of_names(self.names, self.num_views, "views")
         raster = self.sizes_px.new_tensor([self.images.shape[3], self.images.shape[2]])
         if bool(((self.sizes_px < 1) | (self.sizes_px > raster)).any()):
             low, high = self.sizes_px.aminmax()
-            found = f"reach from {int(low)} to {int(high)}"
+            found = f"range from {int(low)} to {int(high)}"
             yield "sizes_px", found, f"width and height within the raster of {raster.tolist()}"
         for index, prior in enumerate(self.priors):
             for name, found, needed in prior.faults():
@@ -97,14 +97,14 @@ class Cameras(Record):
         return self.intrinsics.shape[0]
 
     def faults(self) -> Faults:
-        """List matrices that are no pinhole's."""
+        """List matrices that are not a pinhole's intrinsics or a rigid pose."""
         needed = "f_x, s, c_x; 0, f_y, c_y; 0, 0, 1 in pixels, f above 0"
-        yield from faults_in("intrinsics", needed, no_pinhole, self.intrinsics)
-        needed = "a rotation and a shift, camera axes x right, y down"
+        yield from faults_in("intrinsics", needed, not_pinhole, self.intrinsics)
+        needed = "a rotation and a translation, camera axes x right, y down"
         yield from faults_in("cam_from_world", needed, not_rigid, self.cam_from_world)
 
     @property
     def centers_world(self) -> Float[Tensor, "view 3"]:
-        """Where the cameras stand."""
+        """Camera centres."""
         rotation, translation = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
         return -(rotation.mT @ translation[..., None])[..., 0]

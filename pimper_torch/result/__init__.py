@@ -1,1 +1,1 @@
-"""What is made of a surface: lights and materials, textures, pictures and pages."""
+"""Products of a surface: lights and materials, textures, images and pages."""

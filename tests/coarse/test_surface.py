@@ -128,7 +128,7 @@ def test_a_small_given_mesh_stays_as_it_is(round_about):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v, f: (v, f + len(v)), "faces reach from 42 to 83"),
+        (lambda v, f: (v, f + len(v)), "faces range from 42 to 83"),
         (lambda v, f: (v / 0, f), "not finite"),
     ],
 )

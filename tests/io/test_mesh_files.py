@@ -113,5 +113,5 @@ def test_far_away_files_say_the_offset_and_the_asset_its_place(reconstruction, t
 
 
 def test_fewer_faces_than_a_tetrahedron_has_are_refused():
-    with pytest.raises(ConfigError, match="faces is 3; needed: all, or 4 at least"):
+    with pytest.raises(ConfigError, match="faces is 3; needed: all, or at least 4"):
         MeshFiles(faces=3)

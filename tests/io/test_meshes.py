@@ -195,7 +195,7 @@ def test_a_scene_that_places_a_mesh_many_times_is_refused(mesh, tmp_path, monkey
 def test_faces_of_vertices_that_are_not_there_are_refused(mesh, tmp_path):
     for corner in (5, -1):
         write_ply(mesh.replace(faces=torch.tensor([[0, 1, corner]])), tmp_path / "a.ply")
-        with pytest.raises(InputError, match=r"corners of its faces reach from .*its 5 vertices"):
+        with pytest.raises(InputError, match=r"corners of its faces range from .*its 5 vertices"):
             read_mesh(tmp_path / "a.ply")
 
 

@@ -78,7 +78,9 @@ def test_samples_without_a_normal_are_not_valid_and_a_patch_of_them_is_unseen(li
 def test_what_does_not_belong_to_the_patches_is_refused(lift):
     true = lift(0.0).photometric
     parts = taken_apart(true)
-    with pytest.raises(pt.InputError, match="normals are 0; needed: one tensor for each of"):
+    with pytest.raises(
+        pt.InputError, match="normals has 0 entries; needed: one tensor for each of"
+    ):
         pt.PhotometricPatches.of(true.patches, **{**parts, "normals": []})
     small = [values[:, :2] for values in parts["normals"]]
     with pytest.raises(pt.InputError, match="normals of a bucket have shape"):

@@ -81,7 +81,7 @@ def test_tensors_of_the_wrong_shape_or_kind_are_refused(cameras):
         cameras.replace(sizes_px=cameras.sizes_px.double())  # sizes are whole
     with pytest.raises(InputError, match=r"shape \(view channel height width\)"):
         views_of(2).replace(images=torch.zeros(3, 3))
-    with pytest.raises(InputError, match=r"masks is 3; needed: Bool .* or None, beside images"):
+    with pytest.raises(InputError, match=r"masks is 3; needed: Bool .* or None, next to images"):
         views_of(2).replace(masks=3)
 
 
@@ -99,7 +99,7 @@ def test_a_part_that_is_taken_and_put_together_again_is_the_whole(cameras):
     assert torch.equal(whole.take([1, 2, 0]).images, views.images)
     both = Cameras.cat([cameras, cameras])
     assert torch.equal(both.take([2, 3]).cam_from_world, cameras.cam_from_world)
-    with pytest.raises(InputError, match="some records have masks, others none"):
+    with pytest.raises(InputError, match="some records have masks and others do not"):
         Views.cat([views, views.replace(masks=torch.ones(3, 4, 6, dtype=torch.bool))])
 
 

@@ -172,13 +172,13 @@ def test_a_record_on_a_graph_is_saved_without_it(odds, path):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (lambda: 1, "A file cannot hold a function; needed: records, "),
-        (Path("a"), "cannot hold a PosixPath"),
+        (lambda: 1, "A file cannot contain a function; needed: records, "),
+        (Path("a"), "cannot contain a PosixPath"),
         ([1], "Odds.many.0 is .1.; needed"),
         ({1: 2}, "Odds.many.0 is .*; needed"),
         (records.PatchStatus.FAILED, "Odds.many.0 is 5; needed"),
-        (torch.zeros(2, dtype=torch.complex128), "cannot hold a torch.complex128"),
-        (torch.eye(2).to_sparse(), "cannot hold a torch.float32 torch.sparse_coo Tensor"),
+        (torch.zeros(2, dtype=torch.complex128), "cannot contain a torch.complex128"),
+        (torch.eye(2).to_sparse(), "cannot contain a torch.float32 torch.sparse_coo Tensor"),
         (torch.zeros(2, device="meta"), "needed: .* dense tensors with values"),
     ],
 )
@@ -211,7 +211,7 @@ def test_a_save_that_fails_leaves_the_former_file_and_nothing_else(odds, path, m
 
 
 def test_files_that_are_no_whole_record_are_refused(odds, path, tmp_path):
-    with pytest.raises(InputError, match="is no file; needed: a file that `save_record` wrote"):
+    with pytest.raises(InputError, match="is not a file; needed: a file that `save_record` wrote"):
         load_record(Odds, tmp_path)
     save_record(odds, path)
     whole = path.read_bytes()
@@ -220,13 +220,15 @@ def test_files_that_are_no_whole_record_are_refused(odds, path, tmp_path):
     for damaged in (b"", whole[:4], whole[:200], whole[:-1], whole + b"x", claimed, shape):
         assert damaged != whole
         path.write_bytes(damaged)
-        with pytest.raises(InputError, match="seems cut short or damaged"):
+        with pytest.raises(InputError, match="seems truncated or damaged"):
             load_record(Odds, path)
     save_file({"a": torch.zeros(2)}, path)
-    with pytest.raises(InputError, match=r"holds tensors alone; needed: 'pimper_torch record 2'"):
+    with pytest.raises(InputError, match=r"contains only tensors; needed: 'pimper_torch record 2'"):
         load_record(Odds, path)
     save_file({"a": torch.zeros(2)}, path, {"pimper_torch": '{"format": 1}'})  # as 0.10 wrote it
-    with pytest.raises(InputError, match=r"holds pimper_torch; needed: 'pimper_torch record 2', "):
+    with pytest.raises(
+        InputError, match=r"contains pimper_torch; needed: 'pimper_torch record 2', "
+    ):
         load_record(Odds, path)
 
 
@@ -248,10 +250,10 @@ def test_another_record_than_the_one_asked_for_is_refused(odds, path):
         ({"many": [{"record": "Mesh", "fields": {}}]}, "Odds.many.0 is .*Mesh.*; needed: .*Tensor"),
         ({"name": {"record": []}}, "Odds.name is .*; needed: str . None"),
         ({"figures": {"a": None}}, "Odds.figures.a is null; needed: int . float"),
-        ("{", "seems cut short or damaged"),
-        ("[" * 10**5 + "]" * 10**5, "seems cut short or damaged"),
-        ("9" * 5000, "seems cut short or damaged"),
-        ("1" + " " * 2**25, "33554432 bytes at most"),
+        ("{", "seems truncated or damaged"),
+        ("[" * 10**5 + "]" * 10**5, "seems truncated or damaged"),
+        ("9" * 5000, "seems truncated or damaged"),
+        ("1" + " " * 2**25, "at most 33554432 bytes"),
     ],
     ids=lambda one: str(one)[:40],
 )

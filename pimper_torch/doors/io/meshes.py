@@ -22,7 +22,7 @@ from pimper_torch.ground.geometry.topology import corners_of
 from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.ground.shapes import FaceMask, Vertices
 from pimper_torch.records import Mesh
-from pimper_torch.records.value_checks import beyond, not_finite
+from pimper_torch.records.value_checks import not_finite, out_of_range
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.viz.maps import base_color, carried_normals
 from pimper_torch.runtime.errors import InputError
@@ -158,7 +158,7 @@ def read_mesh(path: Path | str) -> Mesh:
     mesh = _joined(parts)
     if not bool(mesh.vertices_world.isfinite().all()):
         raise InputError(f"{path}: some vertices are not finite; needed: numbers throughout.")
-    if found := beyond(mesh.faces, len(mesh.vertices_world)):
+    if found := out_of_range(mesh.faces, len(mesh.vertices_world)):
         raise InputError(
             f"{path}: the corners of its faces {found}; needed: indices of its "
             f"{len(mesh.vertices_world)} vertices. Export it again."

@@ -1,1 +1,1 @@
-"""A surface of few faces with textures, for other programs to light."""
+"""Meshes of few faces with textures, for rendering in other programs."""

@@ -17,29 +17,29 @@ from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.failures import reason_of
 
-# A choice: what browsers on telephones take.
+# A choice: the limit of browsers on phones.
 MAX_SIDE = 4096
 
-# The same mesh takes it 1.5 s. A choice: long enough for a slow machine.
+# xatlas takes 1.5 s for a typical mesh. A choice: long enough for a slow machine.
 _LIMIT_S = 60.0
 
-# Of Python: nothing is imported from the script's folder, which has this room's modules.
+# Python's option: nothing is imported from the script's folder, which has the modules of `asset`.
 _CHILD = ("-P",)
 
 # Around a cell's triangles, and between them, along each side. With 1, colours of a sphere
-# are off by 2.8 levels in place of 0.5.
+# are off by 2.8 of 255 instead of 0.5.
 _GUTTER_TEXELS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Atlas(Record):
-    """A mesh cut along seams and laid out flat.
+    """A mesh cut along seams and flattened onto a texture.
 
     Attributes:
-        vertex: The mesh's vertex that every vertex of the atlas is a copy of.
-        faces: The mesh's faces, in its order, as vertices of the atlas.
+        vertex: Index of the mesh's vertex that each vertex of the atlas copies.
+        faces: The mesh's faces, in the same order, as vertices of the atlas.
         uv: Right and down over the texture, in [0, 1].
-        width: A power of two, as is the height: graphics cards store other textures badly.
+        width: A power of two, like ``height``: GPUs store other textures inefficiently.
     """
 
     vertex: Int[Tensor, " copy"]
@@ -51,29 +51,29 @@ class Atlas(Record):
 
 
 def unwrapped(mesh: Mesh, texel: float) -> Atlas:
-    """Lay a mesh out by xatlas; triangle by triangle where xatlas fails or takes too long.
+    """Unwrap a mesh by xatlas, or triangle by triangle if xatlas fails or takes too long.
 
     Args:
-        texel: Side wanted, scene units. The texture's sides are the nearest powers of two, 4096 at
-            most, so that texels are up to 1.42 times as long or as short.
+        texel: Requested side, scene units. The texture's sides are the nearest powers of two, at
+            most 4096, so texels are longer or shorter by a factor of up to 1.42.
     """
     return _by_xatlas(mesh, texel) or by_triangles(mesh, texel)
 
 
 def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
-    """Run xatlas on pieces of a mesh in a child process; ``None`` where that fails."""
-    # Its tolerances are absolute: lengths are in texels, from the mesh's centre.
-    places = mesh.vertices_world.detach().double()
-    places = ((places - places.median(dim=0).values) / texel).float()
-    pieces = _pieces(places, mesh.faces)
+    """Run xatlas on pieces of a mesh in a child process; ``None`` if that fails."""
+    # Its tolerances are absolute: lengths are in texels, relative to the mesh's centre.
+    vertices = mesh.vertices_world.detach().double()
+    vertices = ((vertices - vertices.median(dim=0).values) / texel).float()
+    pieces = _pieces(vertices, mesh.faces)
     order = torch.cat(pieces)
     with tempfile.TemporaryDirectory() as folder:
         before, after = Path(folder) / "pieces.npz", Path(folder) / "atlas.npz"
         np.savez(
             before,
-            vertices=places.numpy(),
+            vertices=vertices.numpy(),
             faces=mesh.faces[order].numpy(),
-            counts=[len(some) for some in pieces],
+            counts=[len(piece) for piece in pieces],
         )
         command = [sys.executable, *_CHILD, str(Path(__file__).with_name("charts.py"))]
         try:
@@ -85,15 +85,15 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
                 capture_output=True,
             )
         except (subprocess.SubprocessError, OSError) as error:
-            told = (getattr(error, "stderr", None) or b"").decode(errors="replace").split("\n")
-            reason = next((line for line in reversed(told) if line.strip()), reason_of(error))
+            output = (getattr(error, "stderr", None) or b"").decode(errors="replace").split("\n")
+            reason = next((line for line in reversed(output) if line.strip()), reason_of(error))
             caution(
-                f"asset: xatlas made no atlas ({reason}). Every face has a place of its own on the "
-                "textures, which makes `asset.glb` larger."
+                f"asset: xatlas failed to unwrap the surface ({reason}). Every face is stored "
+                "separately in the textures, which makes `asset.glb` larger."
             )
             return None
-        with np.load(after, allow_pickle=False) as found:
-            values = {name: torch.from_numpy(found[name]) for name in found}
+        with np.load(after, allow_pickle=False) as arrays:
+            values = {name: torch.from_numpy(arrays[name]) for name in arrays}
     width, height = (min(MAX_SIDE, 2 ** round(math.log2(side))) for side in values["size"])
     return Atlas(
         vertex=values["vertex"],
@@ -105,26 +105,26 @@ def _by_xatlas(mesh: Mesh, texel: float) -> Atlas | None:
     )
 
 
-def _pieces(places: Vertices, faces: Faces) -> list[Int[Tensor, " some"]]:
+def _pieces(vertices: Vertices, faces: Faces) -> list[Int[Tensor, " piece"]]:
     """Halve the faces across their longest side until pieces are small."""
-    centres = places[faces].mean(dim=1)
+    centres = vertices[faces].mean(dim=1)
     pieces = [torch.arange(len(faces))]
     # xatlas takes 7.9 s for 50,000 faces in one piece, 1.4 s in 128, with as many charts.
     while len(pieces[0]) > 512:
         halves = []
-        for some in pieces:
-            box = centres[some].amax(dim=0) - centres[some].amin(dim=0)
-            along = some[centres[some, box.argmax()].argsort(stable=True)]
-            halves += [along[: len(some) // 2], along[len(some) // 2 :]]
+        for piece in pieces:
+            box = centres[piece].amax(dim=0) - centres[piece].amin(dim=0)
+            along = piece[centres[piece, box.argmax()].argsort(stable=True)]
+            halves += [along[: len(piece) // 2], along[len(piece) // 2 :]]
         pieces = halves
     return pieces
 
 
 def by_triangles(mesh: Mesh, texel: float) -> Atlas:
-    """Lay every face out by itself, as half of a square cell of a grid.
+    """Place every face separately, as half of a square cell of a grid.
 
     Args:
-        texel: Side wanted, scene units: the mean face has as many texels as its area asks for.
+        texel: Requested side, scene units: the mean face has the texels of its area.
     """
     count = len(mesh.faces)
     a, b, c = mesh.vertices_world.detach().double()[mesh.faces].unbind(dim=1)

@@ -1,4 +1,4 @@
-"""Textures of a mesh of few faces, read off the surface that it approximates."""
+"""Textures of a simplified mesh, sampled from the surface that it approximates."""
 
 import torch
 from jaxtyping import Float, Int
@@ -24,13 +24,13 @@ _TEXELS_PER_SIDE = 1.5
 
 
 class Texture(Stage):
-    """Bake a surface and its materials onto few faces, see :func:`textured`."""
+    """Bake a surface and its materials onto a simplified mesh, see :func:`textured`."""
 
     def forward(self, full: Mesh, few: Mesh, relighting: Relighting) -> Textured:
-        """Bake it.
+        """Bake the textures.
 
         Args:
-            few: The mesh whose vertices have the materials.
+            few: The simplified mesh, whose vertices have the materials.
         """
         return textured(full, few, relighting.materials.at_vertices())
 
@@ -38,21 +38,21 @@ class Texture(Stage):
 def textured(
     full: Mesh, few: Mesh, reflectance: Vertices | None = None, atlas: Atlas | None = None
 ) -> Textured:
-    """Read albedo and normals of a surface off onto textures of a mesh that has fewer faces.
+    """Bake albedo and normals of a surface into textures of a simplified mesh.
 
-    Albedo that is implausibly bright is inpainted before.
+    Implausibly bright albedo is inpainted first.
 
-    From the centre of every texel, on a face of the mesh, a ray along the mesh's blended normals
-    meets the surface, outward or inward, where that is nearer. A texel far from all faces, or whose
-    ray meets no surface that faces the same way, has the values of the nearest one that does.
+    From the centre of every texel, a ray along the mesh's interpolated normals is cast outward and
+    inward, and the nearer intersection is used. A texel far from all faces, or without an
+    intersection with a surface of similar orientation, has the values of the nearest other texel.
 
     Args:
         full: The surface, on the CPU.
-        few: The same of fewer faces, its normals those that the normal map is relative to.
-        reflectance: Metallic, roughness and specular of its vertices; matte without.
-        atlas: Of ``few``; laid out by xatlas unless given.
+        few: The simplified mesh; the normal map is relative to its normals.
+        reflectance: Metallic, roughness and specular of its vertices; ``None`` for matte.
+        atlas: Of ``few``; made by xatlas by default.
     """
-    full, few = (one.detach().to(torch.float32) for one in (full, few))
+    full, few = (mesh.detach().to(torch.float32) for mesh in (full, few))
     if atlas is None:
         side = float(surfaces.side_lengths(full.vertices_world[full.faces]).median())
         atlas = unwrapped(few, side / _TEXELS_PER_SIDE)
@@ -63,39 +63,43 @@ def textured(
     tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
     values = torch.cat([carried_normals(full), colors, uncertainty[:, None]], dim=1)
-    caster, laid = RayCaster(full.vertices_world, full.faces), _laid(atlas)
-    upright = surfaces.unit_face_normals(full.vertices_world, full.faces)
-    # Few faces are off by far less than their sides; a surface farther away is elsewhere.
+    caster, texel_faces = RayCaster(full.vertices_world, full.faces), _texel_faces(atlas)
+    face_normals = surfaces.unit_face_normals(full.vertices_world, full.faces)
+    # The simplified mesh is off by far less than its sides; a surface farther away is another part.
     reach = surfaces.side_lengths(few.vertices_world[few.faces]).median()
-    own = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
+    material = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
 
     def bake(texels: Int[Tensor, " texel"]) -> tuple[Tensor, Tensor]:
-        """Return the values of texels, and whether the surface was met."""
-        here = laid.take(texels)
-        points = here.interpolate(mesh.vertices_world, mesh.faces)
-        outward = here.interpolate(shape, mesh.faces)
-        # Rays outward, then those inward.
+        """Return the values of texels, and whether rays hit the surface."""
+        on_mesh = texel_faces.take(texels)
+        points = on_mesh.interpolate(mesh.vertices_world, mesh.faces)
+        outward = on_mesh.interpolate(shape, mesh.faces)
+        # Rays outward, then rays inward.
         met = caster.cast(points.repeat(2, 1), torch.cat([outward, -outward]), reach)
-        same_side = (upright[met.face] * outward.repeat(2, 1)).sum(dim=1) > 0
+        same_side = (face_normals[met.face] * outward.repeat(2, 1)).sum(dim=1) > 0
         met = met.replace(face=met.face.where(same_side, -1))
         distances = met.distance.where(same_side, torch.inf).chunk(2)
         row = torch.arange(len(points))
         met = met.take(torch.where(distances[0] <= distances[1], row, row + len(points)))
-        found = met.interpolate(values, full.faces)
-        axes = frames(here, normals, tangent, mesh.faces)
-        columns = [_relative(found[:, :3], axes), found[:, 3:], here.interpolate(own, mesh.faces)]
+        sampled = met.interpolate(values, full.faces)
+        axes = frames(on_mesh, normals, tangent, mesh.faces)
+        columns = [
+            _relative(sampled[:, :3], axes),
+            sampled[:, 3:],
+            on_mesh.interpolate(material, mesh.faces),
+        ]
         return torch.cat(columns, dim=1), met.face >= 0
 
-    (texels,) = torch.nonzero(laid.face >= 0, as_tuple=True)
+    (texels,) = torch.nonzero(texel_faces.face >= 0, as_tuple=True)
     blocks = side_by_side(bake, torch.split(texels, 250_000), tracked=False)
-    found, met = (torch.cat(parts) for parts in zip(*blocks, strict=True))
-    raster = found.new_zeros(len(laid.face), found.shape[1])
-    raster[texels] = found
-    known = torch.zeros_like(laid.face, dtype=torch.bool)
-    known[texels] = met
+    baked, met = (torch.cat(parts) for parts in zip(*blocks, strict=True))
+    raster = baked.new_zeros(len(texel_faces.face), baked.shape[1])
+    raster[texels] = baked
+    measured = torch.zeros_like(texel_faces.face, dtype=torch.bool)
+    measured[texels] = met
     size = (atlas.height, atlas.width)
-    raster = raster[_nearest_known(known.reshape(size))[0]]
-    raster[(laid.face >= 0) & ~known, 6] = INPAINTED
+    raster = raster[_nearest(measured.reshape(size))[0]]
+    raster[(texel_faces.face >= 0) & ~measured, 6] = INPAINTED
     raster = raster.reshape(*size, -1)
     return Textured(
         mesh=mesh,
@@ -112,7 +116,7 @@ def textured(
 
 
 def halved(asset: Textured) -> Textured:
-    """Return the same with textures of half the size."""
+    """Return the asset with textures of half the size."""
 
     def half(texture: Float[Tensor, "height width channel"]) -> Tensor:
         return avg_pool2d(texture.movedim(-1, 0), 2).movedim(0, -1)
@@ -126,26 +130,26 @@ def halved(asset: Textured) -> Textured:
     )
 
 
-def _laid(atlas: Atlas) -> Hits:
-    """Find the face that every texel shows, row by row, and where on it; -1 where none is near.
+def _texel_faces(atlas: Atlas) -> Hits:
+    """Return the face of every texel, row by row, and the position on it; face -1 far from all.
 
-    Graphics cards blend a texel at a border with one off the chart: that shows the border's face
-    continued.
+    GPUs interpolate a texel at a border with one outside the chart, which therefore has the
+    border's face, extrapolated.
     """
     size = atlas.uv.new_tensor([atlas.width, atlas.height])
     flat = torch.cat([atlas.uv * size, torch.zeros_like(atlas.uv[:, :1])], dim=1)
     centers = pixel_centers(atlas.width, atlas.height, like=flat).reshape(-1, 2)
     start = torch.cat([centers, torch.full_like(centers[:, :1], -1.0)], dim=1)
     met = RayCaster(flat, atlas.faces).cast(start, torch.tensor([0.0, 0, 1]).expand_as(start))
-    nearest, distance = _nearest_known((met.face >= 0).reshape(atlas.height, atlas.width))
-    # Texels that blending may reach are a diagonal away.
-    (beside,) = torch.nonzero((distance > 0) & (distance < 1.5), as_tuple=True)
+    nearest, distance = _nearest((met.face >= 0).reshape(atlas.height, atlas.width))
+    # Interpolation uses texels up to a diagonal away.
+    (adjacent,) = torch.nonzero((distance > 0) & (distance < 1.5), as_tuple=True)
     face, barycentric = met.face.clone(), met.barycentric.clone()
-    face[beside] = met.face[nearest[beside]]
-    barycentric[beside] = surfaces.barycentric_2d(
-        centers[beside], flat[atlas.faces[face[beside]], :2]
+    face[adjacent] = met.face[nearest[adjacent]]
+    barycentric[adjacent] = surfaces.barycentric_2d(
+        centers[adjacent], flat[atlas.faces[face[adjacent]], :2]
     )
-    # Slivers would be continued far.
+    # Slivers would be extrapolated far.
     close = (barycentric > -1.0).all(dim=1)
     return met.replace(face=torch.where(close, face, -1), barycentric=barycentric)
 
@@ -153,20 +157,20 @@ def _laid(atlas: Atlas) -> Hits:
 def _relative(
     normals: Float[Tensor, "texel 3"], axes: Float[Tensor, "texel 3 3"]
 ) -> Float[Tensor, "texel 3"]:
-    """Return the unit vectors that the axes turn into the normals' directions."""
+    """Return unit vectors along the normals, in coordinates of the axes."""
     tangent, bitangent, normal = axes.unbind(dim=-1)
-    # Cramer's rule: the axes are not quite at right angles, and seldom without volume.
+    # Cramer's rule: the axes are not exactly perpendicular, and rarely degenerate.
     across = [torch.linalg.cross(*pair) for pair in ((bitangent, normal), (normal, tangent))]
     across.append(torch.linalg.cross(tangent, bitangent))
     volume = (tangent * across[0]).sum(dim=1, keepdim=True)
-    found = torch.stack([(normals * one).sum(dim=1) for one in across], dim=1) * volume.sign()
-    found = normalize(found, dim=1)
-    # Viewers do not draw a surface that faces away from itself.
-    return normalize(torch.cat([found[:, :2], found[:, 2:].clamp_min(0.02)], dim=1), dim=1)
+    relative = torch.stack([(normals * axis).sum(dim=1) for axis in across], dim=1) * volume.sign()
+    relative = normalize(relative, dim=1)
+    # Viewers do not draw a surface that faces away from its own normal.
+    return normalize(torch.cat([relative[:, :2], relative[:, 2:].clamp_min(0.02)], dim=1), dim=1)
 
 
-def _nearest_known(known: Mask) -> tuple[Int[Tensor, " texel"], Float[Tensor, " texel"]]:
-    """Number the nearest known texel of every one, row by row, and return how far that is."""
-    away, (row, column) = distance_transform_edt(~known.numpy(), return_indices=True)
+def _nearest(known: Mask) -> tuple[Int[Tensor, " texel"], Float[Tensor, " texel"]]:
+    """Return the index of the nearest true texel for every texel, row by row, and its distance."""
+    distance, (row, column) = distance_transform_edt(~known.numpy(), return_indices=True)
     index = torch.from_numpy(row).long() * known.shape[1] + torch.from_numpy(column)
-    return index.flatten(), torch.from_numpy(away).flatten()
+    return index.flatten(), torch.from_numpy(distance).flatten()

@@ -1,4 +1,4 @@
-"""Finish of a surface before it is written: fewer vertices, and caps where it is open."""
+"""Preparation of a surface for writing: simplification, and caps over borders."""
 
 import torch
 from jaxtyping import Float
@@ -14,70 +14,70 @@ from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.viz.maps import base_color
 from pimper_torch.runtime.stage import Stage
 
-# What people can edit, and browsers draw at once.
+# Editable by people, and fast to draw in browsers.
 _FACES = 50_000
 
-# Steps that the eye hardly sees on a rendered surface, and errors far below the accuracy of these
-# two figures.
+# Colour differences hardly visible on a rendered surface, and errors far below the accuracy of
+# confidence and expected error.
 _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
 
 
 class Simplify(Stage):
-    """Reduce a surface to as few vertices as its shape needs, and close it if asked to."""
+    """Simplify a surface to the vertices that its shape needs, and cap its borders if requested."""
 
     def forward(self, mesh: Mesh, files: MeshFiles) -> Finished:
-        """Make a surface ready to be written."""
+        """Prepare a surface for writing."""
         how, moved = "", dict[str, int | float]()
-        whole: Closed | None = None
+        capped: Closed | None = None
         if isinstance(files.faces, int):
             how = "reduced"
-            few, whole = _few_enough(mesh, files.faces, files.watertight)
+            few, capped = _reduced_to(mesh, files.faces, files.watertight)
         elif files.faces == "all":
             few = mesh
         else:
-            how, found = "simplified", simplify(mesh, values=written_channels(mesh))
-            few = found.mesh
+            how, simplified = "simplified", simplify(mesh, values=written_channels(mesh))
+            few = simplified.mesh
             figures = ("spacing", "max_spacings", "max_angle_deg")
-            moved = {name: getattr(found, name) for name in figures}
-        if files.watertight and whole is None:
-            whole = closed(few)
+            moved = {name: getattr(simplified, name) for name in figures}
+        if files.watertight and capped is None:
+            capped = closed(few)
         caps: dict[str, int | float] = {}
-        if whole is not None:
-            area = face_normals(whole.mesh.vertices_world, whole.mesh.faces).norm(dim=1)
-            share = float(area[~whole.measured].sum() / area.sum())
-            count = int((~whole.measured).sum())
-            caps = {"borders": whole.borders, "faces": count, "area_fraction": share}
+        if capped is not None:
+            area = face_normals(capped.mesh.vertices_world, capped.mesh.faces).norm(dim=1)
+            fraction = float(area[~capped.measured].sum() / area.sum())
+            count = int((~capped.measured).sum())
+            caps = {"borders": capped.borders, "faces": count, "area_fraction": fraction}
         return Finished(
             mesh=few,
             few=reduced(few, _FACES),
-            closed=whole,
+            closed=capped,
             how=how,
             counts={"vertices": len(few.vertices_world), "faces": len(few.faces), **moved},
             caps=caps,
         )
 
 
-def _few_enough(mesh: Mesh, faces: int, watertight: bool) -> tuple[Mesh, Closed | None]:
-    """Reduce a mesh until it has few enough faces, together with its caps if it gets some."""
+def _reduced_to(mesh: Mesh, faces: int, watertight: bool) -> tuple[Mesh, Closed | None]:
+    """Reduce a mesh to at most ``faces`` faces, including its caps if it gets some."""
     few = reduced(mesh, faces)
     if not watertight:
         return few, None
-    whole, wanted = closed(few), faces
-    for _ in range(4):  # caps hardly change after the second time
-        excess = len(whole.mesh.faces) - faces
+    capped, wanted = closed(few), faces
+    for _ in range(4):  # caps hardly change after the second iteration
+        excess = len(capped.mesh.faces) - faces
         wanted -= excess
         if excess <= 0 or wanted < 4:
             break
         few = reduced(mesh, wanted)
-        whole = closed(few)
-    return few, whole
+        capped = closed(few)
+    return few, capped
 
 
 def written_channels(mesh: Mesh) -> Float[Tensor, "vertex channel"]:
-    """Return a file's other values of vertices, in units of their tolerances.
+    """Return the written vertex values other than positions, in units of their tolerances.
 
-    For :func:`pimper_torch.method.meshing.simplify.simplify`: sRGB colour may be off by 8 levels of
-    255, confidence by 0.1, expected error by a tenth of itself.
+    For :func:`pimper_torch.method.meshing.simplify.simplify`: the tolerance of sRGB colour is 8 of
+    255, of confidence 0.1, and of expected error a tenth of its value.
     """
     channels = [mesh.vertices_world.new_zeros(len(mesh.vertices_world), 0)]
     if mesh.albedo is not None:

@@ -12,18 +12,18 @@ from PIL import Image
 from pimper_torch.ground.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.result.asset.placement import Placement
 
-_ARRAYS, _INDICES = 34962, 34963  # what a view of the buffer is for
+_ARRAYS, _INDICES = 34962, 34963  # targets of buffer views
 _TRIANGLES, _POINTS = 4, 0
 _KINDS = {"u1": 5121, "u2": 5123, "u4": 5125, "f4": 5126}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _LINEAR_MIPMAP_LINEAR, _LINEAR, _CLAMP = 9987, 9729, 33071
 _WEBP = "EXT_texture_webp"
-# glTF's own is metal.
+# glTF's default is metal.
 MATTE: dict[str, Any] = {
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
     "doubleSided": True,
 }
-# Of normals and tangents that have no length: glTF wants them unit.
+# Replaces normals and tangents of zero length: glTF requires unit vectors.
 _UPWARD = (0.0, 0.0, 1.0)
 
 
@@ -35,12 +35,12 @@ def gltf_of(
     offset_world: Offset = NO_OFFSET,
     placement: Placement | None = None,
 ) -> bytes:
-    """Return one mesh of one material as a GLB.
+    """Return one mesh with one material as a GLB.
 
     Args:
-        attributes: By glTF's names, one row a vertex; written in single precision.
-        faces: Three vertices each. Without any, the vertices are points.
-        material: In glTF's words; its textures' indices are those of ``images``. Extensions that it
+        attributes: By glTF's names, one row per vertex; written in single precision.
+        faces: Three vertices each. If empty, the vertices are points.
+        material: In glTF's terms; its texture indices refer to ``images``. Extensions that it
             names are declared.
         images: PNG, JPEG or WebP files.
         offset_world: The node's ``translation``.
@@ -67,11 +67,11 @@ def gltf_of(
         )
         return len(accessors) - 1
 
-    places = np.asarray(attributes["POSITION"], "<f4")
-    bounds = {"min": places.min(axis=0).tolist(), "max": places.max(axis=0).tolist()}
+    positions = np.asarray(attributes["POSITION"], "<f4")
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     primitive: dict[str, Any] = {"attributes": {}, "mode": _TRIANGLES if len(faces) else _POINTS}
     if len(faces):
-        kind = "<u2" if len(places) < 65536 else "<u4"
+        kind = "<u2" if len(positions) < 65536 else "<u4"
         primitive["indices"] = stored(faces.astype(kind).ravel(), _INDICES)
     for key, values in attributes.items():
         rows = _unit(values) if key in ("NORMAL", "TANGENT") else np.asarray(values, "<f4")
@@ -83,7 +83,7 @@ def gltf_of(
         "asset": {"version": "2.0", "generator": "pimper_torch"},
         "scene": 0,
         "scenes": [{"nodes": list(range(1 + len(cameras)))}],
-        "nodes": [{"mesh": 0}, *({**one, "camera": index} for index, one in enumerate(cameras))],
+        "nodes": [{"mesh": 0}, *({**node, "camera": index} for index, node in enumerate(cameras))],
         "meshes": [{"primitives": [primitive]}],
         "materials": [dict(material)],
         "accessors": accessors,
@@ -96,7 +96,7 @@ def gltf_of(
             tree[kind][0]["name"] = placement.name
         tree["nodes"][0]["extras"] = placement.extras
     if cameras:
-        tree["cameras"] = [one["camera"] for one in cameras]
+        tree["cameras"] = [node["camera"] for node in cameras]
     extensions = set(material.get("extensions", ()))
     if images:
         kinds = [Image.open(BytesIO(image)).get_format_mimetype() for image in images]
@@ -126,7 +126,7 @@ def gltf_of(
 
 
 def _unit(values: np.ndarray) -> np.ndarray:
-    """Make the first three columns unit, in single precision."""
+    """Normalize the first three columns, in single precision."""
     rows = np.array(values, "<f8")
     length = np.linalg.norm(rows[:, :3], axis=1, keepdims=True)
     rows[:, :3] = np.where(length > 0, rows[:, :3] / np.where(length > 0, length, 1), _UPWARD)

@@ -1,4 +1,4 @@
-"""Albedo where light does not determine the surface."""
+"""Albedo where light does not determine it."""
 
 import torch
 
@@ -11,18 +11,19 @@ from pimper_torch.records import Mesh
 _LEAST_CONFIDENCE = 0.1
 
 UNDETERMINED, INPAINTED = 0.5, 1.0
-"""Doubt about the albedo of a vertex, or of a texel; 0 where light determines it."""
+"""Uncertainty of the albedo of a vertex or texel; 0 where light determines it."""
 
 
 def inpainted(mesh: Mesh) -> tuple[Mesh, PerVertex]:
     """Replace implausibly bright albedo by that of the neighbours.
 
-    Where few lights reach, normals are not determined, and neither is the shading that albedo was
-    divided by. A vertex is too bright there if it is brighter than 99 of 100 determined ones; so is
-    what surrounds it, as far as it is brighter than the continued albedo of the determined surface.
+    Where few lights reach the surface, normals are undetermined, and with them the shading by which
+    radiance was divided. Such a vertex is too bright if it is brighter than 99 of 100 determined
+    ones; so are its surroundings where they exceed the albedo continued from determined surface.
 
     Returns:
-        The mesh, unchanged if nothing is too bright or no vertex has confidence, and the doubt.
+        The mesh, unchanged if nothing is too bright or vertices have no confidence, and the
+        uncertainty.
     """
     albedo, confidence = mesh.albedo, mesh.confidence
     if albedo is None or confidence is None:

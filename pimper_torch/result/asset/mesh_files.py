@@ -1,4 +1,4 @@
-"""Form of the files of a mesh."""
+"""File options of a mesh."""
 
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -16,12 +16,12 @@ class MeshFiles:
     """Form in which the surface is written.
 
     Attributes:
-        faces: Most that the mesh has; ``None`` for as few as tell the surface to a twentieth of a
-            sample's spacing and 1.5 degrees.
-        formats: Beside PLY and GLB, which are always written. USDZ holds the asset, and needs
-            usd-core, the extra ``usd``.
-        texture: Of the pictures in ``asset.glb``; others are PNG.
-        cameras: Whether ``asset.glb`` holds the cameras of the photographs.
+        faces: Maximum number of faces; ``None`` for as few as represent the surface to a twentieth
+            of a sample's spacing and 1.5 degrees.
+        formats: In addition to PLY and GLB, which are always written. USDZ contains the asset, and
+            needs usd-core, the extra ``usd``.
+        texture: Of the images in ``asset.glb``; other images are PNG.
+        cameras: Whether ``asset.glb`` contains the cameras of the photographs.
     """
 
     faces: int | Literal["all"] | None = None
@@ -32,7 +32,7 @@ class MeshFiles:
 
     def __post_init__(self) -> None:
         few = self.faces is not None and self.faces != "all" and self.faces < 4
-        require(not few, "faces", self.faces, "all, or 4 at least, those of a tetrahedron")
+        require(not few, "faces", self.faces, "all, or at least 4, a tetrahedron's")
         if "usdz" in self.formats and find_spec("pxr") is None:
             raise ConfigError(
                 "USDZ needs usd-core, which is not installed: pip install 'pimper_torch[usd]'."

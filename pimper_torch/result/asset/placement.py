@@ -1,4 +1,4 @@
-"""Position of an asset in its file: upright on the origin, in metres."""
+"""Placement of an asset in its file: upright on the origin, in metres."""
 
 import math
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from pimper_torch.records import Cameras, Mesh
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placement:
-    """Name of an asset, and the way back from its file's frame to the scene.
+    """Name of an asset, and the transformation from its file's frame back to the scene.
 
     Attributes:
         scene_from_asset: A similarity in float64: the asset has y up, z towards the reference
             camera, and the middle of its base at the origin.
         offset_world: Of the scene; see ``SparseScene.offset_world``.
         metric: Whether the asset is in metres; otherwise its longest side is 1.
-        cameras: That the file holds, by the names of their photographs.
+        cameras: Cameras written to the file, and the names of their photographs.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Placement:
 
     @property
     def extras(self) -> dict[str, object]:
-        """Numbers that undo the placement, glTF's ``extras``; the matrix is listed by columns."""
+        """Values that undo the placement, for glTF's ``extras``; the matrix is in column order."""
         return {
             "scene_from_asset": self.scene_from_asset.mT.flatten().tolist(),
             "offset_world": list(self.offset_world),
@@ -41,40 +41,40 @@ class Placement:
         }
 
     def placed(self, vertices: Vertices, normals: Vertices) -> tuple[Vertices, Vertices]:
-        """Carry vertices and their directions from the scene to the asset."""
+        """Transform vertices and their directions from the scene to the asset."""
         matrix = self.scene_from_asset
         rotation = normalize(matrix[:3, :3], dim=0)
         points = (vertices.double() - matrix[:3, 3]) @ rotation / matrix[:3, 0].norm()
         return points.float(), (normals.double() @ rotation).float()
 
     def gltf_cameras(self) -> list[dict[str, Any]]:
-        """Return the cameras as nodes of glTF with their ``camera``, which have no distortion."""
+        """Return the cameras as glTF nodes with their ``camera``, without distortion."""
         if self.cameras is None:
             return []
         names, cameras = self.cameras
-        found = []
+        nodes = []
         for view, name in enumerate(names):
             eye = invert_rigid(cameras.cam_from_world[view].detach().cpu().double())
-            places, axes = self.placed(eye[None, :3, 3], eye[:3, :3].mT)
+            position, axes = self.placed(eye[None, :3, 3], eye[:3, :3].mT)
             back = axes.mT.double() * torch.tensor([1.0, -1.0, -1.0])  # y up, z backward
             width, height = cameras.sizes_px[view].tolist()
             yfov = 2 * math.atan(height / 2 / float(cameras.intrinsics[view, 1, 1]))
-            lens = {"yfov": yfov, "aspectRatio": width / height, "znear": 0.01}
-            matrix = rigid(back, places[0].double()).mT.flatten().tolist()
-            camera = {"type": "perspective", "name": name, "perspective": lens}
-            found.append({"name": name, "matrix": matrix, "camera": camera})
-        return found
+            perspective = {"yfov": yfov, "aspectRatio": width / height, "znear": 0.01}
+            matrix = rigid(back, position[0].double()).mT.flatten().tolist()
+            camera = {"type": "perspective", "name": name, "perspective": perspective}
+            nodes.append({"name": name, "matrix": matrix, "camera": camera})
+        return nodes
 
 
 def standing(mesh: Mesh, cameras: Cameras, reference: int, up: Vector, metre: float | None) -> Pose:
-    """Return ``scene_from_asset`` of a mesh on its base; see :class:`Placement`.
+    """Return ``scene_from_asset`` of a mesh placed on its base; see :class:`Placement`.
 
     Args:
         up: Unit, scene frame.
-        metre: In scene units; ``None`` where the size is not known.
+        metre: In scene units; ``None`` if the scale is unknown.
     """
     up, pose = up.detach().cpu().double(), cameras.cam_from_world[reference].detach().cpu().double()
-    # Seen from straight above, the front is where the picture's lower edge is.
+    # Seen from straight above, the front is at the image's lower edge.
     towards = 1e-3 * pose[1, :3] - pose[2, :3]
     front = normalize(towards - (towards @ up) * up, dim=0)
     rotation = torch.stack([torch.linalg.cross(up, front), up, front], dim=1)

@@ -1,4 +1,4 @@
-"""The frames that normal maps are relative to, as viewers compute them."""
+"""Tangent frames of normal maps, as viewers compute them."""
 
 import torch
 from jaxtyping import Float
@@ -12,26 +12,26 @@ from pimper_torch.ground.shapes import Faces, Vertices
 def tangents(
     vertices: Vertices, normals: Vertices, uv: Float[Tensor, "vertex 2"], faces: Faces
 ) -> Float[Tensor, "vertex 4"]:
-    """Return glTF's tangents: unit, at right angles to the normal, along ``u``; then a sign.
+    """Return glTF's tangents: unit, perpendicular to the normal, along ``u``; then a sign.
 
-    The sign times the cross product of normal and tangent points up the picture, against ``v``;
-    it is -1 where the texture shows the surface mirrored. Directions of the faces round a vertex
-    are weighted by their area on the texture.
+    The sign times the cross product of normal and tangent points up in the image, against ``v``;
+    it is -1 where the texture is mirrored on the surface. Directions of a vertex's faces are
+    weighted by their area on the texture.
 
     Args:
         uv: Right and down over the texture.
     """
     a, b, c = vertices[faces].unbind(dim=1)
     p, q, r = (uv * uv.new_tensor([1.0, -1.0]))[faces].unbind(dim=1)
-    one, other = q - p, r - p
-    area = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
-    along = (b - a) * other[:, 1:] - (c - a) * one[:, 1:]
+    first, second = q - p, r - p
+    area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    along = (b - a) * second[:, 1:] - (c - a) * first[:, 1:]
     along = along * area.sign()[:, None]
     corners = faces.mT.flatten()
     total = torch.zeros_like(vertices).index_add(0, corners, along.repeat(3, 1))
     signed = torch.zeros_like(vertices[:, 0]).index_add(0, corners, area.repeat(3))
     across = total - (total * normals).sum(dim=1, keepdim=True) * normals
-    # Where faces have no area on the texture, any direction along the surface will do.
+    # Where faces have no area on the texture, use any direction along the surface.
     axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
     lost = across.norm(dim=1, keepdim=True) <= 1e-6 * total.norm(dim=1, keepdim=True)
     across = torch.where(lost, torch.linalg.cross(normals, axis), across)
@@ -42,10 +42,10 @@ def tangents(
 def frames(
     hits: Hits, normals: Vertices, tangent: Float[Tensor, "vertex 4"], faces: Faces
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Return tangent, bitangent and normal in columns, blended over faces as shaders do.
+    """Return tangent, bitangent and normal as columns, interpolated over faces as in shaders.
 
-    Khronos' viewer and three.js blend each of the three and make it unit again; they are then not
-    quite at right angles to each other.
+    Khronos' viewer and three.js interpolate and normalize each of the three separately; they are
+    then not exactly perpendicular.
     """
     along, sign = tangent[:, :3], tangent[:, 3:]
     axes = (along, sign * torch.linalg.cross(normals, along), normals)

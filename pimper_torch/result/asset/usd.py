@@ -1,4 +1,4 @@
-"""Textured meshes as USDZ, by usd-core, an extra."""
+"""Textured meshes as USDZ, by usd-core, an optional dependency."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +11,7 @@ from pimper_torch.result.asset.placement import Placement
 
 
 def write_usdz(asset: Textured, path: Path | str, placement: Placement) -> None:
-    """Write a USDZ, for telephones of Apple and for film: one mesh with albedo and normal map.
+    """Write a USDZ, for Apple's devices and for film: one mesh with albedo and normal map.
 
     y is up, and lengths are in metres; ``customData`` of the mesh undoes the placement. The surface
     is matte.
@@ -21,8 +21,8 @@ def write_usdz(asset: Textured, path: Path | str, placement: Placement) -> None:
     vertices, normals = placement.placed(asset.mesh.vertices_world, asset.normals)
     uv = asset.uv * asset.uv.new_tensor([1.0, -1.0]) + asset.uv.new_tensor([0.0, 1.0])
     with TemporaryDirectory(prefix="pimper_usd_") as folder:
-        whole = Path(folder) / "asset.usdc"
-        stage = Usd.Stage.CreateNew(str(whole))
+        layer = Path(folder) / "asset.usdc"
+        stage = Usd.Stage.CreateNew(str(layer))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         root = UsdGeom.Xform.Define(stage, "/asset")
@@ -53,11 +53,11 @@ def write_usdz(asset: Textured, path: Path | str, placement: Placement) -> None:
         reader.CreateIdAttr("UsdPrimvarReader_float2")
         reader.CreateInput("varname", kind.String).Set("st")
         where = reader.CreateOutput("result", kind.Float2)
-        for name, picture, slot, space, scale, bias in (
+        for name, image, slot, space, scale, bias in (
             ("albedo", asset.base_color, "diffuseColor", "sRGB", 1.0, 0.0),
             ("normal", asset.normal, "normal", "raw", 2.0, -1.0),
         ):
-            Image.fromarray(picture.numpy()).save(Path(folder) / f"{name}.png")
+            Image.fromarray(image.numpy()).save(Path(folder) / f"{name}.png")
             texture = UsdShade.Shader.Define(stage, f"/asset/material/{name}")
             texture.CreateIdAttr("UsdUVTexture")
             texture.CreateInput("file", kind.Asset).Set(f"./{name}.png")
@@ -74,4 +74,4 @@ def write_usdz(asset: Textured, path: Path | str, placement: Placement) -> None:
         material.CreateSurfaceOutput().ConnectToSource(shader_out)
         UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
         stage.GetRootLayer().Save()
-        UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(whole)), str(path))
+        UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(path))

@@ -18,9 +18,9 @@ from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.asset.mesh_files import TextureFormat
 from pimper_torch.result.asset.placement import Placement
 
-_Picture = UInt8[Tensor, "height width *channel"]
+_Image = UInt8[Tensor, "height width *channel"]
 _SPECULAR = "KHR_materials_specular"
-# Of JPEG and WebP: colours of the skull are off by 1.6 and 1.8 levels of 255 (root mean square), in
+# Of JPEG and WebP: colours of the skull are off by 1.6 and 1.8 of 255 (root mean square), in
 # 46 % and 23 % of the PNG's bytes.
 _QUALITY = 95
 
@@ -38,9 +38,10 @@ def write_asset(
     ``albedo_doubt``: black where it is determined, grey where not, white where it was inpainted.
 
     Args:
-        placement: Of the file; without, the file is in the frame of the asset's mesh.
-        texture: Of the base colour, which JPEG and WebP compress with losses. The other pictures
-            are lossless: PNG, or WebP. Programs need ``EXT_texture_webp`` for WebP.
+        placement: Of the file; by default, the file is in the frame of the asset's mesh.
+        texture: Of the base colour; JPEG and WebP are lossy. Other images are lossless: PNG, or
+            WebP. Programs need ``EXT_texture_webp`` for WebP.
+        more: Additional vertex attributes, by name.
     """
     mesh = asset.mesh
     vertices, normals, along = mesh.vertices_world, asset.normals, asset.tangent[:, :3]
@@ -60,8 +61,8 @@ def write_asset(
     surface = MATTE["pbrMetallicRoughness"] | {"baseColorTexture": {"index": 0}}
     material = MATTE | {"pbrMetallicRoughness": surface, "normalTexture": {"index": 1}}
     if asset.reflectance is not None:
-        pictures = _reflect(material, asset.reflectance, len(images))
-        images += [_encoded(picture, texture) for picture in pictures]
+        maps = _reflect(material, asset.reflectance, len(images))
+        images += [_encoded(image, texture) for image in maps]
     if bool(asset.uncertainty.any()):
         material["extras"] = {"albedo_doubt": {"index": len(images)}}
         images.append(_encoded(asset.uncertainty, "png"))
@@ -77,8 +78,8 @@ def write_asset(
 
 def _reflect(
     material: dict[str, Any], reflectance: Float[Tensor, "height width 3"], first: int
-) -> list[_Picture]:
-    """Add factors, or textures where they vary, to a material; return the textures' pictures."""
+) -> list[_Image]:
+    """Add factors, or textures where they vary, to a material; return the textures' images."""
     metallic, roughness, specular = reflectance.unbind(dim=-1)
     strongest = float(specular.max().clamp_min(1))
     surface = material["pbrMetallicRoughness"]
@@ -95,32 +96,32 @@ def _reflect(
     occlusion = torch.ones_like(metallic)
     colored = to_bytes(specular.clamp_min(1)[..., None].expand(-1, -1, 3) / strongest)
     return [
-        _levels(torch.stack([occlusion, roughness, metallic], dim=-1)),
-        torch.cat([colored, _levels(specular.clamp_max(1)[..., None])], dim=-1),
+        _as_bytes(torch.stack([occlusion, roughness, metallic], dim=-1)),
+        torch.cat([colored, _as_bytes(specular.clamp_max(1)[..., None])], dim=-1),
     ]
 
 
-def _levels(values: Scalars) -> UInt8[Tensor, "*batch"]:
+def _as_bytes(values: Scalars) -> UInt8[Tensor, "*batch"]:
     return (255 * values.clamp(0, 1)).round().to(torch.uint8)
 
 
-def _encoded(picture: _Picture, texture: TextureFormat, *, lossless: bool = True) -> bytes:
-    """Return a picture's file; JPEG is never lossless."""
-    file, image = BytesIO(), Image.fromarray(picture.numpy())
+def _encoded(image: _Image, texture: TextureFormat, *, lossless: bool = True) -> bytes:
+    """Return an image's file; JPEG is never lossless."""
+    file, pillow = BytesIO(), Image.fromarray(image.numpy())
     if texture == "webp":
-        image.save(file, "WEBP", lossless=lossless, quality=_QUALITY)
+        pillow.save(file, "WEBP", lossless=lossless, quality=_QUALITY)
     elif texture == "jpeg" and not lossless:
-        image.save(file, "JPEG", quality=_QUALITY, subsampling=0)
+        pillow.save(file, "JPEG", quality=_QUALITY, subsampling=0)
     else:
-        # With 6 the two pictures take twice as long and are a twentieth smaller.
-        image.save(file, "PNG", compress_level=3)
+        # With 6, two images take twice as long and are 5 % smaller.
+        pillow.save(file, "PNG", compress_level=3)
     return file.getvalue()
 
 
 def write_asset_obj(asset: Textured, path: Path | str, placement: Placement) -> None:
-    """Write an OBJ, and next to it the ``.mtl`` and the two PNG files that it refers to.
+    """Write an OBJ, its ``.mtl`` and the two PNG files that this refers to.
 
-    Its first lines are comments that undo the placement.
+    The first lines are comments with values that undo the placement.
     """
     path, name = Path(path), "_".join(placement.name.split())
     albedo, normal = (path.with_name(f"{path.stem}_{name}.png") for name in ("albedo", "normal"))

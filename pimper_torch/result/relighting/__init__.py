@@ -1,1 +1,1 @@
-"""The light of every photograph, and the materials, with the surface held fixed."""
+"""Lights of the photographs and materials of the surface, with its shape held fixed."""

@@ -1,9 +1,9 @@
-"""The light of every photograph: ambient and directed, fitted with the surface held fixed.
+"""Ambient and directed light of every photograph, fitted with the surface held fixed.
 
-A photograph's exposure and colour are part of its light. Radiance is linear in the ambient and the
-directed strength of each channel, so only the direction is searched: over the whole sphere without
-cast shadows, then among the best with them, then in ever smaller steps. Errors are those of sRGB
-values, under Cauchy's loss, so that highlights and shadows of other objects have little weight.
+A photograph's exposure and colour are part of its light. Radiance is linear in the ambient and
+directed strengths of each channel, so only the direction is searched: over the sphere without cast
+shadows, then among the best with them, then in decreasing steps. Residuals are of sRGB values with
+Cauchy's loss, so that highlights and shadows of other objects have little weight.
 """
 
 from collections.abc import Sequence
@@ -28,12 +28,12 @@ from pimper_torch.result.relighting.lit_surface import (
 )
 from pimper_torch.runtime.parallel import side_by_side
 
-# Longer side of the photographs that lights are fitted to, at most: some 20,000 pixels of an
-# object, ten thousand times what a light has unknowns.
+# Maximum length of the longer side of the photographs used: some 20,000 pixels of an object, ten
+# thousand times the unknowns of a light.
 _SIZE_PX = 300
 
-# Below this radiance an error counts no more for being in the dark: sRGB's slope would let noise
-# decide.
+# Below this radiance the weight of an error is constant: with the slope of sRGB, noise would
+# dominate.
 _DARK = 0.01
 
 
@@ -43,8 +43,8 @@ class Observed(Record):
 
     Attributes:
         weight: Of a squared error of radiance, so that errors are those of sRGB.
-        saturated: True where the photograph is, in part of the pixel at least: radiance is then not
-            below the value shown.
+        saturated: True where the photograph is saturated, at least in part of the pixel: the
+            radiance there is a lower bound.
     """
 
     pixels: SurfacePixels
@@ -53,7 +53,7 @@ class Observed(Record):
     saturated: Bool[Tensor, " pixel"]
 
     def thinned(self, most: int) -> "Observed":
-        """Keep every n-th pixel, so that few enough are left."""
+        """Keep every n-th pixel, so that at most ``most`` are left."""
         step = -(-len(self.radiance) // most)
         return self.take(slice(None, None, step)) if step > 1 else self
 
@@ -61,33 +61,33 @@ class Observed(Record):
 def observe_all(
     surface: LitSurface, scene: SparseScene, silhouettes: Silhouettes | None
 ) -> list[Observed]:
-    """Return the pixels of every photograph that show the surface and nothing else.
+    """Return the pixels of every photograph that show only the surface.
 
     Args:
-        silhouettes: Of all views; by default the masks of the views, or the surface's own outline.
+        silhouettes: Of all views; by default the views' masks, or the surface's outline.
     """
     masks = scene.views.masks
 
     def observed(view: int) -> Observed:
-        own = scene.cameras.take([view])
-        width, height = own.sizes_px[0].tolist()
+        camera = scene.cameras.take([view])
+        width, height = camera.sizes_px[0].tolist()
         factor = max(1, -(-max(width, height) // _SIZE_PX))
-        intrinsics = scale_intrinsics(own.intrinsics, 1 / factor, 1 / factor)
-        smaller = own.replace(intrinsics=intrinsics, sizes_px=own.sizes_px // factor)
+        intrinsics = scale_intrinsics(camera.intrinsics, 1 / factor, 1 / factor)
+        smaller = camera.replace(intrinsics=intrinsics, sizes_px=camera.sizes_px // factor)
         pixels = surface.pixels(smaller)
         image = scene.views.images[view, :, :height, :width].detach().cpu().float()
         radiance = avg_pool2d(image, factor).flatten(1).mT
         saturated = avg_pool2d((image.amax(dim=0, keepdim=True) >= SATURATED).float(), factor)
         kept = pixels.inner & radiance[pixels.pixel].isfinite().all(dim=1)
-        shown = None if masks is None else masks[view]
+        mask = None if masks is None else masks[view]
         if silhouettes is not None:
-            shown = silhouettes.inside[view] > 0.5
-        if shown is not None:
-            inside = avg_pool2d(shown[None, :height, :width].cpu().float(), factor)
+            mask = silhouettes.inside[view] > 0.5
+        if mask is not None:
+            inside = avg_pool2d(mask[None, :height, :width].cpu().float(), factor)
             kept &= inside.flatten()[pixels.pixel] > 0.99
         pixels = pixels.take(kept)
         radiance = radiance[pixels.pixel].clamp(0, 1)
-        # The slope of sRGB but for its factor.
+        # The squared slope of sRGB up to a factor.
         return Observed(
             pixels=pixels,
             radiance=radiance,
@@ -98,49 +98,51 @@ def observe_all(
     return list(side_by_side(observed, range(scene.cameras.num_views), tracked=False))
 
 
-def loss_scale(seen: Observed) -> float:
-    """Return the scale of Cauchy's loss, by a light of first order without any shadow."""
-    basis = torch.cat([torch.ones_like(seen.radiance[:, :1]), seen.pixels.normals_world], dim=1)
-    root = seen.weight.sqrt() * ~seen.saturated[:, None]
-    rows = (root * seen.pixels.base_color).mT[..., None] * basis
-    values = (root * seen.radiance).mT[..., None]
+def loss_scale(observed: Observed) -> float:
+    """Return the scale of Cauchy's loss from a first-order light without shadows."""
+    basis = torch.cat(
+        [torch.ones_like(observed.radiance[:, :1]), observed.pixels.normals_world], dim=1
+    )
+    root = observed.weight.sqrt() * ~observed.saturated[:, None]
+    rows = (root * observed.pixels.base_color).mT[..., None] * basis
+    values = (root * observed.radiance).mT[..., None]
     light = torch.linalg.lstsq(rows, values, driver="gelsd").solution
     size = (values - rows @ light)[..., 0].norm(dim=0)
     deviation = float(median_deviation(size, torch.ones_like(size, dtype=torch.bool)))
-    # Half a level of eight bits.
+    # Half a step of eight bits.
     return CAUCHY_TUNING * max(deviation, 0.002)
 
 
 def fit_strengths(
-    seen: Observed,
+    observed: Observed,
     diffuse: Float[Tensor, "*batch pixel #channel"],
     response: Float[Tensor, "light pixel #channel"],
     scale: float,
 ) -> tuple[Float[Tensor, "light channel"], Float[Tensor, "light channel"], Float[Tensor, " light"]]:
-    """Fit ambient and directed strength for every light, by reweighted least squares.
+    """Fit ambient and directed strengths of every light by iteratively reweighted least squares.
 
     Args:
         diffuse: Radiance under an ambient light of 1, one for all lights or one for each.
         response: Radiance under a directed light of strength 1.
 
     Returns:
-        Both, neither below 0, and the mean loss.
+        Ambient and directed strengths, neither below 0, and the mean loss.
     """
-    radiance = seen.radiance
-    used = (~seen.saturated)[:, None].expand_as(response).float()
+    radiance = observed.radiance
+    used = (~observed.saturated)[:, None].expand_as(response).float()
     robust = torch.ones_like(response[..., 0])
     for _ in range(3):
-        weight = robust[..., None] * seen.weight * used
+        weight = robust[..., None] * observed.weight * used
         aa, ab = (weight * diffuse**2).sum(dim=1), (weight * diffuse * response).sum(dim=1)
         bb = (weight * response**2).sum(dim=1)
         ay = (weight * diffuse * radiance).sum(dim=1)
         by = (weight * response * radiance).sum(dim=1)
         ambient, directed = _non_negative(aa, ab, bb, ay, by)
         error = ambient[:, None] * diffuse + directed[:, None] * response - radiance
-        # A saturated photograph says nothing of radiance above its own.
-        error = torch.where(seen.saturated[:, None], error.clamp_max(0), error)
+        # A saturated photograph bounds the radiance from below.
+        error = torch.where(observed.saturated[:, None], error.clamp_max(0), error)
         used = (error != 0).float()
-        size = (seen.weight * error**2).sum(dim=-1).sqrt()
+        size = (observed.weight * error**2).sum(dim=-1).sqrt()
         robust = cauchy_weights(size, torch.full_like(size[:1, :1], scale))
     return ambient, directed, -robust.log().mean(dim=1)
 
@@ -148,30 +150,30 @@ def fit_strengths(
 def _non_negative(
     aa: Tensor, ab: Tensor, bb: Tensor, ay: Tensor, by: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Solve the normal equations of two unknowns, neither below 0."""
+    """Solve the normal equations of two unknowns with neither below 0."""
     tiny = torch.finfo(aa.dtype).tiny
     determinant = aa * bb - ab**2
     sound = determinant > 1e-6 * aa * bb
     determinant = torch.where(sound, determinant, 1)
     first, second = (bb * ay - ab * by) / determinant, (aa * by - ab * ay) / determinant
     alone, other = ay / aa.clamp_min(tiny), by / bb.clamp_min(tiny)
-    both = sound & (first >= 0) & (second >= 0)
-    # One of them is 0 at the best point that is allowed: the gain of each alone decides.
+    interior = sound & (first >= 0) & (second >= 0)
+    # At the constrained optimum one of them is 0: the larger decrease of the cost decides which.
     larger = ay * alone >= by * other
     return (
-        torch.where(both, first, torch.where(larger, alone, 0)),
-        torch.where(both, second, torch.where(larger, 0, other)),
+        torch.where(interior, first, torch.where(larger, alone, 0)),
+        torch.where(interior, second, torch.where(larger, 0, other)),
     )
 
 
-# Directions that are tried first, some 12 degrees apart, and how many of them with cast shadows.
+# Number of directions tried first, some 12 degrees apart, and number refined with cast shadows.
 _DIRECTIONS, _CANDIDATES = 300, 12
-# Pixels of a photograph that the first directions are tried on, and the last.
+# Numbers of pixels of a photograph used for the first directions, and for the last.
 _FEW, _MANY = 500, 2000
-# Radius over distance that is tried first, and at most: a light as near as a lamp is held.
-_CLOSENESS, _CLOSEST = (0.0, 0.25, 0.5), 0.7
-# Of direction, in radians, and of closeness: half the distance of the first directions, down to a
-# tenth of a degree.
+# First and maximum values of radius over distance: as for a lamp held near the object.
+_INVERSE_DISTANCES, _MAX_INVERSE_DISTANCE = (0.0, 0.25, 0.5), 0.7
+# Steps of direction, in radians, and of inverse distance: from half the distance of the first
+# directions down to a tenth of a degree.
 _COARSE, _FINE = (0.1, 0.1, 0.05, 0.05, 0.025, 0.025), (0.04, 0.02, 0.01, 0.005, 0.0025)
 
 
@@ -181,11 +183,11 @@ def lights_of(
     materials: Materials | None = None,
     start: ViewLights | None = None,
 ) -> ViewLights:
-    """Fit the light of every photograph, see above.
+    """Fit the light of every photograph.
 
     Args:
         observed: Of each photograph, see :func:`observe_all`.
-        start: Lights nearby; by default the whole sphere is searched.
+        start: Approximate lights; by default the complete sphere is searched.
     """
     material = None if materials is None else materials.at_vertices()
 
@@ -197,29 +199,36 @@ def lights_of(
 
 
 def _fit(
-    surface: LitSurface, seen: Observed, material: Vertices | None, start: ViewLights | None
+    surface: LitSurface, observed: Observed, material: Vertices | None, start: ViewLights | None
 ) -> ViewLights:
-    if len(seen.radiance) == 0:
-        none = torch.zeros(1, seen.radiance.shape[1])
+    if len(observed.radiance) == 0:
+        zero = torch.zeros(1, observed.radiance.shape[1])
         up = torch.tensor([[0.0, 0.0, 1.0]])
         return ViewLights(
-            direction_world=up, inverse_distance=none[:, 0], ambient=none, directed=none
+            direction_world=up, inverse_distance=zero[:, 0], ambient=zero, directed=zero
         )
-    few, many = seen.thinned(_FEW), seen.thinned(_MANY)
+    few, many = observed.thinned(_FEW), observed.thinned(_MANY)
     scale = loss_scale(few)
 
     def rendered(
-        seen: Observed, lights: Float[Tensor, "light 4"], shadows: bool = True
+        observed: Observed, lights: Float[Tensor, "light 4"], shadows: bool = True
     ) -> tuple[Float[Tensor, "pixel channel"], Float[Tensor, "light pixel channel"]]:
-        own = None if material is None else material[seen.pixels.vertex]
-        light = surface.incidence(seen.pixels, lights[:, :3], lights[:, 3], shadows=shadows)
-        return diffuse_color(seen.pixels, own), response(seen.pixels, light, own)
+        reflectance = None if material is None else material[observed.pixels.vertex]
+        light = surface.incidence(observed.pixels, lights[:, :3], lights[:, 3], shadows=shadows)
+        return diffuse_color(observed.pixels, reflectance), response(
+            observed.pixels, light, reflectance
+        )
 
     def best(
-        seen: Observed, lights: Float[Tensor, "start light 4"], shadows: bool = True, most: int = 1
+        observed: Observed,
+        lights: Float[Tensor, "start light 4"],
+        shadows: bool = True,
+        most: int = 1,
     ) -> Float[Tensor, "start most 4"]:
         """Return the best lights of every start, best first."""
-        losses = fit_strengths(seen, *rendered(seen, lights.flatten(0, 1), shadows), scale)[2]
+        losses = fit_strengths(observed, *rendered(observed, lights.flatten(0, 1), shadows), scale)[
+            2
+        ]
         order = losses.reshape(lights.shape[:2]).argsort(dim=1, stable=True)[:, :most]
         return lights.gather(1, order[..., None].expand(-1, -1, 4))
 
@@ -228,9 +237,17 @@ def _fit(
         lights = torch.cat([start.direction_world, start.inverse_distance[:, None]], dim=1)
     else:
         far = best(few, lights[None], shadows=False, most=_CANDIDATES)[0]
-        starts = best(few, torch.stack([pad(far[:, :3], (0, 1), value=one) for one in _CLOSENESS]))
+        starts = best(
+            few,
+            torch.stack(
+                [
+                    pad(far[:, :3], (0, 1), value=inverse_distance)
+                    for inverse_distance in _INVERSE_DISTANCES
+                ]
+            ),
+        )
         for step in _COARSE:
-            starts = best(few, torch.stack([_neighbours(one[0], step) for one in starts]))
+            starts = best(few, torch.stack([_neighbours(light[0], step) for light in starts]))
         lights = best(many, starts.flatten(0, 1)[None])[0]
     for step in _FINE:
         lights = best(many, _neighbours(lights[0], step)[None])[0]
@@ -244,15 +261,15 @@ def _fit(
 
 
 def _neighbours(light: Float[Tensor, " 4"], step: float) -> Float[Tensor, "11 4"]:
-    """Return a light and others around it: ``step`` radians away, nearer and farther."""
+    """Return a light and its neighbours: ``step`` radians away, nearer and farther."""
     direction = light[:3]
     axis = torch.eye(3).to(direction)[direction.abs().argmin()]
     first = normalize(torch.linalg.cross(direction, axis), dim=0)
     second = torch.linalg.cross(direction, first)
     angle = torch.arange(8, dtype=direction.dtype) * (torch.pi / 4)
     around = angle.cos()[:, None] * first + angle.sin()[:, None] * second
-    beside = torch.cat([direction[None], normalize(direction + step * around, dim=1)])
-    beside = torch.cat([beside, light[3].expand(9, 1)], dim=1)
+    directions = torch.cat([direction[None], normalize(direction + step * around, dim=1)])
+    directions = torch.cat([directions, light[3].expand(9, 1)], dim=1)
     along = light.repeat(2, 1)
-    along[:, 3] = (light[3] + torch.tensor([-step, step])).clamp(0, _CLOSEST)
-    return torch.cat([beside, along])
+    along[:, 3] = (light[3] + torch.tensor([-step, step])).clamp(0, _MAX_INVERSE_DISTANCE)
+    return torch.cat([directions, along])

@@ -1,4 +1,4 @@
-"""Prediction of photographs from a surface, its materials and a light, and the errors."""
+"""Photographs predicted from a surface, its materials and a light, and the errors."""
 
 import torch
 from jaxtyping import Float
@@ -23,18 +23,18 @@ from pimper_torch.runtime.stage import Stage
 def predict(
     mesh: Mesh | LitSurface, camera: Cameras, light: ViewLights, materials: Materials | None = None
 ) -> Float[Tensor, "height width channel"]:
-    """Return the linear radiance that a camera sees, with cast shadows; NaN off the mesh.
+    """Return the linear radiance in a camera, with cast shadows; NaN off the mesh.
 
     Args:
-        mesh: With albedo; prepared where several pictures of it are wanted.
+        mesh: With albedo; pass a ``LitSurface`` to render several images of one mesh.
     """
     surface = mesh if isinstance(mesh, LitSurface) else LitSurface(mesh)
     pixels = surface.pixels(camera)
     width, height = (int(side) for side in camera.sizes_px[0])
     radiance = shaded(surface, pixels, light, materials)
-    picture = torch.full((height * width, radiance.shape[1]), torch.nan)
-    picture[pixels.pixel] = radiance
-    return picture.reshape(height, width, -1)
+    image = torch.full((height * width, radiance.shape[1]), torch.nan)
+    image[pixels.pixel] = radiance
+    return image.reshape(height, width, -1)
 
 
 def shaded(
@@ -51,14 +51,14 @@ def psnr(predicted: Radiance, radiance: Radiance) -> float:
     """Return the peak signal-to-noise ratio of sRGB values in [0, 1], in decibels.
 
     Args:
-        predicted: Linear, clipped to [0, 1] as a photograph is; ``radiance`` likewise.
+        predicted: Linear, clipped to [0, 1] like a photograph; ``radiance`` likewise.
     """
     error = srgb_from_linear(predicted).double() - srgb_from_linear(radiance).double()
     return float(-10 * error.square().mean().clamp_min(1e-12).log10())
 
 
 class Relight(Stage):
-    """Fit lights and materials to the photographs, and predict these, or others, with them."""
+    """Fit lights and materials to photographs, and predict these or others with them."""
 
     def forward(
         self,
@@ -67,11 +67,11 @@ class Relight(Stage):
         silhouettes: Silhouettes | None,
         held_out: SparseScene | None = None,
     ) -> Relighting:
-        """Fit and judge them.
+        """Fit lights and materials, and compute their errors.
 
         Args:
             mesh: In the scene's frame, with albedo.
-            held_out: Photographs to predict; the scene's own by default.
+            held_out: Photographs to predict; by default those of ``scene``.
         """
         surface = LitSurface(mesh)
         observed = observe_all(surface, scene, silhouettes)
@@ -80,11 +80,11 @@ class Relight(Stage):
         lights = matte
         if bool((materials.specular > 0).any() or (materials.metallic > 0).any()):
             lights = lights_of(surface, observed, materials, matte)
-        shown, fitted = scene, lights
+        predicted, fitted = scene, lights
         if held_out is not None:
-            shown, observed = held_out, observe_all(surface, held_out, None)
-            fitted, matte = (lights_of(surface, observed, one) for one in (materials, None))
-        names = shown.views.names
+            predicted, observed = held_out, observe_all(surface, held_out, None)
+            fitted, matte = (lights_of(surface, observed, kind) for kind in (materials, None))
+        names = predicted.views.names
         return Relighting(
             lights=lights,
             materials=materials,
@@ -100,10 +100,10 @@ def judge_textures(
     """Add the errors of the textured surface under the same lights."""
     surface = TexturedSurface(asset)
     observed = observe_all(surface, scene, silhouettes)
-    errors, few = relighting.errors, relighting.materials
-    materials = few.replace(cluster=few.cluster[asset.vertex])
-    found = view_errors(surface, observed, errors.names, errors.lights, materials)
-    return relighting.replace(textured=found)
+    errors, materials = relighting.errors, relighting.materials
+    copied = materials.replace(cluster=materials.cluster[asset.vertex])
+    textured = view_errors(surface, observed, errors.names, errors.lights, copied)
+    return relighting.replace(textured=textured)
 
 
 def view_errors(
@@ -113,9 +113,12 @@ def view_errors(
     lights: ViewLights,
     materials: Materials | None = None,
 ) -> ViewErrors:
-    """Compare photographs with what the surface shows under lights."""
-    found = [
-        psnr(shaded(surface, seen.pixels, lights.take([view]), materials), seen.radiance)
-        for view, seen in enumerate(observed)
+    """Compare photographs with renderings of the surface under lights."""
+    psnr_db = [
+        psnr(
+            shaded(surface, observation.pixels, lights.take([view]), materials),
+            observation.radiance,
+        )
+        for view, observation in enumerate(observed)
     ]
-    return ViewErrors(psnr_db=torch.tensor(found), lights=lights, names=names)
+    return ViewErrors(psnr_db=torch.tensor(psnr_db), lights=lights, names=names)

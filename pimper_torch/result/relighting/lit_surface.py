@@ -1,4 +1,4 @@
-r"""A surface with glTF materials: the pixels that show it, and its radiance under directed lights.
+r"""Surfaces with glTF materials: their pixels in a view, and radiance under directed lights.
 
 The radiance is that of three.js's ``MeshPhysicalMaterial``. With base colour :math:`b`, metallic
 :math:`m`, roughness :math:`r` and specular :math:`s`,
@@ -7,8 +7,8 @@ The radiance is that of three.js's ``MeshPhysicalMaterial``. With base colour :m
     F = f_0 + (f_{90} - f_0) (1 - v \cdot h)^5
 
 with :math:`f_0 = 0.04 s (1 - m) + b m` and :math:`f_{90} = \min(s, 1) (1 - m) + m`. A white matte
-surface that faces a light of strength 1 has radiance 1: three.js's light is :math:`\pi` times as
-strong, directed and ambient. A specular above 1 is ``KHR_materials_specular``'s
+surface that faces a light of strength 1 has radiance 1; three.js's lights, directed and ambient,
+are :math:`\pi` times as strong. A specular above 1 is ``KHR_materials_specular``'s
 ``specularColorFactor``, below 1 its ``specularFactor``.
 
 Source: Walter et al., EGSR 2007, for the distribution GGX; Heitz, JCGT 3(2), 2014, for Smith's
@@ -36,10 +36,10 @@ Material = Float[Tensor, "*batch pixel 3"]  # metallic, roughness and specular
 
 
 def facet_density(cosine: Broadcast, alpha: Broadcast) -> Scalars:
-    """Return GGX's density of facets per solid angle.
+    """Return GGX's density of microfacets per solid angle.
 
     Args:
-        cosine: Between a facet's normal and the surface's.
+        cosine: Between a microfacet's normal and the surface's.
         alpha: Width of the distribution; squared roughness.
     """
     spread = cosine**2 * (alpha**2 - 1) + 1
@@ -47,18 +47,18 @@ def facet_density(cosine: Broadcast, alpha: Broadcast) -> Scalars:
 
 
 def masking(to_light: Broadcast, to_eye: Broadcast, alpha: Broadcast) -> Scalars:
-    """Return Smith's fraction of facets that both light and eye see, over ``4 cos cos``.
+    """Return Smith's fraction of microfacets visible from light and eye, over ``4 cos cos``.
 
     Args:
-        to_light: Cosine between light and normal, more than 0; ``to_eye`` likewise.
+        to_light: Cosine between light and normal, above 0; ``to_eye`` likewise.
     """
     light_side = to_eye * (to_light**2 * (1 - alpha**2) + alpha**2).sqrt()
     eye_side = to_light * (to_eye**2 * (1 - alpha**2) + alpha**2).sqrt()
     return 0.5 / (light_side + eye_side)
 
 
-# Shadow rays start this far from the surface, as a fraction of its radius: beyond what
-# simplification moves it by, and short of what casts a shadow worth seeing.
+# Offset of shadow rays from the surface, as a fraction of its radius: larger than the error of
+# simplification, and smaller than features with a visible shadow.
 _LIFT = 0.004
 
 
@@ -69,10 +69,10 @@ class SurfacePixels(Record):
     Attributes:
         pixel: Index into the raster, row by row.
         points_world: Intersections of the rays through the pixels' centres.
-        normals_world: Unit, those of the mesh.
+        normals_world: Unit vertex normals, interpolated.
         to_eye: Unit, towards the camera.
-        vertex: The nearest vertex of the face that is met.
-        inner: False next to pixels that show something else, with which they are blended.
+        vertex: The nearest vertex of the intersected face.
+        inner: False next to pixels off the surface, with which they are blended.
     """
 
     pixel: Int[Tensor, " pixel"]
@@ -90,7 +90,7 @@ class Incidence(Record):
 
     Attributes:
         cosine: Between the normal and the light; 0 where the surface faces away or is shadowed.
-        irradiance: Of a light that has 1 at the surface's centre.
+        irradiance: Relative to that at the surface's centre.
     """
 
     to_light: Float[Tensor, "light pixel 3"]
@@ -99,7 +99,7 @@ class Incidence(Record):
 
 
 class LitSurface:
-    """A mesh prepared for rays and cast shadows; a constant to autograd, on the CPU."""
+    """A mesh prepared for rays and cast shadows; not differentiable, on the CPU."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh = mesh.detach().to("cpu", torch.float32)
@@ -111,23 +111,23 @@ class LitSurface:
         self.radius = float((high - low).norm()) / 2
 
     def pixels(self, camera: Cameras) -> SurfacePixels:
-        """Return what one camera shows."""
+        """Return the pixels of the surface in one camera."""
         camera = camera.detach().to("cpu", torch.float32)
         hits = cast_view(self._caster, camera, 0)
-        seen = hits.face >= 0
-        faces, met = self.mesh.faces, hits.take(seen)
-        points = met.interpolate(self.mesh.vertices_world, faces)
-        nearest = met.barycentric.argmax(dim=1, keepdim=True)
-        normals_world, base_color = self.appearance(met)
-        elsewhere = max_pool2d((~seen)[None].float(), 3, stride=1, padding=1)[0] > 0
+        visible = hits.face >= 0
+        faces, hits_on = self.mesh.faces, hits.take(visible)
+        points = hits_on.interpolate(self.mesh.vertices_world, faces)
+        nearest = hits_on.barycentric.argmax(dim=1, keepdim=True)
+        normals_world, base_color = self.appearance(hits_on)
+        off_surface = max_pool2d((~visible)[None].float(), 3, stride=1, padding=1)[0] > 0
         return SurfacePixels(
-            pixel=seen.reshape(-1).nonzero()[:, 0],
+            pixel=visible.reshape(-1).nonzero()[:, 0],
             points_world=points,
             normals_world=normals_world,
             to_eye=normalize(camera.centers_world[0] - points, dim=-1),
             base_color=base_color,
-            vertex=faces[met.face].gather(1, nearest)[:, 0],
-            inner=~elsewhere[seen],
+            vertex=faces[hits_on.face].gather(1, nearest)[:, 0],
+            inner=~off_surface[visible],
         )
 
     def appearance(self, met: Hits) -> tuple[Directions, Radiance]:
@@ -144,16 +144,16 @@ class LitSurface:
         *,
         shadows: bool = True,
     ) -> Incidence:
-        """Return the directions to lights at pixels, and the light that arrives.
+        """Return the directions from pixels to lights, and the irradiance.
 
         Args:
             directions: Unit, world, from the surface's centre.
-            closeness: The surface's radius over the light's distance; 0 for a light at infinity.
-            shadows: Whether the surface casts any; without, only back faces are dark.
+            inverse_distance: The surface's radius over the light's distance; 0 at infinity.
+            shadows: Whether the surface casts shadows; if not, only back faces are dark.
         """
         offset = (pixels.points_world - self.center_world) / self.radius
         toward = directions[:, None] - inverse_distance[:, None, None] * offset
-        # No point is nearer to a light.
+        # A minimum distance avoids a singularity at the light.
         distance = toward.norm(dim=-1).clamp_min(0.1)
         toward = toward / distance[..., None]
         cosine = (toward * pixels.normals_world).sum(dim=-1).clamp_min(0)
@@ -174,10 +174,10 @@ DIELECTRIC = 0.04
 def diffuse_color(
     pixels: SurfacePixels, material: Material | None = None
 ) -> Float[Tensor, "*batch pixel channel"]:
-    """Return the albedo of the matte part, which ambient light meets, too.
+    """Return the diffuse albedo, which ambient light meets, too.
 
     Args:
-        material: Metallic, roughness and specular; matte without.
+        material: Metallic, roughness and specular; ``None`` for matte.
     """
     return pixels.base_color if material is None else (1 - material[..., :1]) * pixels.base_color
 
@@ -188,7 +188,7 @@ def response(
     """Return the radiance under directed lights of strength 1.
 
     Args:
-        material: Metallic, roughness and specular; matte without.
+        material: Metallic, roughness and specular; ``None`` for matte.
     """
     if material is None:
         return light.irradiance[..., None] * pixels.base_color
@@ -201,15 +201,15 @@ def response(
     highlight = torch.pi * density * masking(light.cosine, to_eye, alpha) * light.irradiance
     grazing = (1 - (1 + aligned) / length).clamp(0, 1) ** 5
     dielectric = (1 - metallic) * specular
-    head_on = (DIELECTRIC * dielectric)[..., None] + metallic[..., None] * pixels.base_color
-    edge = ((1 - metallic) * specular.clamp_max(1) + metallic)[..., None]
-    mirrored = head_on + (edge - head_on) * grazing[..., None]
+    f0 = (DIELECTRIC * dielectric)[..., None] + metallic[..., None] * pixels.base_color
+    f90 = ((1 - metallic) * specular.clamp_max(1) + metallic)[..., None]
+    mirrored = f0 + (f90 - f0) * grazing[..., None]
     matte = light.irradiance[..., None] * diffuse_color(pixels, material)
     return matte + highlight[..., None] * mirrored
 
 
 class TexturedSurface(LitSurface):
-    """A mesh whose base colours and normals are those of textures, blended between texels."""
+    """A mesh with base colours and normals from textures, interpolated between texels."""
 
     def __init__(self, asset: Textured) -> None:
         super().__init__(asset.mesh.replace(normals_world=asset.normals))
@@ -230,5 +230,5 @@ def _sampled(
 ) -> Float[Tensor, "pixel 3"]:
     values = texture.movedim(-1, 0)[None].float() / 255
     grid = (2 * uv - 1)[None, None]
-    found = grid_sample(values, grid, padding_mode="border", align_corners=False)
-    return found[0, :, 0].mT
+    sampled = grid_sample(values, grid, padding_mode="border", align_corners=False)
+    return sampled[0, :, 0].mT
