@@ -59,7 +59,7 @@ def spoilt(normals):
         ),
         (
             lambda found: changed(found, normals_patch=spoilt),
-            r"normals_patch has .*some of them NaN",
+            r"normals_patch has .*some with NaN",
         ),
         (lambda found: changed(found, normals_patch=lambda n: 2 * n), "of length 2 to 2"),
         (
@@ -139,7 +139,7 @@ def test_a_number_of_every_patch_is_drawn_in_a_view(factorized, tmp_path):
     for record in (found.patches, seen, found):
         pt.plot_patch(record[3]).savefig(tmp_path / "b.png")
     assert [axes.get_title() for axes in pt.plot_patch(found[3]).axes][:2] == ["albedo", "normals"]
-    with pytest.raises(pt.InputError, match="one value a patch"):
+    with pytest.raises(pt.InputError, match="one value per patch"):
         pt.by_facet(found, "albedo")
     with pytest.raises(pt.InputError, match="needed: one for each of"):
         pt.plot_in_view(coarse, scene.cameras, 0, residuals[1:])
@@ -169,5 +169,5 @@ def test_residuals_and_the_light_of_a_sample_are_drawn_beside_photometry(factori
     assert pt.plot_patch(found[3], seen[3]).axes[-1].get_title() != "residual"
     with pytest.raises(pt.InputError, match="photometry of one patch, and views of the same"):
         pt.plot_patch(found[3], seen[4])
-    with pytest.raises(pt.InputError, match="no view has sample"):
+    with pytest.raises(pt.InputError, match="is not valid in any view"):
         pt.plot_patch(found[3], seen[3], (0, 0))

@@ -1,1 +1,1 @@
-"""Evaluation of the chain: scenes of known truth, data sets, metrics, baselines, tables."""
+"""Evaluation: scenes with ground truth, data sets, metrics, baselines, tables."""

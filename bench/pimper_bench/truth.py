@@ -12,18 +12,18 @@ from pimper_torch.records import Cameras, Mesh, Record, Views
 class Truth(Record):
     """Ground truth of an object; ``None`` where unknown.
 
-    Maps hold what the ray through each pixel's centre meets first, one a view.
+    Maps have one entry per view, for the first intersection of the ray through each pixel's centre.
 
     Attributes:
-        mesh: Surface of the object alone, as scanned or as rendered.
-        surroundings: What else stands in the scene, such as the table.
-        points_world: Scanned points, where no surface was made of them.
-        depth: Along the camera's z; infinite where the ray meets nothing, or unknown.
-        normals_world: Unit, outward; zero where the ray meets nothing.
-        albedo: Linear; zero where the ray meets nothing.
+        mesh: Surface of the object alone, scanned or rendered.
+        surroundings: Other surfaces of the scene, such as the table.
+        points_world: Scanned points, if they have no surface.
+        depth: Along the camera's z; infinite off all surfaces, or unknown.
+        normals_world: Unit, outward; zero off all surfaces.
+        albedo: Linear; zero off all surfaces.
         foreground: True on the object, false on its table and the background.
-        lit: True where the point light reaches the surface.
-        highlight: True where a highlight adds noticeably to the matte part.
+        lit: True where the point light illuminates the surface.
+        highlight: True where a highlight adds noticeably to the diffuse reflection.
         lights_world: First-order light ``l`` at the object, radiance = albedo * l . (1, n),
             up to one scale for all views.
     """
@@ -42,14 +42,14 @@ class Truth(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Capture(Record):
-    """Photographs of a data set with all that came along.
+    """Photographs of a data set with cameras and ground truth.
 
     Views of one index in ``position`` were taken by the same camera from the same position;
     views of one index in ``light`` under the same light.
 
     Attributes:
         views: The photographs, linear radiance. Names are unique.
-        cameras: That took them, world frame and unit of the data set; ``None`` if unknown.
+        cameras: Their cameras, world frame and unit of the data set; ``None`` if unknown.
     """
 
     views: Views
@@ -61,14 +61,14 @@ class Capture(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DtuProtocol(Record):
-    """Where a scan of the DTU 2014 set is evaluated, in the data set's frame and millimetres.
+    """Evaluated region of a scan of the DTU 2014 set, in the data set's frame and millimetres.
 
     Attributes:
-        obs_mask: True in voxels that the structured light scanner could see. The centre of
+        obs_mask: True in voxels visible to the structured light scanner. The centre of
             voxel ``(i, j, k)`` is ``bounding_box[0] + resolution * (i, j, k)``.
         bounding_box: Lower corner, upper corner.
         resolution: Distance of neighbouring voxels.
-        plane: Of the table; points with ``plane . (x, y, z, 1) > 0`` stand on it.
+        plane: Of the table; points with ``plane . (x, y, z, 1) > 0`` are above it.
     """
 
     obs_mask: Bool[Tensor, "x y z"]

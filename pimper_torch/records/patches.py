@@ -121,8 +121,7 @@ class OverPatches(Record):
 
     @property
     def _templates(self) -> "PatchSet":
-        templates: PatchSet = self.patches  # type: ignore[attr-defined]
-        return templates
+        return self.patches  # type: ignore[attr-defined, no-any-return]
 
     def of_facets(self: AnyPatches, facets: Bool[Tensor, " facet"]) -> AnyPatches:
         """Return the patches of some facets; patches keep their facet numbers."""

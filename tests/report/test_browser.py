@@ -115,6 +115,7 @@ def shown(tmp_path_factory):
     write_page(folder / "report.html", **parts, lights_world=lights_world)
     quiet = {**SUMMARY, "left_out": [], "failures": [], "warnings": [], "relighting": None}
     parts["summary"] = quiet | {"simplified": None, "scale": {"unit": "mm"}}
+    parts["summary"] |= {"diagnosis": "The cameras only rotated."}
     write_page(folder / "plain.html", **parts)
     return folder / "report.html", mesh, scene, lights, materials
 
@@ -343,7 +344,7 @@ def test_photograph_prediction_and_difference_are_in_one_row_with_a_word_on_deci
     assert boxes[0]["x"] < boxes[1]["x"] < boxes[2]["x"]
     assert boxes[0]["y"] + boxes[0]["height"] <= 800  # in sight with the surface
     words = opened.locator("#worth").inner_text()
-    assert words.startswith("31.0 dB (PSNR): the prediction is off by 7.2 of 255 levels")
+    assert words.startswith("31.0 dB (PSNR): the prediction is off by 7.2 of 255 (root")
     assert words.endswith("number 1 of 6.")
 
 
@@ -428,7 +429,7 @@ def test_two_clicks_measure_the_surface(opened, shown):
     behind(opened, 0)
     choose(opened, "measure")
     told = opened.locator("#measured")
-    assert told.inner_text() == "Click the first place on the surface."
+    assert told.inner_text() == "Click the first point on the surface."
     stage = opened.locator("#canvas").bounding_box()
     side = min(stage["width"], stage["height"])
 
@@ -445,9 +446,9 @@ def test_two_clicks_measure_the_surface(opened, shown):
         return eye + (along - (along**2 - eye @ eye + 1).sqrt()) * ray
 
     click(2.0, 2.0)  # beside the ball
-    assert told.inner_text() == "Click the first place on the surface."
+    assert told.inner_text() == "Click the first point on the surface."
     first = click(30.0, 40.0)
-    assert told.inner_text() == "Click the second place on the surface."
+    assert told.inner_text() == "Click the second point on the surface."
     second = click(52.0, 31.0)
     wanted = 100 * float((first - second).norm()) / (2 * 3**0.5)
     value, _, unit = told.inner_text().partition(" ")
@@ -455,7 +456,7 @@ def test_two_clicks_measure_the_surface(opened, shown):
     assert unit == "% of the object's size"
     assert len(pressed(opened)) == 1  # no camera was clicked
     click(30.0, 40.0)  # begins anew
-    assert told.inner_text() == "Click the second place on the surface."
+    assert told.inner_text() == "Click the second point on the surface."
     choose(opened, "measure")
     assert not told.is_visible()
 
@@ -501,7 +502,7 @@ def test_head_and_tables_say_one_thing(opened):
         "6 of 7 photographs, 2,999 facets, 83,045 vertices in mesh.ply (560,140 before "
         "simplification), 150 s"
     )
-    assert opened.get_by_text("150 s up to this page, 900 MB at most, in warp").is_visible()
+    assert opened.get_by_text("150 s up to this page, at most 900 MB, in warp").is_visible()
     assert cells(opened, "Stages")[1:] == [
         ["warp", "8.0", "", "500", "samples 12,345"],
         ["fuse", "4.0", "", "900", ""],
@@ -532,7 +533,10 @@ def test_a_plain_result_has_no_section_without_a_message(opened, shown):
     opened.asked[:] = opened.asked[:1]
     titles = opened.locator("#sections h2, #sections summary").all_inner_texts()
     assert titles == ["Warnings", "Stages", "Settings"]
-    assert "560,140 vertices, 150 s" in opened.locator("#headline").inner_text()
+    headline = opened.locator("#headline").inner_text()
+    assert headline.startswith("6 of 7 photographs (cameras unreliable), ")
+    assert "560,140 vertices, 150 s" in headline
+    assert opened.locator("li").inner_text() == "The cameras only rotated."
     assert not opened.get_by_label("environment").is_visible()
     choose(opened, "expected error")
     assert opened.locator("#high").inner_text().endswith(" mm or more")
@@ -585,7 +589,7 @@ def test_a_browser_without_webgl_still_shows_photographs_and_tables(browser, sho
     page = plain.new_page()
     page.goto(shown[0].as_uri())
     page.locator("#trouble").wait_for(state="visible")
-    assert "cannot be drawn here" in page.locator("#trouble").inner_text()
+    assert "cannot be drawn" in page.locator("#trouble").inner_text()
     page.locator("#thumbnails button").first.click()
     page.locator("#prediction img").wait_for(state="visible")
     assert page.get_by_role("heading", name="Stages").is_visible()

@@ -318,7 +318,10 @@ def test_an_impossible_place_is_refused(place, needed):
 
 
 def test_a_page_that_others_reach_is_warned_of():
-    with pytest.warns(PimperWarning, match="whoever reaches this machine"), Viewer("0.0.0.0", 0):
+    with (
+        pytest.warns(PimperWarning, match="everyone who can connect to this machine"),
+        Viewer("0.0.0.0", 0),
+    ):
         pass
 
 

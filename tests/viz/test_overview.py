@@ -11,8 +11,8 @@ from pimper_torch.ground.geometry.projection import project
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes, Views
 from pimper_torch.result.viz.overview import (
-    DOUBTED,
     RELIABLE,
+    UNRELIABLE,
     _selected,
     border,
     draw_overview,
@@ -130,7 +130,7 @@ def test_gradients_do_not_hinder_drawing(reconstruction, tmp_path):
 def test_the_headline_counts(reconstruction):
     assert headline(reconstruction) == "3 of 4 photographs, 2 facets, 225 vertices, 2 s"
     doubted = reconstruction.replace(scene=reconstruction.scene.replace(diagnosis="All is flat."))
-    assert headline(doubted).startswith("3 of 4 photographs (cameras doubtful), 2 facets")
+    assert headline(doubted).startswith("3 of 4 photographs (cameras unreliable), 2 facets")
 
 
 def test_the_photograph_and_the_surface_from_three_sides_stand_side_by_side(
@@ -180,7 +180,7 @@ def test_every_view_has_its_tile_and_its_silhouette():
     sheet = thumbnails(views, silhouettes, range(3), width_px=60, across=2)
     assert sheet.shape == (40, 60, 3)  # two rows of two tiles of 30 x 20
     assert_close(sheet[20:, 30:], torch.ones(20, 30, 3))
-    for view, colour in enumerate((RELIABLE, RELIABLE, DOUBTED)):
+    for view, colour in enumerate((RELIABLE, RELIABLE, UNRELIABLE)):
         top, left = 20 * (view // 2), 30 * (view % 2)
         tile = sheet[top : top + 20, left : left + 30]
         drawn = (tile - torch.tensor(colour)).abs().amax(dim=-1) < 1e-6

@@ -1,4 +1,4 @@
-"""Baselines, run on the same scene as the method."""
+"""Baselines that reconstruct the same scenes."""
 
 from pimper_bench.baselines.openmvs import OpenMvs
 from pimper_bench.baselines.smoothed import Smoothed

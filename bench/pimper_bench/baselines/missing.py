@@ -1,7 +1,7 @@
-"""The error of a baseline whose program is not there."""
+"""The error of a baseline whose program is missing."""
 
 from pimper_torch.runtime.errors import ReconstructionError
 
 
 class MissingProgramError(ReconstructionError):
-    """A program that somebody else wrote is not installed here."""
+    """An external program is not installed."""

@@ -1,14 +1,14 @@
-r"""Baseline: the coarse mesh itself, smoothed; no photometry at all.
+r"""Baseline: the smoothed coarse mesh, without photometry.
 
 The surface of least bending through the coarse mesh's vertices: with the flat facets as the
 domain, the positions S minimise
 
 .. math:: \int |\Delta S|^2 + e \oint |S''|^2 + \frac{w}{e^2} \sum_v |S(v) - V_v|^2
 
-over the mesh's subdivided mesh, with e the median edge. The first term is that of a thin plate and
-only knows lengths within the facets, so that creases between them cost nothing to undo; the
-second is the bending of the rim, without which harmonic functions would be free; the last
-holds the vertices. In linear finite elements: cotangents and lumped masses.
+over the subdivided mesh, with e the median edge. The first term is that of a thin plate; it
+depends only on lengths within the facets, so it does not preserve creases between them. The
+second is the bending of the rim, without which harmonic functions would be free. The last
+keeps the vertices near their positions. Linear finite elements: cotangents and lumped masses.
 
 Source: Botsch & Sorkine, On linear variational surface deformation methods, TVCG 14(1), 2008,
 for the discrete plate; the rim's term is ours.
@@ -34,10 +34,10 @@ from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.stage import Stage
 
 # Vertices of the smooth mesh if its facets are of one size, about twice as many with those of a
-# sparse cloud: more would show nothing more.
+# sparse cloud: more vertices would not show more detail.
 _NUM_VERTICES = 20_000
 
-# ``w``: on a sphere, a wavy plane and rendered potatoes 1000 came nearer to the truth than 100, and
+# ``w``: on a sphere, a wavy plane and rendered potatoes, 1000 was nearer to the truth than 100, and
 # 10000 hardly nearer than 1000.
 _FIDELITY = 1000.0
 
@@ -46,20 +46,20 @@ Entries = tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " en
 
 
 class Smoothed(Stage):
-    """Smooth the coarse mesh as a thin plate fixed at its vertices.
+    """Smooth the coarse mesh as a thin plate that is held near its vertices.
 
-    Any mesh will do, closed ones and several pieces too. Photographs are not looked at;
-    albedo and lights stay unknown. Not differentiable.
+    Any mesh works, also closed ones and several components. Photographs are not used;
+    albedo and lights are unknown. Not differentiable.
     """
 
     @torch.no_grad()
     def forward(self, scene: SparseScene, coarse: CoarseMesh) -> Estimate:
-        """Smooth the mesh; its vertices carry its own normals."""
+        """Smooth the mesh; vertex normals are those of the smooth mesh."""
         mesh = coarse.mesh
         if len(mesh.faces) == 0:
             raise ReconstructionError(
-                "the coarse mesh has no facets; at least one is needed. Relax the filters of "
-                "`triangulate`, or bring a mesh of your own."
+                "the coarse mesh has no facets; needed: at least one. Relax the filters of "
+                "`triangulate`, or provide a mesh."
             )
         area = face_normals(mesh.vertices_world, mesh.faces).norm(dim=-1).sum() / 2
         # A triangular subdivided mesh with edges s has a vertex on every sqrt(3)/2 s^2.
@@ -79,19 +79,19 @@ class Smoothed(Stage):
 
 
 def thin_plate(subdivision: Subdivision, mesh: Mesh) -> Float[Tensor, "vertex 3"]:
-    """Return the positions of the subdivided mesh's vertices on the surface of least bending."""
+    """Return the vertex positions of the subdivided mesh on the surface of least bending."""
     points = subdivision.points.double()
     corners = mesh.vertices_world.double()[mesh.faces]
     edge = side_lengths(corners).median()
     rim = boundary_vertices(subdivision.faces, len(points))
     flat = elements(points, subdivision.faces)
-    one = torch.ones_like(flat.area)
-    # A needle's area is at least this fraction of its longest edge squared.
-    rows, cols, values = cotangent_laplacian(flat, one, 1e-3)
-    mass = lumped_mass(flat, one)
+    ones = torch.ones_like(flat.area)
+    # A sliver's area is set to at least this fraction of its longest edge squared.
+    rows, cols, values = cotangent_laplacian(flat, ones, 1e-3)
+    mass = lumped_mass(flat, ones)
     keep = torch.where(rim, 0, 1 / mass.sqrt())
     count = len(points)
-    parts = [
+    grams = [
         _gram((rows, cols, values * keep[rows]), count, count),
         _gram(_rim_differences(subdivision, edge), count, count),
     ]
@@ -105,10 +105,10 @@ def thin_plate(subdivision: Subdivision, mesh: Mesh) -> Float[Tensor, "vertex 3"
     )
     index = torch.arange(len(points), device=points.device)
     factor = SparseCholesky(
-        torch.cat([*(rows for rows, _, _ in parts), index]),
-        torch.cat([*(cols for _, cols, _ in parts), index]),
-        # A thousandth of a millionth of what holds the points keeps loose rims definite.
-        torch.cat([*(values for _, _, values in parts), diagonal + 1e-9 * regularization.mean()]),
+        torch.cat([*(rows for rows, _, _ in grams), index]),
+        torch.cat([*(cols for _, cols, _ in grams), index]),
+        # 1e-9 of the weight of the vertices keeps unconstrained rims definite.
+        torch.cat([*(values for _, _, values in grams), diagonal + 1e-9 * regularization.mean()]),
         size=len(points),
         what="the smoothing of the coarse mesh",
     )
@@ -118,8 +118,8 @@ def thin_plate(subdivision: Subdivision, mesh: Mesh) -> Float[Tensor, "vertex 3"
 def _gram(
     entries: Entries, num_rows: int, num_columns: int
 ) -> tuple[Int[Tensor, " product"], Int[Tensor, " product"], Float[Tensor, " product"]]:
-    """Return ``B^T B`` of a sparse matrix; duplicate entries add up."""
-    rows, cols, values = (part.cpu().numpy() for part in entries)
+    """Return ``B^T B`` of a sparse matrix; duplicate entries are added."""
+    rows, cols, values = (entry.cpu().numpy() for entry in entries)
     matrix = coo_array((values, (rows, cols)), shape=(num_rows, num_columns)).tocsr()
     gram = (matrix.T @ matrix).tocoo()
     like = entries[0]
@@ -135,7 +135,7 @@ def _rim_differences(subdivision: Subdivision, edge: Float[Tensor, ""]) -> Entri
     _, index = face_edges(subdivision.faces)
     ends = half_edges(subdivision.faces)[face_counts(index)[index.flatten()] == 1]
     count = len(subdivision.points)
-    # Every vertex of the rim with one edge in and one out has a second difference.
+    # Every vertex of the rim with one incoming and one outgoing edge has a second difference.
     following = torch.full((count,), -1, device=ends.device).index_put((ends[:, 0],), ends[:, 1])
     preceding = torch.full((count,), -1, device=ends.device).index_put((ends[:, 1],), ends[:, 0])
     degree = torch.bincount(ends.flatten(), minlength=count)

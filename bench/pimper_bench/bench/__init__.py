@@ -1,1 +1,1 @@
-"""The table: scenes, presets and baselines, measured in the same way."""
+"""The table: scenes, presets and baselines under one evaluation."""

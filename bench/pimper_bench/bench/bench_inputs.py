@@ -32,25 +32,24 @@ from pimper_torch.runtime.store import opened
 
 SCENES = ("mug", "jar", "balls", "potatoes")
 METHODS = {"quick": ("default", "smoothed"), "full": ("default", "paper", "smoothed", "openmvs")}
-"""Methods that each scale runs by default."""
+"""Default methods of each scale."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BenchConfig:
-    """Which methods run on which scenes, and how large the scenes are.
+    """Methods and scenes of the bench, and the size of the scenes.
 
     Attributes:
-        scale: quick: 16 photographs of 640x480 a scene; full: 30 of 1600x1200.
+        scale: quick: 16 photographs of 640x480 per scene; full: 30 of 1600x1200.
         scenes: Names of rendered scenes, or folders that `pimper render` wrote.
         methods: Presets, YAML files of settings, and baselines. By default those of the scale:
             quick runs default and smoothed; full also paper and openmvs.
-        masks: Give the methods the true masks of the object; without, they see the table too.
-        cameras: found by structure from motion, once a scene and the same for all methods; by
-            its features alone (``reconstruct.track_iterations: 0``); or the true ones with a true
-            cloud.
+        masks: Give the true masks of the object to the methods; otherwise they use the table, too.
+        cameras: found by structure from motion, once per scene for all methods; by its features
+            only (``reconstruct.track_iterations: 0``); or the true ones with a true cloud.
         seed: Of scenes and samples.
-        samples: On each surface, for distances between surfaces.
-        processes: That render at the same time.
+        samples: Number on each surface, for distances between surfaces.
+        processes: Number of concurrent renderings.
     """
 
     scale: Literal["quick", "full"] = "quick"
@@ -63,17 +62,17 @@ class BenchConfig:
     processes: Annotated[int, Range(least=1, most=1024)] = 2
 
     def __post_init__(self) -> None:
-        """Refuse a table without rows."""
+        """Refuse an empty table, duplicates and values out of range."""
         require_ranges(self)
-        require(len(self.scenes) > 0, "scenes", self.scenes, "one scene or more")
-        require(len(self.chosen_methods) > 0, "methods", self.methods, "one method or more")
+        require(len(self.scenes) > 0, "scenes", self.scenes, "at least one scene")
+        require(len(self.chosen_methods) > 0, "methods", self.methods, "at least one method")
         for name, given in (("scenes", self.scenes), ("methods", self.chosen_methods)):
-            labels = {Path(one).stem for one in given}
-            require(len(labels) == len(given), name, given, "each name only once, of files too")
+            labels = {Path(value).stem for value in given}
+            require(len(labels) == len(given), name, given, "different names, also of files")
 
     @property
     def chosen_methods(self) -> tuple[str, ...]:
-        """The methods given, or those of the scale."""
+        """The given methods, or those of the scale."""
         return METHODS[self.scale] if self.methods is None else self.methods
 
     @property
@@ -91,13 +90,13 @@ class BenchConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Inputs(Record):
-    """A scene of the table, ready for the methods.
+    """Inputs of the methods for a scene.
 
     Attributes:
-        scene: Cameras and cloud, found or true, and the photographs.
-        coarse: Facets for the baselines that start from some; of the default preset.
+        scene: Photographs, and cameras and cloud, estimated or true.
+        coarse: Facets for the baselines that need them; those of ``triangulate``.
         capture: The truth, without photographs and maps.
-        maps: The truth in the methods' reference view alone; those of all views fill the memory.
+        maps: The truth in the methods' reference view; maps of all views would fill the memory.
         sfm_seconds: Wall clock of structure from motion; 0 with true cameras.
     """
 
@@ -118,17 +117,17 @@ def scene_folder(name: str, config: BenchConfig, workspace: Path) -> Path:
 
 
 def prepare(folder: Path, config: BenchConfig, cache: Path | str | None = None) -> Inputs:
-    """Read a rendered scene and find its cameras, from the files as a user would.
+    """Read a rendered scene from its files, as a user would, and estimate its cameras.
 
     Args:
-        cache: Folder of models that were found before, with the seconds that they took.
+        cache: Folder of models estimated before, with the seconds that they took.
     """
     views = load_views(folder / "photos", masks=folder / "masks" if config.masks else None)
     if config.cameras == "true":
         scene, seconds = Reconstruct()(views, folder / "truth" / "sparse"), 0.0
     else:
-        refined = ReconstructConfig()
-        settings = replace(refined, track_iterations=0) if config.cameras == "features" else refined
+        default = ReconstructConfig()
+        settings = replace(default, track_iterations=0) if config.cameras == "features" else default
         model, seconds = find_model(views, settings, opened(cache))
         began = time.perf_counter()
         scene = placed_scene(views, model)
@@ -154,9 +153,9 @@ class MethodRun(Record):
 
     Attributes:
         seconds: Wall clock without structure from motion.
-        figures: Of its stages, such as ``samples``: of all templates times views, missing ones
-            included.
-        external: Whether another program did the work, in memory that is not this process's.
+        figures: Of its stages, such as ``samples``, the samples of all templates times views,
+            including missing ones.
+        external: Whether another program did the work, with memory outside this process.
     """
 
     estimate: Estimate
@@ -171,7 +170,7 @@ _BASELINES: dict[str, Callable[[], nn.Module]] = {"smoothed": Smoothed, "openmvs
 
 
 def method_named(name: str) -> Method:
-    """Find a baseline by name, or a preset, or a YAML file of settings."""
+    """Return a baseline by name, or a preset, or a YAML file of settings."""
     if name in _BASELINES:
         return partial(_run_baseline, _BASELINES[name]())
     try:

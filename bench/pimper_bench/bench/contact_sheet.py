@@ -1,8 +1,8 @@
-"""Errors on the surface, and the contact sheet of the bench.
+"""Error maps of surfaces, and the contact sheet of the bench.
 
-An error map has one number a pixel, per cent of the diagonal of the true bounding box: finite
-where it was measured, infinite where the truth shows something that the surface misses, NaN where
-there is nothing to compare.
+An error map has one value per pixel, per cent of the diagonal of the true bounding box: finite
+where measured, infinite where the surface misses a pixel of the truth, NaN where there is nothing
+to compare.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ from pimper_torch.result.viz.tiles import Picture, Tile, array, encoded, sheet
 
 _COLORS = "viridis"  # perceptually uniform, and it has no red
 MISSED = (0.88, 0.20, 0.16)
-# Errors from here on have the last colour: twice what the facets alone are off by, so that
-# methods differ.
+# Upper end of the colour scale: twice the typical error of the facets alone, so that methods
+# can be distinguished.
 CLIP_PERCENT = 1.0
 LABEL = f"distance to the truth, % of the diagonal, 0 to {CLIP_PERCENT:g} (clipped there)"
 _PANEL_PX = 400
@@ -36,12 +36,12 @@ _BAR_PX = (16, 400)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MethodPanels:
-    """Result of one method on a scene.
+    """Images of one method on a scene.
 
     Attributes:
-        surface: Picture of it, sRGB, rows first; ``None`` if it gave none.
-        error: Picture of its error map; ``None`` if there is none.
-        note: Stands where pictures are missing.
+        surface: Its normals, sRGB, rows first; ``None`` without a surface.
+        error: Its error map; ``None`` without one.
+        note: Text instead of missing images.
     """
 
     method: str
@@ -52,10 +52,10 @@ class MethodPanels:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneRow:
-    """A scene on the sheet: the truth, then one column a method.
+    """A scene on the sheet: the truth, then one column per method.
 
     Attributes:
-        photograph: sRGB, rows first, as large as the pictures below.
+        photograph: sRGB, rows first, of the size of the other images.
     """
 
     scene: str
@@ -69,7 +69,7 @@ def method_panels(mesh: Mesh, met: Meeting | None, inputs: Inputs, method: str) 
 
     Args:
         mesh: In the frame of the truth.
-        met: Of the rays of the reference view; ``None`` if none meets it.
+        met: Intersections of the reference view's rays; ``None`` if no ray meets the mesh.
     """
     truth = inputs.maps
     if met is None or truth.cameras is None:
@@ -84,17 +84,17 @@ def method_panels(mesh: Mesh, met: Meeting | None, inputs: Inputs, method: str) 
 
 
 def scene_row(scene: str, inputs: Inputs, methods: tuple[MethodPanels, ...]) -> SceneRow:
-    """Return a scene's row: photograph, truth, and the panels of all methods."""
+    """Return the row of a scene: photograph, truth, and the images of all methods."""
     maps = inputs.maps
     assert maps.cameras is not None
     assert maps.truth.normals_world is not None
     crop = _crop(maps)
-    taken = inputs.scene.views.images[inputs.coarse.reference]
+    image = inputs.scene.views.images[inputs.coarse.reference]
     normals_world = maps.truth.normals_world[0]
     normals_cam = rotate(maps.cameras.cam_from_world[0].to(normals_world), normals_world)
     return SceneRow(
         scene=scene,
-        photograph=encoded(taken.movedim(0, -1))[crop],
+        photograph=encoded(image.movedim(0, -1))[crop],
         truth=_on_white(normals_cam)[crop],
         methods=methods,
     )
@@ -106,7 +106,7 @@ def _crop(maps: Capture) -> tuple[slice, slice]:
 
 
 def error_along_rays(met: Meeting, capture: Capture) -> Float[Tensor, "height width"]:
-    """Return the distance of a surface from the truth along the rays of a view, as an error map."""
+    """Return the error map of a surface along the rays of a view."""
     assert capture.truth.mesh is not None
     error = torch.full(met.valid.shape, torch.nan, dtype=torch.float64)
     error[met.valid] = torch.inf
@@ -121,10 +121,10 @@ def error_picture(
     """Colour an error map.
 
     Args:
-        shading: The surface, shaded; tints the colours a little so that height field is seen.
+        shading: Shading of the surface; modulates the colours slightly so that relief is visible.
 
     Returns:
-        sRGB. Missed pixels are red, whatever the shading; white where there is nothing.
+        sRGB. Missed pixels are red, regardless of the shading; white where nothing is compared.
     """
     from matplotlib import colormaps
 
@@ -133,59 +133,59 @@ def error_picture(
     colors = colormaps[_COLORS](fractions.numpy())[..., :3]
     if shading is not None:
         tone = shading.detach().cpu().double().mean(dim=-1, keepdim=True).numpy()
-        colors = colors * (0.65 + 0.35 * tone)  # darker would hide the colour
+        colors = colors * (0.65 + 0.35 * tone)  # darker values would hide the colour
     colors[values.isnan().numpy()] = 1
     colors[values.isinf().numpy()] = MISSED
     return np.asarray(colors, dtype=np.float32)
 
 
 def crop_to(where: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
-    """Return the rows and columns that hold all true pixels, with a little room.
+    """Return the rows and columns that contain all true pixels, with a margin.
 
-    Everything where none is true.
+    The complete image if no pixel is true.
     """
     if not bool(where.any()):
         return slice(None), slice(None)
     spans = []
     for axis, size in ((1, where.shape[0]), (0, where.shape[1])):
-        there = torch.nonzero(where.any(dim=axis))[:, 0]
-        low, high = int(there[0]), int(there[-1]) + 1
-        room = round(0.04 * (high - low)) + 1
-        spans.append(slice(max(0, low - room), min(size, high + room)))
+        indices = torch.nonzero(where.any(dim=axis))[:, 0]
+        low, high = int(indices[0]), int(indices[-1]) + 1
+        margin = round(0.04 * (high - low)) + 1
+        spans.append(slice(max(0, low - margin), min(size, high + margin)))
     return spans[0], spans[1]
 
 
 def draw_sheet(rows: Sequence[SceneRow], path: Path | str) -> None:
     """Draw scenes by methods as PNG.
 
-    Every scene has two rows of pictures: the photograph and each method's surface above, the
-    true normals and each method's errors below. A method has one column in all scenes.
+    Every scene has two rows of images: the photograph and each method's surface above, the
+    true normals and each method's errors below. A method has the same column in all scenes.
 
     Args:
-        rows: At least one; a method that is missing in one leaves its place empty there.
+        rows: At least one; a method that is missing in a scene has empty tiles there.
     """
     names = tuple(dict.fromkeys(panels.method for row in rows for panels in row.methods))
-    shown: list[list[Tile]] = []
+    tiles: list[list[Tile]] = []
     for row in rows:
         of_method = {panels.method: panels for panels in row.methods}
         methods = [of_method.get(name, MethodPanels(method=name)) for name in names]
         above = [Tile(title=f"{row.scene}, photograph", picture=row.photograph)]
         below = [Tile(title="true normals", picture=row.truth)]
-        for one in methods:
-            above.append(Tile(title=one.method, picture=one.surface, note=one.note))
-            note = "" if one.surface is None else one.note  # once is enough
-            below.append(Tile(picture=one.error, note=note))
-        shown += [above, below]
-    sheet([*shown, [_bar()]], _PANEL_PX).save(path)
+        for panels in methods:
+            above.append(Tile(title=panels.method, picture=panels.surface, note=panels.note))
+            note = "" if panels.surface is None else panels.note  # not twice
+            below.append(Tile(picture=panels.error, note=note))
+        tiles += [above, below]
+    sheet([*tiles, [_bar()]], _PANEL_PX).save(path)
 
 
 def _on_white(normals_cam: Float[Tensor, "height width 3"]) -> Picture:
-    there = (normals_cam != 0).any(dim=-1, keepdim=True)
-    return array(torch.where(there, normal_colors(normals_cam), 1.0))
+    present = (normals_cam != 0).any(dim=-1, keepdim=True)
+    return array(torch.where(present, normal_colors(normals_cam), 1.0))
 
 
 def _bar() -> Tile:
-    """Draw the colours of errors in a row, the last of them that of what is missed."""
+    """Draw the colour bar of errors, which ends with the colour of missed pixels."""
     height, width = _BAR_PX
     values = torch.linspace(0, CLIP_PERCENT, width).expand(height, width).clone()
     values[:, -width // 10 :] = torch.inf

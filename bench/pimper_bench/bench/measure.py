@@ -1,4 +1,4 @@
-"""The machine that figures were measured on, and peak memory."""
+"""The machine of a measurement, and peak memory."""
 
 import platform
 import re
@@ -17,11 +17,11 @@ from pimper_torch.runtime.cores import usable_cores
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Machine(Record):
-    """A machine and what runs on it.
+    """A machine, its system and package versions.
 
     Attributes:
-        gpu: Name of the first, or nothing.
-        versions: Of the packages that the figures depend on, as ``name version``.
+        gpu: Name of the first GPU, or empty.
+        versions: Of the packages that affect figures, as ``name version``.
     """
 
     cpu: str
@@ -34,7 +34,7 @@ class Machine(Record):
 
     @property
     def summary(self) -> str:
-        """The machine in a line."""
+        """The machine in one line."""
         cores = f"{self.cores} core{'s' if self.cores != 1 else ''}"
         hardware = [self.cpu, cores, f"{self.memory_gb:.0f} GB", *([self.gpu] if self.gpu else [])]
         return (
@@ -47,7 +47,7 @@ _PACKAGES = ("pimper_torch", "torch", "numpy", "scipy", "pycolmap", "embreex")
 
 
 def this_machine() -> Machine:
-    """Describe the machine that this runs on."""
+    """Return a description of this machine."""
     return Machine(
         cpu=_cpu(),
         cores=usable_cores(),
@@ -76,11 +76,11 @@ _RESET_PEAK = "5"  # see proc(5), clear_refs
 def peak_memory() -> Iterator[Callable[[], float | None]]:
     """Measure the peak of resident memory within the ``with`` block.
 
-    The operating system's own peak is of the whole life of a process. Memory in use before
-    counts, that of external programs does not.
+    The operating system's peak is over the lifetime of a process. Memory in use at the start
+    counts, memory of external programs does not.
 
     Yields:
-        A function that returns the peak since then in MB; ``None`` on systems other than Linux.
+        A function that returns the peak since the start in MB; ``None`` on systems except Linux.
     """
     try:
         (_SELF / "clear_refs").write_text(_RESET_PEAK, encoding="ascii")
@@ -92,5 +92,5 @@ def peak_memory() -> Iterator[Callable[[], float | None]]:
 
 def _peak_mb() -> float | None:
     status = (_SELF / "status").read_text(encoding="ascii", errors="replace")
-    found = re.search(r"^VmHWM:\s*(\d+) kB", status, flags=re.MULTILINE)
-    return int(found[1]) / 2**10 if found else None
+    match = re.search(r"^VmHWM:\s*(\d+) kB", status, flags=re.MULTILINE)
+    return int(match[1]) / 2**10 if match else None

@@ -1,4 +1,4 @@
-"""Scenes by methods, measured in the same way."""
+"""Runs of all methods on all scenes, with one evaluation."""
 
 import tempfile
 import time
@@ -50,11 +50,11 @@ BENCH_NAMES = ("table.md", "table.json", "sheet.png", "meshes")
 
 
 class _Cell(NamedTuple):
-    """What a method gave on a scene.
+    """The result of a method on a scene.
 
     Attributes:
         mesh: Its surface in the frame of the truth; ``None`` if it failed.
-        met: Intersections of the rays of the reference view; ``None`` without faces.
+        met: Intersections of the reference view's rays; ``None`` without faces.
     """
 
     row: BenchRow
@@ -70,27 +70,27 @@ def run_bench(
     overwrite: bool = False,
     cache: Path | str | None = None,
 ) -> Table:
-    """Run methods on scenes, and write the table, its figures and all surfaces to a folder.
+    """Run methods on scenes, and write the table, its images and all surfaces to a folder.
 
     ==================  ===========================================================
     file                content
     ==================  ===========================================================
-    `table.md`          the table, beside the published figures
+    `table.md`          the table, with the published figures
     `table.json`        the same with all digits, and why figures are missing
     `sheet.png`         photograph, true normals, each method's normals and errors
     `meshes/`           every surface, in the frame of the truth, as PLY
     ==================  ===========================================================
 
-    A method that fails, or is not installed, has a row that says so. Interrupted after the
-    first scene, the scenes that are complete are written.
+    A method that fails, or is not installed, has a row with the reason. If interrupted after the
+    first scene, the completed scenes are written.
 
     Args:
-        cache: Folder where the models of structure from motion are kept from run to run.
+        cache: Folder in which models of structure from motion are cached between runs.
     """
     methods = {Path(name).stem: method_named(name) for name in config.chosen_methods}
     folder = Path(folder)
     rows: list[BenchRow] = []
-    sheet: list[SceneRow] = []
+    sheet_rows: list[SceneRow] = []
     with (
         written_whole(folder, "table", overwrite=overwrite) as staging,
         tempfile.TemporaryDirectory(prefix="pimper_bench_") as workspace,
@@ -98,18 +98,18 @@ def run_bench(
         (staging / "meshes").mkdir()
         for scene in config.scenes:
             try:
-                measured, pictures = _scene(scene, methods, config, Path(workspace), staging, cache)
+                scene_rows, panels = _scene(scene, methods, config, Path(workspace), staging, cache)
             except KeyboardInterrupt:
                 if not rows:
                     raise
                 warnings.warn(
-                    f"interrupted in scene {scene}; what was complete is in {folder}.",
+                    f"interrupted in scene {scene}; completed scenes are in {folder}.",
                     PimperWarning,
                     stacklevel=2,
                 )
                 break
-            rows += measured
-            sheet += pictures
+            rows += scene_rows
+            sheet_rows += panels
         table = Table(
             rows=with_published(rows),
             machine=this_machine(),
@@ -119,8 +119,8 @@ def run_bench(
         )
         write_json(table, staging / "table.json")
         (staging / "table.md").write_text(markdown(table) + "\n", encoding="utf-8")
-        if sheet:
-            draw_sheet(sheet, staging / "sheet.png")
+        if sheet_rows:
+            draw_sheet(sheet_rows, staging / "sheet.png")
     return table
 
 
@@ -132,7 +132,7 @@ def _scene(
     staging: Path,
     cache: Path | str | None,
 ) -> tuple[list[BenchRow], list[SceneRow]]:
-    """Run all methods on a scene; a scene without cameras has rows that say why."""
+    """Run all methods on a scene; if its cameras fail, all rows have the reason."""
     name = Path(scene).stem
     with stage(f"{name} render"):
         rendered = scene_folder(scene, config, workspace)
@@ -152,14 +152,14 @@ def _scene(
 def _with_common(cells: Sequence[_Cell], maps: Capture) -> list[BenchRow]:
     """Return the rows of a scene with figures over the pixels that all methods cover.
 
-    A method that leaves out difficult parts has small errors on the rest. Methods without a
-    surface limit no other.
+    A method that skips difficult parts has small errors on the rest. Methods without a
+    surface are ignored.
 
     Args:
-        maps: The truth in the reference view alone.
+        maps: The truth in the reference view.
     """
-    known = [cell.met.both for cell in cells if cell.met is not None]
-    common = reduce(torch.logical_and, known) if known else None
+    masks = [cell.met.both for cell in cells if cell.met is not None]
+    common = reduce(torch.logical_and, masks) if masks else None
     rows = []
     for row, _, mesh, met in cells:
         if common is not None and mesh is not None and met is not None:
@@ -172,7 +172,7 @@ def _with_common(cells: Sequence[_Cell], maps: Capture) -> list[BenchRow]:
 
 
 def _along_rays(view: ViewFigures | None) -> dict[str, Any]:
-    """Return the figures that a row has over its own pixels and over common ones."""
+    """Return the figures that a row has both over its covered pixels and over common ones."""
     if view is None:
         return {}
     normals, shape = view.transferred_normals, view.shape_normals
@@ -207,19 +207,19 @@ def _cell(
         return _Cell(row, MethodPanels(method=method, note=row.note))
     mesh = transfer(outcome.estimate.mesh, evaluation.alignment.truth_from_world)
     write_ply(mesh, staging / "meshes" / f"{scene}_{method}.ply")
-    # Evaluated in a view, it has been met.
+    # If the view was evaluated, its rays meet the surface.
     met = meet_truth(mesh, inputs.maps, 0) if evaluation.views else None
     row = _row_of(scene, method, outcome, evaluation, memory, sfm_minutes)
     return _Cell(row, method_panels(mesh, met, inputs, method), mesh, met)
 
 
 def _counted(figures: Mapping[str, int | float]) -> dict[str, Any]:
-    """Return what a preset's stages counted; baselines count nothing."""
+    """Return the counts of a preset's stages; baselines have none."""
     names = ("mesh_points", "triangles", "samples")
-    found: dict[str, Any] = {name: int(figures[name]) for name in names if name in figures}
-    if found:
-        found["missing_percent"] = 100 * (figures["missing_samples"] / figures["samples"])
-    return found
+    counts: dict[str, Any] = {name: int(figures[name]) for name in names if name in figures}
+    if counts:
+        counts["missing_percent"] = 100 * (figures["missing_samples"] / figures["samples"])
+    return counts
 
 
 def _row_of(
@@ -245,7 +245,7 @@ def _row_of(
         accuracy=surface.accuracy.mean_percent if surface and surface.accuracy else None,
         completeness=surface.whole.completeness.mean_percent if surface and surface.whole else None,
         completeness_seen=seen.completeness.mean_percent if seen else None,
-        f_scores=tuple((one.threshold_percent, 100 * one.f_score) for one in seen.thresholds)
+        f_scores=tuple((score.threshold_percent, 100 * score.f_score) for score in seen.thresholds)
         if seen
         else (),
         peak_memory_mb=memory,

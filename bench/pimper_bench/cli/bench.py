@@ -1,4 +1,4 @@
-"""``pimper bench``: the table."""
+"""``pimper bench``: the table of methods and scenes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ from pimper_torch.cli.output import Output
 from pimper_torch.doors.result_folder.folders import prepare_output, require_apart
 from pimper_torch.runtime.user_cache import user_cache
 
-_OUT, _QUICK = Path("pimper_bench"), BenchConfig()
+_OUT, _DEFAULT = Path("pimper_bench"), BenchConfig()
 
 
 def run(job: "_Job", output: Output) -> None:
-    """Carry out ``bench``."""
+    """Run ``bench``."""
     with output.observer():
         table = run_bench(job.config, job.out, overwrite=job.overwrite, cache=job.cache)
     if not output.as_json:
         Console().print(terminal(table))
-    output.remark(f"{job.out}/table.md is the table, {job.out}/sheet.png shows it.")
+    output.remark(f"{job.out}/table.md contains the table, {job.out}/sheet.png the images.")
     output.result({name: job.out / name for name in BENCH_NAMES if (job.out / name).exists()})
 
 
@@ -38,22 +38,22 @@ class _Job:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a folder that is taken."""
-    kept = user_cache()
+    """Read the arguments, and refuse an existing output folder."""
+    default_cache = user_cache()
 
     def bench(
         out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")] = _OUT,
-        config: Annotated[BenchConfig, tyro.conf.arg(name="")] = _QUICK,
-        cache: Annotated[Path, tyro.conf.arg(metavar="DIR")] = kept,
+        config: Annotated[BenchConfig, tyro.conf.arg(name="")] = _DEFAULT,
+        cache: Annotated[Path, tyro.conf.arg(metavar="DIR")] = default_cache,
         overwrite: Flag = False,
     ) -> _Job:
-        """Run presets and baselines on scenes with known truth, and print and save the table.
+        """Run presets and baselines on scenes with ground truth, and print and save the table.
 
         Args:
             out: Folder for the table, its figures and all surfaces; new or empty.
-            cache: Folder where structure from motion is kept from run to run, so that a change
-                of a later stage costs only the later stages.
-            overwrite: Replace a former result in OUT.
+            cache: Folder in which structure from motion is cached between runs, so that a change
+                of a later stage repeats only later stages.
+            overwrite: Replace an existing result in OUT.
         """
         return _Job(out=out, config=config, cache=cache, overwrite=overwrite)
 
@@ -64,7 +64,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
 
 def _inputs(job: _Job) -> dict[str, Path | None]:
-    """Return what the bench reads, by what it is called."""
+    """Return the paths that the bench reads, by argument."""
     names = (*job.config.scenes, *(job.config.methods or ()))
     paths = {name: Path(name) for name in names}
     return {"--cache": job.cache, **{name: path for name, path in paths.items() if path.exists()}}

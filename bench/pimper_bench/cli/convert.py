@@ -1,4 +1,4 @@
-"""A data set of one layout to another."""
+"""``pimper convert``: conversion of data sets between layouts."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -46,20 +46,20 @@ def _named(name: str) -> object:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadOptions:
-    """Options of readers; each goes with the layouts that know it.
+    """Options of readers; each applies to some layouts.
 
     Attributes:
-        scan: Number of the scene or scan; the DTU sets need one.
-        images: Folder of the photographs, if they do not lie where the layout has them.
+        scan: Number of the scene or scan; required for the DTU sets.
+        images: Folder of the photographs, if it is not that of the layout.
         masks: Folder with a mask for each photograph, of the same name; black off the object.
-        mesh: File of the true surface, in the data set's frame; the export's cloud or unit
-            sphere comes from it.
-        response: As photographs.response of `pimper reconstruct`; the layout's own unless given.
-        saturation: As photographs.saturation of `pimper reconstruct`.
-        black: As photographs.black of `pimper reconstruct`.
-        light_seed: Keep one light at each position, chosen by this seed.
-        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0
-            leaves them.
+        mesh: File of the true surface, in the data set's frame; used for the exported cloud or
+            unit sphere.
+        response: Like photographs.response of `pimper reconstruct`; the layout's by default.
+        saturation: Like photographs.saturation of `pimper reconstruct`.
+        black: Like photographs.black of `pimper reconstruct`.
+        light_seed: Keep one light at each position, selected with this seed.
+        max_size_px: Maximum length of the photographs' longer side; larger ones are shrunk, with
+            their cameras. 0 for no limit.
     """
 
     scan: int | None = None
@@ -78,18 +78,18 @@ _OPTIONS = tuple(field.name for field in dataclasses.fields(ReadOptions))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConvertJob:
-    """Read a data set of one layout and write its photographs and cameras in another.
+    """Read a data set in one layout and write its photographs and cameras in another.
 
     Photographs are written as 8-bit sRGB, undistorted, with pinhole cameras.
 
     Attributes:
         data: The data set's folder; for some layouts its file of cameras.
         out: Folder for the result; new or empty.
-        source: Layout of DATA; camera-file is a file of any format that `--sparse` takes, as of
-            Metashape or Meshroom, beside its photographs.
+        source: Layout of DATA; camera-file is a file in any format supported by `--sparse`, such as
+            Metashape's or Meshroom's, next to its photographs.
         target: Layout to write.
-        overwrite: Replace a former result in OUT.
-        options: Of the reader.
+        overwrite: Replace an existing result in OUT.
+        options: Options of the reader.
     """
 
     data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DATA")]
@@ -101,18 +101,18 @@ class ConvertJob:
 
 
 def run(job: ConvertJob, output: Output) -> None:
-    """Carry out ``convert``: read, write whole or not at all, and say what came."""
+    """Run ``convert``: read, write atomically, and describe the result."""
     with written_whole(job.out, "data set", overwrite=job.overwrite) as staging:
-        with output.observer(), stage("read") as told:
+        with output.observer(), stage("read") as figures:
             capture = read(job)
-            told["photographs"] = capture.views.num_views
+            figures["photographs"] = capture.views.num_views
         write(capture, job.target, staging)
     output.remark(describe(capture, job))
     output.result({"folder": job.out}, photographs=capture.views.num_views)
 
 
 def checked(command: str, arguments: Sequence[str]) -> ConvertJob:
-    """Read the arguments, and check what can be checked without reading DATA."""
+    """Read the arguments, and check everything that can be checked without reading DATA."""
     job = parse(arguments)
     inputs = {
         "DATA": job.data,
@@ -123,7 +123,7 @@ def checked(command: str, arguments: Sequence[str]) -> ConvertJob:
     require_apart(job.out, inputs)
     prepare_output(job.out, "data set", job.overwrite)
     if not job.data.exists():
-        raise InputError(f"{job.data}: found nothing; needed: the folder or file of a data set.")
+        raise InputError(f"{job.data}: does not exist; needed: the folder or file of a data set.")
     return job
 
 
@@ -133,11 +133,11 @@ def parse(arguments: Sequence[str]) -> ConvertJob:
 
 
 class _Layout(NamedTuple):
-    """How a layout is read.
+    """Reader of a layout.
 
     Attributes:
-        encoding: What its files hold, unless an option says otherwise.
-        options: Names of those that the reader knows beside the photographs' encoding.
+        encoding: Encoding of its files by default; ``None`` if they specify it.
+        options: Names of the supported options other than the photographs' encoding.
     """
 
     read: Callable[..., Capture]
@@ -146,42 +146,42 @@ class _Layout(NamedTuple):
 
 
 def layouts() -> Mapping[Source, _Layout]:
-    """List all layouts."""
+    """Return all layouts by name."""
     posed = ("mesh", "max_size_px")
-    beside = ("images", "masks", *posed)
+    with_folders = ("images", "masks", *posed)
     lit = ("light_seed", "max_size_px")
     return {
-        "colmap": _Layout(datasets.read_colmap, FROM_FILES, beside),
-        "llff": _Layout(datasets.read_llff, FROM_FILES, beside),
+        "colmap": _Layout(datasets.read_colmap, FROM_FILES, with_folders),
+        "llff": _Layout(datasets.read_llff, FROM_FILES, with_folders),
         "idr": _Layout(datasets.read_idr, FROM_FILES, posed),
         "transforms": _Layout(datasets.read_transforms, FROM_FILES, posed),
-        "camera-file": _Layout(datasets.read_camera_file, FROM_FILES, beside),
+        "camera-file": _Layout(datasets.read_camera_file, FROM_FILES, with_folders),
         "dtu-points": _Layout(datasets.read_dtu_points, LINEAR, ("scan", *lit)),
         "dtu-mvs": _Layout(datasets.read_dtu_mvs, LINEAR, ("scan", *lit)),
         "diligent-mv": _Layout(datasets.read_diligent_mv, LINEAR, lit),
-        # Without its maps, which no layout has a place for; scene.json says what its files hold.
+        # Without maps, for which no layout has a format; scene.json specifies the encoding.
         "rendered": _Layout(partial(datasets.read_rendered, maps=False), None),
     }
 
 
 def read(job: ConvertJob) -> Capture:
-    """Read the data set with the options that were given."""
+    """Read the data set with the given options."""
     layout, plain = layouts()[job.source], ReadOptions()
     given = {
         name: getattr(job.options, name)
         for name in _OPTIONS
         if getattr(job.options, name) != getattr(plain, name)
     }
-    known = (*layout.options, *(_PHOTOGRAPHS if layout.encoding else ()))
-    strange = [_option(name) for name in given if name not in known]
-    if strange:
-        goes = [_option(name) for name in _OPTIONS if name in known]
+    supported = (*layout.options, *(_PHOTOGRAPHS if layout.encoding else ()))
+    unsupported = [_option(name) for name in given if name not in supported]
+    if unsupported:
+        valid = [_option(name) for name in _OPTIONS if name in supported]
         raise InputError(
-            f"{', '.join(strange)}: the reader of {job.source} does not know it; needed: some of "
-            f"{', '.join(goes)}, or another --source."
+            f"{', '.join(unsupported)}: not supported for --source {job.source}; needed: any of "
+            f"{', '.join(valid)}, or a different --source."
         )
     if "scan" in layout.options and "scan" not in given:
-        raise InputError(f"--source {job.source} holds many scans; needed: --scan with a number.")
+        raise InputError(f"--source {job.source} has several scans; needed: --scan with a number.")
     photographs = {name: given.pop(name) for name in _PHOTOGRAPHS if name in given}
     if layout.encoding is not None and photographs:
         given["encoding"] = dataclasses.replace(layout.encoding, **photographs)
@@ -192,8 +192,8 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
     """Write a capture's photographs and cameras in a layout."""
     if capture.cameras is None:
         raise InputError(
-            "this data set says nothing about its cameras; needed: cameras to export. Use its "
-            "photographs as they are."
+            "this data set has no cameras; needed: cameras to export. Its photographs can be used "
+            "without conversion."
         )
     writers = {
         "colmap": datasets.write_colmap,
@@ -206,13 +206,13 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
 
 
 def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
-    """Return points of the true surface, at most a hundred thousand, or ``None``."""
+    """Return points of the true surface, at most 100,000; ``None`` if it is unknown."""
     points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
     return None if points is None else points[thinned(len(points)).to(points.device)]
 
 
 def describe(capture: Capture, job: ConvertJob) -> str:
-    """Report what was read and where it is now."""
+    """Return a description of the data that was read and written."""
     sizes = {f"{width} x {height}" for width, height in capture.views.sizes_px.tolist()}
     size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
     count, positions, lights = (
@@ -220,11 +220,11 @@ def describe(capture: Capture, job: ConvertJob) -> str:
         for numbers in (torch.arange(capture.views.num_views), capture.position, capture.light)
     )
     light = (
-        "each taken to have its own light"
+        "assumed to have a different light each"
         if lights == count
         else f"under {_count(lights, 'light')}"
     )
-    known = [
+    available = [
         name.removesuffix("_world")
         for name in ("mesh", "points_world", "depth", "normals_world", "albedo", "lights_world")
         if getattr(capture.truth, name) is not None
@@ -232,7 +232,7 @@ def describe(capture: Capture, job: ConvertJob) -> str:
     return (
         f"{_count(count, 'photograph')} of {size} from {_count(positions, 'position')}, {light}, "
         f"{'with' if capture.views.masks is not None else 'without'} masks; truth: "
-        f"{', '.join(known) or 'none'}.\n{job.out} has them as {job.target}."
+        f"{', '.join(available) or 'none'}.\nWritten to {job.out} in the layout {job.target}."
     )
 
 

@@ -1,4 +1,4 @@
-"""A result against the truth, on the terminal and as JSON."""
+"""``pimper evaluate``: a result compared with ground truth, on the terminal and as JSON."""
 
 import json
 import re
@@ -38,7 +38,7 @@ from pimper_torch.runtime.errors import InputError
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
 
-# The position of the camera in the names of the DTU and DiLiGenT-MV sets.
+# The number of the camera position in names of the DTU and DiLiGenT-MV sets.
 _POSITION = re.compile(r"(?:rect|view)_(\d+)")
 FORMAT = "pimper_torch evaluation"
 _DEFAULT = EvaluateConfig()
@@ -46,21 +46,21 @@ _DEFAULT = EvaluateConfig()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluateJob:
-    """Measure a result against the truth, each figure under its own named convention.
+    """Measure a result against ground truth, each figure by a named convention.
 
     Attributes:
         result: Folder that `pimper reconstruct` wrote, or a mesh of any method.
         truth: Folder of a rendered scene or of a data set, or a mesh.
         out: JSON file for all figures.
-        report: HTML file that shows the result in a browser with its errors; the photographs that
-            it was made from must be where they were.
-        overwrite: Replace files that a former evaluation wrote, and no others.
-        truth_layout: What TRUTH is. `mesh`: a mesh file or point cloud in the result's frame;
+        report: HTML file that displays the result and its errors in a browser; needs the
+            photographs of the result at their original path.
+        overwrite: Replace existing files of an earlier evaluation, but no other files.
+        truth_layout: Type of TRUTH. `mesh`: a mesh file or point cloud in the result's frame;
             `rendered`: a folder that `pimper render` wrote; `dtu-mvs`: the folder of the
-            DTU multi-view stereo set, with its protocol if ObsMask is there;
+            DTU multi-view stereo set, with its protocol if it contains ObsMask;
             `diligent-mv`: an object's folder. `auto` distinguishes the first two.
         scan: Number of the scan of `dtu-mvs`.
-        config: The measuring.
+        config: Settings of the evaluation.
     """
 
     result: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RESULT")]
@@ -74,7 +74,7 @@ class EvaluateJob:
 
 
 def run(job: EvaluateJob, output: Output) -> None:
-    """Carry out ``evaluate``."""
+    """Run ``evaluate``."""
     config = job.config
     estimate = read_estimate(job.result)
     capture, maps, protocol = read_truth(job, estimate, config)
@@ -85,10 +85,10 @@ def run(job: EvaluateJob, output: Output) -> None:
     _prepare_files(job)
     if job.out is not None:
         write_report(evaluation, job, relighting)
-        output.remark(f"{job.out} has all figures.")
+        output.remark(f"{job.out} contains all figures.")
     if job.report is not None:
         _write_page(evaluation, capture, job.result, job.report)
-        output.remark(f"{job.report} shows the errors.")
+        output.remark(f"{job.report} displays the errors.")
     files = {"figures": job.out, "report": job.report}
     paths = {name: path for name, path in files.items() if path is not None}
     output.result(paths, figures={**report(evaluation), "relighting": relighting})
@@ -99,7 +99,7 @@ def checked(command: str, arguments: Sequence[str]) -> EvaluateJob:
     job = read_arguments(EvaluateJob, command, arguments)
     for path in (job.result, job.truth):
         if not path.exists():
-            raise InputError(f"{path}: found nothing; needed: a result, and what it should be.")
+            raise InputError(f"{path}: does not exist; needed: a result, and its ground truth.")
     _prepare_files(job)
     return job
 
@@ -107,9 +107,9 @@ def checked(command: str, arguments: Sequence[str]) -> EvaluateJob:
 def read_truth(
     job: EvaluateJob, estimate: Estimate, config: EvaluateConfig
 ) -> tuple[Capture, Capture | None, DtuProtocol | None]:
-    """Read the truth, the maps of the views to compare in, if it has none, and its protocol.
+    """Return the truth, separate maps of the compared views if it has none, and its protocol.
 
-    Of a rendered scene no more maps are read than will be compared, so that memory does not
+    Only the maps of compared views of a rendered scene are read, so that memory does not
     grow with the number of its views.
     """
     layout, truth = job.truth_layout, job.truth
@@ -117,40 +117,40 @@ def read_truth(
         layout = "rendered" if (truth / "truth").is_dir() else "mesh"
         if layout == "mesh" and truth.is_dir():
             raise InputError(
-                f"{truth}: a folder without truth/ in it; needed: a folder that `pimper render` "
+                f"{truth}: is a folder without truth/; needed: a folder that `pimper render` "
                 "wrote, a mesh file, or the layout of a data set (--truth-layout)."
             )
     if layout == "mesh":
         return mesh_capture(truth), None, None
     if layout == "rendered":
-        bare = read_rendered(truth, maps=False, photographs=False)
-        chosen = chosen_views(estimate, bare, config)
-        return bare, read_rendered(truth, views=chosen, photographs=False), None
+        without_maps = read_rendered(truth, maps=False, photographs=False)
+        chosen = chosen_views(estimate, without_maps, config)
+        return without_maps, read_rendered(truth, views=chosen, photographs=False), None
     if layout == "diligent-mv":
         return named_as(read_diligent_mv(truth, lights=[1]), estimate), None, None
     scan = job.scan
     if scan is None:
-        raise InputError(f"{truth}: holds many scans; needed: --scan with the number of one.")
-    # They are not compared with anything; small ones save a gigabyte.
+        raise InputError(f"{truth}: has several scans; needed: --scan with the number of one.")
+    # The photographs are not compared; shrunk ones save a gigabyte.
     capture = read_dtu_mvs(truth, scan, lights=[0], max_size_px=200)
     protocol = read_dtu_protocol(truth, scan) if (truth / "ObsMask").is_dir() else None
     return named_as(capture, estimate), None, protocol
 
 
 def named_as(capture: Capture, estimate: Estimate) -> Capture:
-    """Call views as the estimate calls those from the same position, under whatever light.
+    """Rename views to the estimate's names of the same positions, under any light.
 
-    Names of these sets hold the position (``rect_007_3_r5000.png``, ``view_07/012.png``), and a
-    result may be made from any light of each. A position that the estimate has under several
-    lights, or not at all, keeps its name.
+    Names of these sets contain the position (``rect_007_3_r5000.png``, ``view_07/012.png``), and a
+    result may use any light of each. A position that the estimate has several times, or not at all,
+    keeps its name.
     """
     positions = [_position_in(name) for name in estimate.names]
-    known: dict[int | None, str] = {
+    name_of: dict[int | None, str] = {
         position: name
         for position, name in zip(positions, estimate.names, strict=True)
         if position is not None and positions.count(position) == 1
     }
-    names = tuple(known.get(_position_in(name), name) for name in capture.views.names)
+    names = tuple(name_of.get(_position_in(name), name) for name in capture.views.names)
     return capture.replace(views=capture.views.replace(names=names))
 
 
@@ -160,7 +160,7 @@ def _position_in(name: str) -> int | None:
 
 
 def mesh_capture(path: Path) -> Capture:
-    """Read a mesh or a point cloud as a truth without photographs."""
+    """Read a mesh or a point cloud as ground truth without photographs."""
     mesh = read_mesh(path)
     points = None if len(mesh.faces) else mesh.vertices_world
     empty = torch.zeros(0, dtype=torch.long)
@@ -179,29 +179,29 @@ def mesh_capture(path: Path) -> Capture:
 
 
 def read_relighting(result: Path) -> dict[str, Any] | None:
-    """Read how near a result comes to photographs, where it tells."""
+    """Read a result's errors in photographs; ``None`` if it has none."""
     try:
         summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    found: dict[str, Any] | None = summary.get("relighting")
-    return found
+    relighting: dict[str, Any] | None = summary.get("relighting")
+    return relighting
 
 
 def show(
     evaluation: Evaluation, console: Console, relighting: dict[str, Any] | None = None
 ) -> None:
-    """Print the figures section by section, with what each says beside or below it."""
+    """Print the figures by section, with their meanings next to or below them."""
     sections = rows(evaluation, relighting)
-    lines = [row for _, found in sections for row in found]
+    lines = [row for _, section in sections for row in section]
     first = 2 + max(len(row.name) for row in lines)
     second = first + 2 + max(len(row.value) for row in lines)
-    beside = console.width >= second + 72
-    for title, found in sections:
+    in_line = console.width >= second + 72
+    for title, section in sections:
         console.print(Text(title, style="bold"), soft_wrap=True)
-        for row in found:
+        for row in section:
             text = Text(f"  {row.name}".ljust(first) + f"  {row.value}")
-            if beside:
+            if in_line:
                 text.pad_right(second + 2 - len(text))
             else:
                 text.append("\n" + " " * (first + 2))
@@ -212,7 +212,7 @@ def show(
 def write_report(
     evaluation: Evaluation, job: EvaluateJob, relighting: dict[str, Any] | None = None
 ) -> None:
-    """Write all figures and the settings they were made with as JSON, whole or not at all."""
+    """Write all figures, and the settings of the evaluation, as JSON, atomically."""
     assert job.out is not None
     content = {
         "format": FORMAT,
@@ -229,14 +229,14 @@ def write_report(
 
 
 def _write_page(evaluation: Evaluation, capture: Capture, result: Path, path: Path) -> None:
-    """Write the page of a result with its errors, whole or not at all."""
+    """Write the page of a result with its errors, atomically."""
     mesh = true_surface(capture)
     with file_written_whole(path) as fresh:
         write_compared_page(result, mesh, evaluation.alignment.truth_from_world, fresh)
 
 
 def _prepare_files(job: EvaluateJob) -> None:
-    """Refuse, before the work and before writing, files that are not ours to replace."""
+    """Refuse to replace files that are not from an evaluation."""
     marks = {job.out: f'"format": "{FORMAT}"', job.report: HEAD}
     for path, mark in marks.items():
         if path is not None:

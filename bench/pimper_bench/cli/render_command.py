@@ -1,4 +1,4 @@
-"""``pimper render``: photographs of a scene, with the truth beside them."""
+"""``pimper render``: photographs of a scene, with ground truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.runtime.reporting import stage
 
 _DEFAULT = SceneConfig()
-# Left to --help-all.
+# Only in --help-all.
 _RARE_NAMES = """
 processes lights-per-pose elevation-deg sway-deg fill no-fixed-point-light no-fixed-room
 no-fixed-table no-constant-light no-turned-over pan-jitter-px crop-jitter-px point-light-distance
@@ -25,14 +25,14 @@ _RARE = tuple(f"--{name}" for name in _RARE_NAMES.split())
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Render photographs of a scene under a point light, and write the truth beside them.
+    """Render photographs of a scene under a point light, and write the ground truth.
 
     Attributes:
         scene: One of mug, jar, balls, potatoes, pair, or the path of a mesh file.
         out: Folder for photos, masks and truth; new or empty.
-        processes: That render at the same time.
-        overwrite: Replace a former rendering in OUT.
-        config: The photographs.
+        processes: Number of concurrent renderings.
+        overwrite: Replace an existing rendering in OUT.
+        config: Settings of the photographs.
     """
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
@@ -43,15 +43,15 @@ class _Job:
 
 
 def run(job: _Job, output: Output) -> None:
-    """Carry out ``render``."""
-    with output.observer(), stage("render") as told:
+    """Run ``render``."""
+    with output.observer(), stage("render") as figures:
         render_scene(
             job.scene, job.out, job.config, processes=job.processes, overwrite=job.overwrite
         )
-        told["photographs"] = job.config.num_views
+        figures["photographs"] = job.config.num_views
     option = "" if job.config.encoding == "srgb" else " --photographs.response linear"
     output.remark(
-        f"{job.out}/photos are the photographs, {job.out}/truth is what they show. Next:\n"
+        f"{job.out}/photos contains the photographs, {job.out}/truth the ground truth. Next:\n"
         f"  pimper reconstruct {job.out}/photos -o RESULT{option}"
     )
     output.result({name: job.out / name for name in ("photos", "masks", "truth")})

@@ -43,8 +43,8 @@ def textured(
     Implausibly bright albedo is inpainted first.
 
     From the centre of every texel, a ray along the mesh's interpolated normals is cast outward and
-    inward, and the nearer intersection is used. A texel far from all faces, or without an
-    intersection with a surface of similar orientation, has the values of the nearest other texel.
+    inward, and the nearer intersection is used. A texel far from all faces, or without a hit on
+    surface of similar orientation, has the values of the nearest texel with one.
 
     Args:
         full: The surface, on the CPU.
@@ -67,13 +67,13 @@ def textured(
     face_normals = surfaces.unit_face_normals(full.vertices_world, full.faces)
     # The simplified mesh is off by far less than its sides; a surface farther away is another part.
     reach = surfaces.side_lengths(few.vertices_world[few.faces]).median()
-    material = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
+    carried = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
 
     def bake(texels: Int[Tensor, " texel"]) -> tuple[Tensor, Tensor]:
         """Return the values of texels, and whether rays hit the surface."""
-        on_mesh = texel_faces.take(texels)
-        points = on_mesh.interpolate(mesh.vertices_world, mesh.faces)
-        outward = on_mesh.interpolate(shape, mesh.faces)
+        hits = texel_faces.take(texels)
+        points = hits.interpolate(mesh.vertices_world, mesh.faces)
+        outward = hits.interpolate(shape, mesh.faces)
         # Rays outward, then rays inward.
         met = caster.cast(points.repeat(2, 1), torch.cat([outward, -outward]), reach)
         same_side = (face_normals[met.face] * outward.repeat(2, 1)).sum(dim=1) > 0
@@ -81,13 +81,9 @@ def textured(
         distances = met.distance.where(same_side, torch.inf).chunk(2)
         row = torch.arange(len(points))
         met = met.take(torch.where(distances[0] <= distances[1], row, row + len(points)))
-        sampled = met.interpolate(values, full.faces)
-        axes = frames(on_mesh, normals, tangent, mesh.faces)
-        columns = [
-            _relative(sampled[:, :3], axes),
-            sampled[:, 3:],
-            on_mesh.interpolate(material, mesh.faces),
-        ]
+        rows = met.interpolate(values, full.faces)
+        axes = frames(hits, normals, tangent, mesh.faces)
+        columns = [_relative(rows[:, :3], axes), rows[:, 3:], hits.interpolate(carried, mesh.faces)]
         return torch.cat(columns, dim=1), met.face >= 0
 
     (texels,) = torch.nonzero(texel_faces.face >= 0, as_tuple=True)

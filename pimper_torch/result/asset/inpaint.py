@@ -22,8 +22,7 @@ def inpainted(mesh: Mesh) -> tuple[Mesh, PerVertex]:
     ones; so are its surroundings where they exceed the albedo continued from determined surface.
 
     Returns:
-        The mesh, unchanged if nothing is too bright or vertices have no confidence, and the
-        uncertainty.
+        The mesh, unchanged if nothing is too bright or confidence is missing, and the uncertainty.
     """
     albedo, confidence = mesh.albedo, mesh.confidence
     if albedo is None or confidence is None:

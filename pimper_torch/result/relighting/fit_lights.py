@@ -98,14 +98,12 @@ def observe_all(
     return list(side_by_side(observed, range(scene.cameras.num_views), tracked=False))
 
 
-def loss_scale(observed: Observed) -> float:
+def loss_scale(seen: Observed) -> float:
     """Return the scale of Cauchy's loss from a first-order light without shadows."""
-    basis = torch.cat(
-        [torch.ones_like(observed.radiance[:, :1]), observed.pixels.normals_world], dim=1
-    )
-    root = observed.weight.sqrt() * ~observed.saturated[:, None]
-    rows = (root * observed.pixels.base_color).mT[..., None] * basis
-    values = (root * observed.radiance).mT[..., None]
+    basis = torch.cat([torch.ones_like(seen.radiance[:, :1]), seen.pixels.normals_world], dim=1)
+    root = seen.weight.sqrt() * ~seen.saturated[:, None]
+    rows = (root * seen.pixels.base_color).mT[..., None] * basis
+    values = (root * seen.radiance).mT[..., None]
     light = torch.linalg.lstsq(rows, values, driver="gelsd").solution
     size = (values - rows @ light)[..., 0].norm(dim=0)
     deviation = float(median_deviation(size, torch.ones_like(size, dtype=torch.bool)))
@@ -114,7 +112,7 @@ def loss_scale(observed: Observed) -> float:
 
 
 def fit_strengths(
-    observed: Observed,
+    seen: Observed,
     diffuse: Float[Tensor, "*batch pixel #channel"],
     response: Float[Tensor, "light pixel #channel"],
     scale: float,
@@ -128,11 +126,11 @@ def fit_strengths(
     Returns:
         Ambient and directed strengths, neither below 0, and the mean loss.
     """
-    radiance = observed.radiance
-    used = (~observed.saturated)[:, None].expand_as(response).float()
+    radiance = seen.radiance
+    used = (~seen.saturated)[:, None].expand_as(response).float()
     robust = torch.ones_like(response[..., 0])
     for _ in range(3):
-        weight = robust[..., None] * observed.weight * used
+        weight = robust[..., None] * seen.weight * used
         aa, ab = (weight * diffuse**2).sum(dim=1), (weight * diffuse * response).sum(dim=1)
         bb = (weight * response**2).sum(dim=1)
         ay = (weight * diffuse * radiance).sum(dim=1)
@@ -140,9 +138,9 @@ def fit_strengths(
         ambient, directed = _non_negative(aa, ab, bb, ay, by)
         error = ambient[:, None] * diffuse + directed[:, None] * response - radiance
         # A saturated photograph bounds the radiance from below.
-        error = torch.where(observed.saturated[:, None], error.clamp_max(0), error)
+        error = torch.where(seen.saturated[:, None], error.clamp_max(0), error)
         used = (error != 0).float()
-        size = (observed.weight * error**2).sum(dim=-1).sqrt()
+        size = (seen.weight * error**2).sum(dim=-1).sqrt()
         robust = cauchy_weights(size, torch.full_like(size[:1, :1], scale))
     return ambient, directed, -robust.log().mean(dim=1)
 
@@ -199,36 +197,28 @@ def lights_of(
 
 
 def _fit(
-    surface: LitSurface, observed: Observed, material: Vertices | None, start: ViewLights | None
+    surface: LitSurface, seen: Observed, material: Vertices | None, start: ViewLights | None
 ) -> ViewLights:
-    if len(observed.radiance) == 0:
-        zero = torch.zeros(1, observed.radiance.shape[1])
-        up = torch.tensor([[0.0, 0.0, 1.0]])
+    if len(seen.radiance) == 0:
+        up, zero = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, seen.radiance.shape[1])
         return ViewLights(
             direction_world=up, inverse_distance=zero[:, 0], ambient=zero, directed=zero
         )
-    few, many = observed.thinned(_FEW), observed.thinned(_MANY)
+    few, many = seen.thinned(_FEW), seen.thinned(_MANY)
     scale = loss_scale(few)
 
     def rendered(
-        observed: Observed, lights: Float[Tensor, "light 4"], shadows: bool = True
+        seen: Observed, lights: Float[Tensor, "light 4"], shadows: bool = True
     ) -> tuple[Float[Tensor, "pixel channel"], Float[Tensor, "light pixel channel"]]:
-        reflectance = None if material is None else material[observed.pixels.vertex]
-        light = surface.incidence(observed.pixels, lights[:, :3], lights[:, 3], shadows=shadows)
-        return diffuse_color(observed.pixels, reflectance), response(
-            observed.pixels, light, reflectance
-        )
+        values = None if material is None else material[seen.pixels.vertex]
+        light = surface.incidence(seen.pixels, lights[:, :3], lights[:, 3], shadows=shadows)
+        return diffuse_color(seen.pixels, values), response(seen.pixels, light, values)
 
     def best(
-        observed: Observed,
-        lights: Float[Tensor, "start light 4"],
-        shadows: bool = True,
-        most: int = 1,
+        seen: Observed, lights: Float[Tensor, "start light 4"], shadows: bool = True, most: int = 1
     ) -> Float[Tensor, "start most 4"]:
         """Return the best lights of every start, best first."""
-        losses = fit_strengths(observed, *rendered(observed, lights.flatten(0, 1), shadows), scale)[
-            2
-        ]
+        losses = fit_strengths(seen, *rendered(seen, lights.flatten(0, 1), shadows), scale)[2]
         order = losses.reshape(lights.shape[:2]).argsort(dim=1, stable=True)[:, :most]
         return lights.gather(1, order[..., None].expand(-1, -1, 4))
 
@@ -237,15 +227,8 @@ def _fit(
         lights = torch.cat([start.direction_world, start.inverse_distance[:, None]], dim=1)
     else:
         far = best(few, lights[None], shadows=False, most=_CANDIDATES)[0]
-        starts = best(
-            few,
-            torch.stack(
-                [
-                    pad(far[:, :3], (0, 1), value=inverse_distance)
-                    for inverse_distance in _INVERSE_DISTANCES
-                ]
-            ),
-        )
+        tried = [pad(far[:, :3], (0, 1), value=inverse) for inverse in _INVERSE_DISTANCES]
+        starts = best(few, torch.stack(tried))
         for step in _COARSE:
             starts = best(few, torch.stack([_neighbours(light[0], step) for light in starts]))
         lights = best(many, starts.flatten(0, 1)[None])[0]

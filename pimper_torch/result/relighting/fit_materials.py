@@ -77,12 +77,12 @@ class _Trial:
         views = [view for view, pixels in enumerate(observed) if len(pixels.radiance)]
         most = min(3000, max(1, 20_000 // max(1, len(views))))
         self.observed = [observed[view].thinned(most) for view in views]
-        self.scales = [loss_scale(observation) for observation in self.observed]
+        self.scales = [loss_scale(seen) for seen in self.observed]
         self.incidence = [
             surface.incidence(
-                observation.pixels, lights.direction_world[[view]], lights.inverse_distance[[view]]
+                seen.pixels, lights.direction_world[[view]], lights.inverse_distance[[view]]
             )
-            for view, observation in zip(views, self.observed, strict=True)
+            for view, seen in zip(views, self.observed, strict=True)
         ]
 
     def losses(
@@ -91,11 +91,11 @@ class _Trial:
         """Return the loss of every photograph for every candidate."""
 
         def of_view(view: int) -> Float[Tensor, " candidate"]:
-            observation = self.observed[view]
-            material = candidates[:, cluster[observation.pixels.vertex]]
-            lit = response(observation.pixels, self.incidence[view], material)
-            diffuse = diffuse_color(observation.pixels, material)
-            return fit_strengths(observation, diffuse, lit, self.scales[view])[2]
+            seen = self.observed[view]
+            material = candidates[:, cluster[seen.pixels.vertex]]
+            lit = response(seen.pixels, self.incidence[view], material)
+            diffuse = diffuse_color(seen.pixels, material)
+            return fit_strengths(seen, diffuse, lit, self.scales[view])[2]
 
         return torch.stack(list(side_by_side(of_view, range(len(self.observed)), tracked=False)))
 

@@ -115,10 +115,7 @@ def view_errors(
 ) -> ViewErrors:
     """Compare photographs with renderings of the surface under lights."""
     psnr_db = [
-        psnr(
-            shaded(surface, observation.pixels, lights.take([view]), materials),
-            observation.radiance,
-        )
-        for view, observation in enumerate(observed)
+        psnr(shaded(surface, seen.pixels, lights.take([view]), materials), seen.radiance)
+        for view, seen in enumerate(observed)
     ]
     return ViewErrors(psnr_db=torch.tensor(psnr_db), lights=lights, names=names)

@@ -1,1 +1,1 @@
-"""The page of a run: one file that shows its surface, photographs and stages in a browser."""
+"""The page of a run: one HTML file with its surface, photographs and stages."""

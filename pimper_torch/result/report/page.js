@@ -1,5 +1,5 @@
-// Draws a run's report: its surface under a light that moves, its photographs, its tables.
-// Text from files is only ever written as text, and nothing is fetched.
+// Draws a run's report: its surface under a movable light, its photographs, its tables.
+// Text from files is inserted only as text, never as HTML, and nothing is fetched.
 "use strict";
 (() => {
   const began = performance.now();
@@ -17,7 +17,7 @@
   };
   const vector = (values) => new THREE.Vector3(...values);
 
-  // What stands between backticks is code.
+  // Text between backticks is code.
   const prose = (text) => text.split(/`([^`]+)`/).map((part, at) => at % 2 ? make("code", { text: part }) : part);
   const thousands = (number) => number.toLocaleString("en");
   const digits = (number, count) => String(Number(number.toPrecision(count)));
@@ -26,7 +26,7 @@
   const simpler = summary.simplified || summary.reduced;
   find("title").textContent = data.title;
   find("headline").textContent = [
-    `${summary.registered} of ${summary.views} photographs${summary.doubt ? " (cameras doubtful)" : ""}`,
+    `${summary.registered} of ${summary.views} photographs${summary.diagnosis ? " (cameras unreliable)" : ""}`,
     `${thousands(summary.triangles)} facets`,
     `${thousands((simpler || summary).vertices)} vertices`
       + (simpler ? ` in mesh.ply (${thousands(summary.vertices)} before simplification)` : ""),
@@ -36,7 +36,7 @@
   // ---- Photographs -------------------------------------------------------------------------
 
   const picture = (source, view, outlined) => {
-    const box = make("div", { class: view.reliable ? "picture" : "picture doubted" });
+    const box = make("div", { class: view.reliable ? "picture" : "picture unreliable" });
     box.style.setProperty("--shape", view.width / view.height);
     box.append(make("img", { src: source, alt: view.name, loading: "lazy" }));
     if (outlined && view.outline) {
@@ -50,7 +50,7 @@
     }
     return box;
   };
-  // Leave of a box what is inside the silhouette.
+  // Clip a box to the silhouette.
   const clip = (box, view) => {
     if (!view.outline) return;
     const path = find("inside").firstElementChild;
@@ -66,14 +66,14 @@
     find("thumbnails").append(button);
     return button;
   });
-  // What a figure in decibels means: of levels, and among the other photographs.
+  // Explain a PSNR: as an error of 8-bit values, and by its rank among the photographs.
   const worth = (view) => {
     if (!("psnr_db" in view)) return "";
-    const all = data.views.filter((one) => "psnr_db" in one);
-    const place = 1 + all.filter((one) => one.psnr_db > view.psnr_db).length;
-    const off = 255 * 10 ** (-view.psnr_db / 20);
-    return `${view.psnr_db.toFixed(1)} dB (PSNR): the prediction is off by ${digits(off, 2)} of 255 levels `
-      + `(root mean square); more decibels are better, and this is number ${place} of ${all.length}.`;
+    const all = data.views.filter((other) => "psnr_db" in other);
+    const rank = 1 + all.filter((other) => other.psnr_db > view.psnr_db).length;
+    const error = 255 * 10 ** (-view.psnr_db / 20);
+    return `${view.psnr_db.toFixed(1)} dB (PSNR): the prediction is off by ${digits(error, 2)} of 255 `
+      + `(root mean square). Higher is better; this is number ${rank} of ${all.length}.`;
   };
 
   const HINT = find("hint").textContent;
@@ -91,10 +91,10 @@
       find("worth").textContent = worth(view);
       if (view.prediction) {
         find("prediction").replaceChildren(picture(view.prediction, view, false));
-        const both = picture(view.photo, view, false);
-        both.append(make("img", { src: view.prediction, alt: "" }));
-        find("difference").replaceChildren(both);
-        clip(both, view);
+        const difference = picture(view.photo, view, false);
+        difference.append(make("img", { src: view.prediction, alt: "" }));
+        find("difference").replaceChildren(difference);
+        clip(difference, view);
       }
     }
     scene?.stand(view);
@@ -128,7 +128,7 @@
     bar.style.width = `${100 * value}%`;
     return make("td", { class: kind }, bar);
   };
-  // Columns are pairs of title and kind; a row of one text is a heading.
+  // Columns are pairs of title and kind; a row that is a string is a heading.
   const table = (columns, rows) => {
     const head = make("tr", {}, ...columns.map(([text, kind]) => make("th", { class: kind, text })));
     const body = rows.map((row) => Array.isArray(row)
@@ -143,7 +143,7 @@
   const faint = (text) => make("p", { class: "faint" }, ...prose(text));
   const some = (names) => names.slice(0, 8).join(", ") + (names.length > 8 ? ` and ${names.length - 8} more` : "");
 
-  const warnings = [...(summary.doubt ? [summary.doubt] : []), ...(summary.warnings || [])];
+  const warnings = [...(summary.diagnosis ? [summary.diagnosis] : []), ...(summary.warnings || [])];
   section("Warnings", warnings.length
     ? make("ul", {}, ...warnings.map((text) => make("li", {}, ...prose(text)))) : faint("None."));
 
@@ -152,11 +152,11 @@
     const decibels = (value) => value === null || value === undefined ? "" : value.toFixed(2);
     const materials = relit.materials.map((one) => `${(100 * one.vertices).toFixed(0)} % metallic `
       + `${digits(one.metallic, 2)}, roughness ${digits(one.roughness, 2)}, specular ${digits(one.specular, 2)}`);
-    const whose = relit.photographs === "held out" ? "held out of the run" : "that the surface was made from";
+    const origin = relit.photographs === "held out" ? "that were held out of the run" : "from which the surface was made";
     const textured = decibels(relit.psnr_textured_db);
     folded("Photographs predicted from the surface",
-      faint(`Each under its own fitted light, of photographs ${whose}`
-        + `${textured && `; with the asset's textures ${textured} dB on average`}. Materials: ${materials.join("; ")}.`),
+      faint(`Each photograph under its fitted light; photographs ${origin}`
+        + `${textured && `. With the asset's textures ${textured} dB on average`}. Materials: ${materials.join("; ")}.`),
       table([["photograph", "name"], ["PSNR with materials, dB", "number"], ["matte, dB", "number"], ["", "text"]],
         [{ name: "mean", ...relit }, ...relit.views].map((one) =>
           [one.name, decibels(one.psnr_db), decibels(one.psnr_matte_db), ""])));
@@ -168,15 +168,15 @@
     .map(([key, value]) => `${key.replaceAll("_", " ")} ${Number.isInteger(value) ? thousands(value) : digits(value, 4)}`)
     .join(", ");
   section("Stages",
-    faint(`${summary.seconds.toFixed(0)} s up to this page, ${(summary.peak_memory_mb || 0).toFixed(0)} MB at most`
+    faint(`${summary.seconds.toFixed(0)} s up to this page, at most ${(summary.peak_memory_mb || 0).toFixed(0)} MB`
       + `${summary.peak_memory_stage ? `, in ${summary.peak_memory_stage}` : ""}`),
     table([["stage", "name"], ["seconds", "number"], ["", "bar"], ["peak MB", "number"], ["figures", "text"]],
       summary.stages.map((stage) => [stage.name, stage.kept ? "kept" : stage.seconds.toFixed(1),
         stage.kept ? 0 : stage.seconds / longest, stage.peak_memory_mb.toFixed(0), figures(stage)])));
 
   if (data.left_out.length) {
-    folded("Left out", faint("By guards, where it matters; `summary.json` has the rest."),
-      table([["guard", "name"], ["left out", "number"], ["of", "number"], ["", "name"], ["reason", "text"]],
+    folded("Left out", faint("Significant removals by guards; `summary.json` lists all."),
+      table([["guard", "name"], ["removed", "number"], ["of", "number"], ["", "name"], ["reason", "text"]],
         data.left_out.flatMap(({ heading, entries }) => [heading, ...entries.map((one) =>
           [one.guard, thousands(one.count), thousands(one.total), one.what,
             one.reason + (one.names.length ? `: ${some(one.names)}` : "")])])));
@@ -193,9 +193,9 @@
 
   const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"];
   const [NEAR, FAR, FOV_DEG] = [0.01, 100, 30]; // planes in units of the scene's radius
-  const MARKED = 2.7; // how far cameras are drawn, in radii: with them the surface has a third of the picture
-  const REMOTE = 1e-3; // the surface's radius over the distance of a light that is far
-  // Of spherical harmonics: coefficients that light a white matte surface by 1, and by 1 where it faces an axis.
+  const MARKED = 2.7; // maximum distance of drawn cameras, in radii: the surface then has a third of the image
+  const REMOTE = 1e-3; // the surface's radius over the distance of a distant light
+  // Coefficients of spherical harmonics for an irradiance of 1, and for 1 where the surface faces an axis.
   const [EVEN, ALONG] = [Math.PI / 0.886227, Math.PI / (2 * 0.511664)];
   const OPENGL = new THREE.Matrix4().makeScale(1, -1, -1); // from x right, y down, z forward
 
@@ -207,30 +207,30 @@
       this.camera = new THREE.PerspectiveCamera(FOV_DEG, 1, 1, 10);
       this.world = new THREE.Scene();
       this.object = object;
-      const { scene_from_asset: back } = object.userData; // cameras are in the frame of the scene
+      const { scene_from_asset: back } = object.userData; // cameras are in the scene's frame
       if (back) object.geometry.applyMatrix4(new THREE.Matrix4().fromArray(back));
       object.geometry.computeBoundingSphere();
       ({ center: this.center, radius: this.radius } = object.geometry.boundingSphere);
       object.geometry.computeBoundingBox();
-      const box = object.geometry.boundingBox; // the lights' distances are in its half diagonals
+      const box = object.geometry.boundingBox; // distances of lights are in units of its half diagonal
       this.middle = { center: box.getCenter(new THREE.Vector3()), radius: box.min.distanceTo(box.max) / 2 };
       this.up = vector(data.up);
       this.light = new THREE.PointLight();
       this.ambient = new THREE.AmbientLight();
-      this.probe = new THREE.LightProbe(); // what comes from all sides, unlike the ambient light by the normal
-      this.shade = { value: 1 }; // whether the surface hides the sky from itself
+      this.probe = new THREE.LightProbe(); // light from all sides that depends on the normal, unlike ambient light
+      this.shade = { value: 1 }; // 1 if the surface occludes the sky
       this.openSky(object.geometry);
       this.markers = new THREE.Group();
       this.lamps = new THREE.Group();
       this.markers.visible = this.lamps.visible = false;
       this.world.add(object, this.light, this.ambient, this.probe, this.markers, this.lamps);
       this.lamp = { view: new THREE.Vector3(-0.45, 0.55, 0.7).normalize(), fitted: null };
-      this.behind = null; // the photograph whose camera is stood behind
+      this.behind = null; // the photograph whose viewpoint is used
       this.layers = this.makeLayers();
       this.makeMarkers();
       this.makeRuler();
       this.controls = new THREE.OrbitControls(this.camera, this.canvas);
-      let held = false; // a click alone stays behind the photograph's camera
+      let held = false; // a click without dragging keeps the photograph's viewpoint
       this.controls.addEventListener("start", () => { held = true; });
       this.controls.addEventListener("end", () => { held = false; });
       this.controls.addEventListener("change", () => {
@@ -242,13 +242,13 @@
       new ResizeObserver(() => this.resize()).observe(this.stage);
     }
 
-    // How much of the sky each vertex sees.
+    // Visible fraction of the sky per vertex.
     openSky(geometry) {
       const open = Float32Array.from(atob(data.openness), (one) => one.charCodeAt(0) / 255);
       geometry.setAttribute("openness", new THREE.Float32BufferAttribute(open, 1));
     }
 
-    // Let light from all sides reach a material only as far as its surroundings are open.
+    // Attenuate light from all sides by the visible fraction of the sky.
     shaded(material) {
       material.onBeforeCompile = (shader) => {
         shader.uniforms.shade = this.shade;
@@ -334,7 +334,7 @@
       for (const view of data.views) {
         view.worldFromCamera = new THREE.Matrix4().set(...view.pose).invert();
         view.place = new THREE.Vector3().applyMatrix4(view.worldFromCamera);
-        // Where it is drawn: on its line of sight, but no farther than the surface stays large.
+        // Drawn position: on the line of sight, near enough that the surface remains large.
         const away = view.place.distanceTo(this.center), shown = Math.min(away, MARKED * this.radius);
         view.marker = view.place.clone().sub(this.center).multiplyScalar(shown / away).add(this.center);
         const size = 0.08 * shown;
@@ -357,7 +357,7 @@
       this.lamps.add(this.ray);
     }
 
-    // Two points of the surface, and the line between them, drawn over it.
+    // Two points of the surface and the line between them, drawn over it.
     makeRuler() {
       this.ends = [];
       const look = { color: 0xffd24a, depthTest: false, transparent: true };
@@ -371,7 +371,7 @@
       this.measuring = false;
     }
 
-    // Take an end of a length; without, begin or stop to measure.
+    // Add an end point; without one, start or stop measuring.
     mark(place) {
       const stopped = place === null && this.measuring;
       this.measuring = !stopped;
@@ -380,7 +380,7 @@
       if (this.ruler.visible) this.ruler.children[0].geometry.setFromPoints([this.ends[0], this.ends.at(-1)]);
       const { factor, name } = data.unit;
       find("measured").textContent = this.ends.length < 2
-        ? `Click the ${this.ends.length ? "second" : "first"} place on the surface.`
+        ? `Click the ${this.ends.length ? "second" : "first"} point on the surface.`
         : `${digits(factor * this.ends[0].distanceTo(this.ends[1]), 3)} ${name}`;
       find("measured").hidden = stopped;
       find("measure").setAttribute("aria-pressed", String(!stopped));
@@ -409,7 +409,7 @@
       const environment = find("environment");
       environment.parentElement.hidden = !data.views.some((view) => view.environment);
       environment.addEventListener("change", () => {
-        find("lit").checked = !environment.checked; // it has the lamp's light in it
+        find("lit").checked = !environment.checked; // the environment includes the lamp's light
         this.showLamp();
         this.draw();
       });
@@ -445,7 +445,7 @@
       });
     }
 
-    // Let the light come from a point of the hemisphere before the viewer.
+    // Set the light to a point of the hemisphere on the viewer's side.
     aim(x, y) {
       const length = Math.hypot(x, y);
       const shrink = Math.min(1, 0.999 / (length || 1));
@@ -454,7 +454,7 @@
       this.draw();
     }
 
-    // The shape has one light for all photographs: a lamp behind the camera would flatten it.
+    // `shape` has the same light for all photographs: a lamp behind the camera would flatten it.
     get plain() { return this.shown.title === "shape"; }
 
     get fitted() { return this.plain ? null : this.lamp.fitted; }
@@ -491,7 +491,7 @@
       this.controls.update();
     }
 
-    // Stand behind the camera of a photograph, under its light; or leave it.
+    // Move to the viewpoint of a photograph, under its light; or leave it.
     stand(view) {
       if (!view) {
         this.lamp.fitted = null;
@@ -531,7 +531,7 @@
       this.renderer.setSize(width, height, false);
       const [near, far] = [NEAR * this.radius, FAR * this.radius];
       Object.assign(this.camera, { aspect: width / height, near, far });
-      // Narrow pictures see as much across as square ones see upward.
+      // Narrow images have the horizontal field of view that square ones have vertically.
       const half = Math.tan((FOV_DEG * Math.PI) / 360) / Math.min(1, width / height);
       this.camera.fov = (360 / Math.PI) * Math.atan(half);
       this.camera.updateProjectionMatrix();
@@ -540,7 +540,7 @@
       this.draw();
     }
 
-    // The photograph's own pinhole, as large as it fits into the canvas.
+    // The photograph's pinhole, scaled to fit into the canvas.
     frame(width, height, near, far) {
       const { focal: [fx, fy], centre: [cx, cy], ...view } = this.behind;
       const scale = Math.min(width / view.width, height / view.height);
@@ -564,7 +564,7 @@
       });
     }
 
-    // First-order light from all sides: that of photographs, or of a sky that is brighter above.
+    // First-order light from all sides: that of photographs, or a sky that is brighter above.
     surroundings() {
       if (!find("environment").checked) {
         const ambient = Number(find("ambient").value) * (this.plain ? 1.5 : 1);
@@ -574,7 +574,7 @@
       const known = own ? [own] : data.views.flatMap((view) => view.environment ? [view.environment] : []);
       const mean = [0, 1, 2, 3].map((at) => known.reduce((sum, one) => sum + one[at], 0) / known.length);
       const along = vector(mean.slice(1));
-      const exposure = 1 / Math.max(mean[0] + along.length(), 1e-6); // a scale is free
+      const exposure = 1 / Math.max(mean[0] + along.length(), 1e-6); // lights are up to a scale
       return [exposure * mean[0], along.multiplyScalar(exposure)];
     }
 
@@ -591,8 +591,8 @@
       const distance = this.middle.radius / Math.max(fitted?.inverse_distance ?? 0, REMOTE);
       this.light.position.copy(towards).transformDirection(this.camera.matrixWorld)
         .multiplyScalar(distance).add(this.middle.center);
-      // Radiance is albedo times light here; the renderer divides it by pi, and by the distance's
-      // square.
+      // Radiance is albedo times light here; the renderer divides it by pi, and by the squared
+      // distance.
       const exact = fitted && !find("environment").checked;
       this.light.intensity = find("lit").checked ? (plain ? 0.75 : 1) * Math.PI * distance ** 2 : 0;
       this.light.color.setRGB(...(exact ? fitted.directed : [1, 1, 1]));
@@ -616,7 +616,7 @@
 
   let scene = null;
   const fail = (error) => {
-    find("trouble").textContent = `The surface cannot be drawn here: ${error.message || error}. The photographs and tables below need no WebGL.`;
+    find("trouble").textContent = `The surface cannot be drawn: ${error.message || error}. The photographs and tables below do not need WebGL.`;
     find("trouble").hidden = false;
     find("tools").hidden = true;
   };

@@ -1,4 +1,4 @@
-"""The page itself: one file, opened offline."""
+"""Writing of the report page, one HTML file that works offline."""
 
 import base64
 import json
@@ -24,23 +24,16 @@ from pimper_torch.result.viz.turn import up_world
 from pimper_torch.runtime.ledger import closing_line
 
 HEAD = "<title>pimper_torch report</title>"
-"""Of every page, by which a former one is known."""
+"""Part of every page; identifies a page of an earlier run."""
 
-# Places of the template that its parts go into.
+# Placeholders of the template.
 _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
-# Of summary.json; paths on the machine of the run stay out of a page that is sent to others.
+# Keys of summary.json on the page; paths on the run's machine are excluded, as pages are shared.
 _SHOWN = (
-    *(
-        "diagnosis",
-        "warnings",
-        "failures",
-        "stages",
-        "seconds",
-        "peak_memory_mb",
-        "peak_memory_stage",
-    ),
-    *("registered", "views", "triangles", "vertices", "simplified", "reduced", "relighting"),
+    *("diagnosis", "warnings", "failures", "stages", "seconds", "peak_memory_mb"),
+    *("peak_memory_stage", "registered", "views", "triangles", "vertices", "simplified"),
+    *("reduced", "relighting"),
 )
 
 
@@ -63,13 +56,13 @@ def write_page(
     """Write a page that shows a result in a browser, without a server and offline.
 
     Args:
-        mesh: The result's, as it was written; it decides units, and ranges of colours.
-        asset: The surface as a binary glTF; its ``extras`` say where it is in ``scene``, otherwise
-            it is in that frame.
-        summary: What ``summary.json`` holds; ``settings`` likewise of ``config.yaml``.
+        mesh: The result's, as written; it determines units, and ranges of colours.
+        asset: The surface as a binary glTF, whose ``extras`` contain its placement in ``scene``;
+            without these, it is in that frame.
+        summary: Contents of ``summary.json``; ``settings`` likewise of ``config.yaml``.
         surface: The asset's mesh, with its vertices in the order of the file.
-        lights_world: First-order light of every view, up to a scale; NaN where it is unknown.
-        layers: More than those of ``mesh``; the page leaves out those that the asset lacks.
+        lights_world: First-order light of every view, up to a scale; NaN where unknown.
+        layers: In addition to those of ``mesh``; the page skips those that the asset lacks.
     """
     unit = length_unit(mesh, (summary.get("scale") or {}).get("unit"))
     shade = (255 * openness(surface)).round().to(torch.uint8).numpy().tobytes()
@@ -86,21 +79,21 @@ def write_page(
         "settings": _text(settings),
     }
     parts = {
-        # No text can end the element that it stands in.
+        # No text can close the element that contains it.
         "data": json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c"),
         "asset": base64.b64encode(asset).decode("ascii"),
     }
 
-    def part(place: re.Match[str]) -> str:
-        name = place[1] or place[2]
+    def part(placeholder: re.Match[str]) -> str:
+        name = placeholder[1] or placeholder[2]
         return parts[name] if name in parts else _read(name)
 
     Path(path).write_text(_PLACE.sub(part, _read("page.html")), encoding="utf-8")
 
 
 def asset_within(asset: Textured, path: Path, placement: Placement) -> bytes:
-    """Read an asset's file, or make one with coarser textures where it is too large for a page."""
-    # Of a page of 15 MB; text takes a third more than bytes.
+    """Read an asset's file, or make one with coarser textures if it is too large for a page."""
+    # Half of a page of 15 MB; base64 takes a third more than bytes.
     if path.stat().st_size <= 7_500_000 or min(asset.base_color.shape[:2]) < 2:
         return path.read_bytes()
     with TemporaryDirectory(prefix="pimper_page_") as folder:
@@ -114,13 +107,13 @@ def _read(name: str) -> str:
 
 
 def _text(value: object) -> object:
-    """Write values of settings as YAML in one line; JSON has no infinite numbers."""
+    """Format values of settings as YAML in one line; JSON has no infinite numbers."""
     if isinstance(value, Mapping):
         return {name: _text(inner) for name, inner in value.items()}
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-# Of guards outside of passes, by their rooms.
+# Headings of guards outside of passes, by stage.
 _HEADINGS = dict.fromkeys(
     ("sfm", "silhouettes", "contours", "depth_points", "coarse", "triangulate"),
     "Cameras, silhouettes and coarse surface",
@@ -128,19 +121,19 @@ _HEADINGS = dict.fromkeys(
 
 
 def left_out_by_pass(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """List what guards left out where it matters, as ``closing_line`` decides, pass by pass.
+    """List the significant guards by pass, as ``closing_line`` selects them.
 
     Args:
         entries: ``left_out`` of ``summary.json``.
 
     Returns:
-        For every pass that has some, its ``heading`` and its ``entries``.
+        The ``heading`` and the ``entries`` of every pass that has some.
     """
-    found: dict[str, list[Mapping[str, Any]]] = {}
+    passes: dict[str, list[Mapping[str, Any]]] = {}
     number = 1
     for entry in entries:
-        room = entry["guard"].split(".")[0]
+        stage = entry["guard"].split(".")[0]
         if closing_line([LeftOut(**{**entry, "names": tuple(entry["names"])})]):
-            found.setdefault(_HEADINGS.get(room, f"Pass {number}"), []).append(entry)
-        number += room == "repair"  # ends a pass
-    return [{"heading": heading, "entries": some} for heading, some in found.items()]
+            passes.setdefault(_HEADINGS.get(stage, f"Pass {number}"), []).append(entry)
+        number += stage == "repair"  # ends a pass
+    return [{"heading": heading, "entries": listed} for heading, listed in passes.items()]

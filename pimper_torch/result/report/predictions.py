@@ -1,4 +1,4 @@
-"""Photographs as the surface explains them, small enough for a page."""
+"""Photographs and their predictions from the surface, small enough for a page."""
 
 import base64
 import math
@@ -22,31 +22,31 @@ from pimper_torch.runtime.mapped import drop_pages
 from pimper_torch.runtime.parallel import side_by_side
 
 # The demo's 24 photographs and their predictions take 1.1 MB of its page; more photographs share
-# the room that so many take. Fewer pixels than the least show nothing.
+# this size. Fewer pixels than the minimum are not informative.
 _LONGEST_PX, _SHORTEST_PX, _VIEWS = 800, 120, 24
 
 
 def longest_px(num_views: int) -> int:
-    """Return the longer side of every photograph in a page of so many."""
+    """Return the longer side of every photograph in a page with ``num_views`` photographs."""
     return round(max(_SHORTEST_PX, _LONGEST_PX * min(1.0, math.sqrt(_VIEWS / num_views))))
 
 
 def shrunk(
-    picture: Float[Tensor, "channel height width"], longest: int
+    image: Float[Tensor, "channel height width"], longest: int
 ) -> Float[Tensor, "channel shorter narrower"]:
-    """Average a picture down until its longer side is ``longest`` pixels; small ones stay."""
-    height, width = picture.shape[-2:]
-    return interpolate(picture[None], size=_sides(height, width, longest), mode="area")[0]
+    """Shrink an image by averaging until its longer side is ``longest`` pixels, if it is larger."""
+    height, width = image.shape[-2:]
+    return interpolate(image[None], size=_sides(height, width, longest), mode="area")[0]
 
 
 def _sides(first: int, second: int, longest: int) -> tuple[int, int]:
-    """Return the sides of a picture that is shrunk until both are at most ``longest``."""
+    """Return the sides of an image that is shrunk until both are at most ``longest``."""
     factor = min(1.0, longest / max(first, second))
     return max(1, round(factor * first)), max(1, round(factor * second))
 
 
 def jpeg(radiance: Float[Tensor, "channel height width"]) -> str:
-    """Return a picture of linear radiance, cut off at 1, as a data address of a JPEG."""
+    """Return an image of linear radiance, clipped at 1, as a data URL of a JPEG."""
     colors = to_bytes(radiance.detach().cpu().clamp(0, 1).movedim(0, -1)).expand(-1, -1, 3)
     file = BytesIO()
     Image.fromarray(colors.numpy()).save(file, "JPEG", quality=80)
@@ -54,12 +54,12 @@ def jpeg(radiance: Float[Tensor, "channel height width"]) -> str:
 
 
 def outline(inside: Map, scale: float) -> str:
-    """Trace the border of a silhouette as a path of SVG.
+    """Trace the border of a silhouette as an SVG path.
 
     Args:
-        scale: Pixels of the photograph to one of ``inside``.
+        scale: Pixels of the photograph per pixel of ``inside``.
     """
-    # Local: scipy's image functions take long to import.
+    # Imported here because scipy's image functions are slow to import.
     from skimage.measure import approximate_polygon, find_contours
 
     values = inside.detach().float().cpu().numpy()
@@ -73,11 +73,11 @@ def outline(inside: Map, scale: float) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Prediction(Record):
-    """A photograph as the surface explains it.
+    """A photograph predicted from the surface.
 
     Attributes:
         radiance: Linear, under the photograph's fitted light; zero off the surface.
-        psnr_db: NaN where the photograph was not judged.
+        psnr_db: NaN if the photograph was not evaluated.
     """
 
     radiance: Float[Tensor, "channel height width"]
@@ -92,10 +92,10 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
         mesh: In the scene's frame, with albedo.
     """
     surface, errors = LitSurface(mesh), relighting.errors
-    longest = longest_px(scene.views.num_views) // 2  # rays are what they cost
-    worth = dict(zip(errors.names, errors.psnr_db.tolist(), strict=True))
+    longest = longest_px(scene.views.num_views) // 2  # rays dominate the cost
+    psnr_db = dict(zip(errors.names, errors.psnr_db.tolist(), strict=True))
 
-    def one(view: int) -> Prediction:
+    def of_view(view: int) -> Prediction:
         light, camera = relighting.lights.take([view]), scene.cameras.take([view])
         width, height = camera.sizes_px[0].tolist()
         sides = _sides(width, height, longest)
@@ -103,12 +103,12 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
             intrinsics=scale_intrinsics(camera.intrinsics, sides[0] / width, sides[1] / height),
             sizes_px=torch.tensor([sides]),
         )
-        seen = predict(surface, camera, light, relighting.materials)
-        radiance = seen.nan_to_num(0).movedim(-1, 0)
-        decibels = worth.get(scene.views.names[view], math.nan)
+        image = predict(surface, camera, light, relighting.materials)
+        radiance = image.nan_to_num(0).movedim(-1, 0)
+        decibels = psnr_db.get(scene.views.names[view], math.nan)
         return Prediction(radiance=radiance, light=light, psnr_db=decibels)
 
-    return list(side_by_side(one, range(scene.views.num_views), tracked=False))
+    return list(side_by_side(of_view, range(scene.views.num_views), tracked=False))
 
 
 Json = dict[str, object]
@@ -120,11 +120,11 @@ def view_entries(
     predictions: Sequence[Prediction | None],
     lights_world: Float[Tensor, "view 4"] | None = None,
 ) -> list[Json]:
-    """List the photographs with their pinholes, pictures, silhouettes and lights.
+    """Return the photographs with their pinholes, images, silhouettes and lights, as JSON.
 
     Args:
-        predictions: One a view, ``None`` where there is none.
-        lights_world: First-order light of every view, up to a scale; NaN where it is unknown.
+        predictions: One per view, ``None`` without a prediction.
+        lights_world: First-order light of every view, up to a scale; NaN where unknown.
     """
     longest = longest_px(scene.views.num_views)
     cameras, entries = scene.cameras.to("cpu"), []

@@ -1,4 +1,4 @@
-"""Numbers of a surface's vertices that a page shows in colours."""
+"""Vertex values of a surface that a page displays in colours."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from pimper_torch.records import Mesh
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LengthUnit:
-    """The unit in which people read lengths: ``factor`` of it are one unit of the scene."""
+    """The displayed unit of length: a unit of the scene is ``factor`` of it."""
 
     factor: float
     name: str
@@ -18,7 +18,7 @@ def length_unit(mesh: Mesh, known: str | None = None) -> LengthUnit:
     """Return the unit of lengths of a result.
 
     Args:
-        known: Name of the scene's unit; without, the diagonal of the mesh's bounding box is 100.
+        known: Name of the scene's unit; without it, the diagonal of the mesh's bounding box is 100.
     """
     if known:
         return LengthUnit(factor=1.0, name=known)
@@ -28,11 +28,11 @@ def length_unit(mesh: Mesh, known: str | None = None) -> LengthUnit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VertexLayer:
-    """One number a vertex, shown in colours from ``low`` to ``high``.
+    """One value per vertex, in colours from ``low`` to ``high``.
 
     Attributes:
-        attribute: Of the asset's vertices, in small letters.
-        about: Longer, shown when the button is pointed at.
+        attribute: Of the asset's vertices, in lower case.
+        about: Description, displayed as a tooltip of the button.
     """
 
     attribute: str
@@ -45,14 +45,14 @@ class VertexLayer:
 
 
 def surface_layers(mesh: Mesh, unit: LengthUnit | None = None) -> list[VertexLayer]:
-    """Return the layers of a result's surface; the mesh as it is written decides their ranges."""
+    """Return the layers of a result's surface; the mesh as written determines their ranges."""
     layers = []
     if mesh.expected_error is not None:
-        about = "Standard deviation of the surface along its normal, as the run expects it"
+        about = "Estimated standard deviation of the surface along its normal"
         unit, error = unit or length_unit(mesh), mesh.expected_error
         layers.append(length_layer("_expected_error", "expected error", about, error, unit))
     if mesh.confidence is not None:
-        about = "Confidence of the normals: the number of lights that determine them, and how well"
+        about = "Confidence of the normals: how many lights determine them, and how well"
         layers.append(
             VertexLayer(
                 attribute="_support",
@@ -68,18 +68,18 @@ def surface_layers(mesh: Mesh, unit: LengthUnit | None = None) -> list[VertexLay
 def length_layer(
     attribute: str, title: str, about: str, values: PerVertex, unit: LengthUnit
 ) -> VertexLayer:
-    """Return a layer of lengths, from 0 to Tukey's upper fence: outliers share one colour.
+    """Return a layer of lengths from 0 to Tukey's upper fence; outliers share one colour.
 
-    The fence is the upper quartile and one and a half interquartile ranges; where no value is
-    above it, the range ends at the greatest value.
+    The fence is the upper quartile plus 1.5 interquartile ranges; if no value is above it, the
+    range ends at the maximum.
 
     Source: Tukey, Exploratory Data Analysis, 1977.
     """
-    known = values[values.isfinite()]
-    high, count = 0.0, len(known)
+    finite = values[values.isfinite()]
+    high, count = 0.0, len(finite)
     if count:
         ranks = (1 + (count - 1) // 4, count - (count - 1) // 4)
-        lower, upper = (float(known.kthvalue(rank).values) for rank in ranks)
-        high = min(float(known.max()), upper + 1.5 * (upper - lower))
+        lower, upper = (float(finite.kthvalue(rank).values) for rank in ranks)
+        high = min(float(finite.max()), upper + 1.5 * (upper - lower))
     text = f"{high * unit.factor:.2g} {unit.name} or more"
     return VertexLayer(attribute=attribute, title=title, about=about, high=high, high_text=text)

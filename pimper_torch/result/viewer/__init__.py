@@ -1,1 +1,1 @@
-"""A surface with its cameras and photographs, to turn in a browser."""
+"""Interactive display of a surface with its cameras and photographs in a browser."""

@@ -1,4 +1,4 @@
-"""Layers: what the colours of a surface show."""
+"""Layers: quantities displayed as colours of a surface."""
 
 from io import BytesIO
 
@@ -17,14 +17,14 @@ from pimper_torch.result.report.vertex_layers import VertexLayer, length_unit, s
 from pimper_torch.result.viz.maps import base_color, carried_normals, normal_colors
 
 LAYERS = ("lit", "shape", "albedo", "normals")
-"""Of colours; those of numbers are the report's."""
+"""Layers of colours; those of numbers are shared with the report."""
 VIRIDIS: Float[Tensor, "256 3"] = ColorMap("viridis", 256).colors.T
-"""sRGB of low numbers, dark violet, to high ones, bright yellow."""
+"""sRGB from low values, dark violet, to high ones, bright yellow."""
 _UNLIT = MATTE | {"extensions": {"KHR_materials_unlit": {}}}
 
 
 def layers_of(mesh: Mesh) -> list[str]:
-    """List the layers of what a surface carries."""
+    """Return the names of a surface's layers."""
     colors = [name for name in LAYERS if name != "albedo" or mesh.albedo is not None]
     return colors + [layer.title for layer in surface_layers(mesh)]
 
@@ -35,8 +35,8 @@ def painted(
     """Colour a surface by one of its layers.
 
     Args:
-        viewer_from_world: A similarity. x of the viewer points to the reference camera, z up.
-        unit: Of the mesh, if its size is known.
+        viewer_from_world: A similarity; the viewer's x points to the reference camera, z is up.
+        unit: Of the mesh, if its scale is known.
 
     Returns:
         A GLB in the viewer's frame, and the layer if it is one of numbers.
@@ -46,15 +46,15 @@ def painted(
     normals = normalize(rotate(viewer_from_world, carried_normals(mesh).double()), dim=1)
     colors = base_color(mesh).expand(-1, 3)
     if name == "normals":
-        right_down_ahead = normals[:, [1, 2, 0]] * normals.new_tensor([1.0, -1.0, -1.0])
-        colors = linear_from_srgb(normal_colors(right_down_ahead))
+        normals_cam = normals[:, [1, 2, 0]] * normals.new_tensor([1.0, -1.0, -1.0])
+        colors = linear_from_srgb(normal_colors(normals_cam))
     layers = {layer.title: layer for layer in surface_layers(mesh, length_unit(mesh, unit))}
     layer = layers.get(name)
     if layer is not None:
         values = mesh.confidence if layer.attribute == "_support" else mesh.expected_error
         assert values is not None
-        shares = ((values - layer.low) / (layer.high - layer.low or 1)).nan_to_num(1)
-        colors = linear_from_srgb(VIRIDIS[(255 * shares.clamp(0, 1)).round().long()])
+        fractions = ((values - layer.low) / (layer.high - layer.low or 1)).nan_to_num(1)
+        colors = linear_from_srgb(VIRIDIS[(255 * fractions.clamp(0, 1)).round().long()])
     attributes = {
         "POSITION": transform(viewer_from_world, mesh.vertices_world.double()).numpy(),
         "NORMAL": normals.numpy(),
@@ -65,7 +65,7 @@ def painted(
 
 
 def color_bar(layer: VertexLayer) -> str:
-    """Return HTML of a bar between the texts of a layer's lowest and highest number."""
+    """Return HTML of a colour bar between the texts of a layer's limits."""
     stops = ", ".join(f"rgb({r} {g} {b})" for r, g, b in (255 * VIRIDIS[::51]).int().tolist())
     return (
         '<div style="display: flex; gap: 6px; align-items: center; padding: 2px 10px; '
@@ -75,15 +75,15 @@ def color_bar(layer: VertexLayer) -> str:
     )
 
 
-def pane(picture: np.ndarray, corners: np.ndarray, opacity: float) -> bytes:
-    """Return a GLB of a photograph that things shine through.
+def pane(image: np.ndarray, corners: np.ndarray, opacity: float) -> bytes:
+    """Return a GLB of a translucent photograph.
 
     Args:
-        picture: 8-bit sRGB.
-        corners: Upper left, and on clockwise.
+        image: 8-bit sRGB.
+        corners: Clockwise from the upper left.
     """
     file, corner = BytesIO(), np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    Image.fromarray(picture).save(file, "JPEG", quality=90)
+    Image.fromarray(image).save(file, "JPEG", quality=90)
     surface = {"baseColorTexture": {"index": 0}, "baseColorFactor": [1.0, 1.0, 1.0, opacity]}
     material = {**_UNLIT, "alphaMode": "BLEND", "pbrMetallicRoughness": surface}
     attributes = {"POSITION": corners, "TEXCOORD_0": corner}

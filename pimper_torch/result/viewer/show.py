@@ -1,4 +1,4 @@
-"""Results in a browser or a notebook, from Python."""
+"""Display of results in a browser or a notebook, from Python."""
 
 from pathlib import Path
 
@@ -16,12 +16,12 @@ COARSE, RESULT = "coarse surface", "result"
 
 
 def add_folder(viewer: Viewer, path: Path | str, photographs: Path | str | None = None) -> None:
-    """Show a folder that ``pimper reconstruct`` wrote, or a mesh file alone.
+    """Add a folder that ``pimper reconstruct`` wrote, or a mesh file.
 
-    Where its photographs are gone, a warning says so, and the rest is shown.
+    If its photographs are missing, a warning is given, and the rest is displayed.
 
     Args:
-        photographs: Their folder; by default the one that the result names.
+        photographs: Their folder; by default the one named in the result.
 
     Raises:
         InputError: There is no surface, or it cannot be read.
@@ -38,52 +38,53 @@ def add_folder(viewer: Viewer, path: Path | str, photographs: Path | str | None 
             caution(f"{error} The viewer shows no photographs.", stacklevel=2)
         names, reference = estimate.names, estimate.reference
         if estimate.cameras is not None and names:
-            place = names.index(reference) if reference in names else 0
+            index = names.index(reference) if reference in names else 0
             points = read_model(path / "sparse").points_world
-            viewer.add_cameras(names, estimate.cameras, points, place)
+            viewer.add_cameras(names, estimate.cameras, points, index)
         viewer.add_pass(RESULT, estimate.mesh)
     else:
         add_found(viewer, result)
 
 
 def add_found(
-    viewer: Viewer, found: SparseScene | Step | Mesh | Result | Reconstruction, reference: int = 0
+    viewer: Viewer, result: SparseScene | Step | Mesh | Result | Reconstruction, reference: int = 0
 ) -> None:
-    """Show cameras, photographs and points, a surface, or a whole result."""
-    if isinstance(found, SparseScene):
-        names = found.views.names
-        viewer.add_cameras(names, found.cameras, found.points_world, reference, found.views)
-    elif isinstance(found, Step):
-        viewer.add_pass(f"pass at {found.scale:g} of the photographs", found.surface.mesh)
-    elif isinstance(found, Mesh):
-        viewer.add_pass("surface", found)
+    """Add cameras, photographs and points, a surface, or a complete result."""
+    if isinstance(result, SparseScene):
+        names = result.views.names
+        viewer.add_cameras(names, result.cameras, result.points_world, reference, result.views)
+    elif isinstance(result, Step):
+        viewer.add_pass(f"pass at {result.scale:g} of the photographs", result.surface.mesh)
+    elif isinstance(result, Mesh):
+        viewer.add_pass("surface", result)
     else:
-        if isinstance(found, Reconstruction):
-            add_found(viewer, found.scene, found.coarse.reference)
-            viewer.add_pass(COARSE, found.coarse.mesh)
+        if isinstance(result, Reconstruction):
+            add_found(viewer, result.scene, result.coarse.reference)
+            viewer.add_pass(COARSE, result.coarse.mesh)
         else:
-            add_found(viewer, found.scene, found.scene.views.names.index(found.reference))
-        viewer.add_pass(RESULT, found.mesh)
+            add_found(viewer, result.scene, result.scene.views.names.index(result.reference))
+        viewer.add_pass(RESULT, result.mesh)
 
 
 def show(
     result: Reconstruction | Result | Mesh | Path | str, *, host: str = HOST, port: int = PORT
 ) -> Viewer:
-    """Open a surface, with cameras, photographs and points where it has some, in the viewer.
+    """Open a surface in the viewer, with its cameras, photographs and points if it has some.
 
-    As the last line of a notebook's cell it shows the page there; elsewhere
-    :attr:`~pimper_torch.result.viewer.viewer.Viewer.address` opens in a browser. The page lives as
-    long as the process: scripts end with :meth:`~pimper_torch.result.viewer.viewer.Viewer.wait`.
+    As the last expression of a notebook cell, it displays the page there; elsewhere, open
+    :attr:`~pimper_torch.result.viewer.viewer.Viewer.address` in a browser. The page works while the
+    process runs: scripts end with :meth:`~pimper_torch.result.viewer.viewer.Viewer.wait`.
 
     Args:
-        result: What a chain or :func:`~pimper_torch.doors.export.result.read_result` returned, a
+        result: The result of a chain or of :func:`~pimper_torch.doors.export.result.read_result`,
+            a mesh, or the path of a result folder or of a mesh.
             mesh, or the path of a folder of results or of a mesh.
-        host: Address of this machine that the page is served at.
-        port: The next free one is taken where another program has it; 0 takes any.
+        host: Address of this machine at which the page is served.
+        port: The next free one is used if it is in use; 0 selects any.
 
     Raises:
-        PimperError: viser, the extra ``view``, is missing, there is no such host or port, or the
-            folder holds no surface.
+        PimperError: viser, the extra ``view``, is missing, ``host`` or ``port`` is invalid, or the
+            folder contains no surface.
     """
     viewer = Viewer(host, port)
     try:

@@ -1,4 +1,4 @@
-"""Maps of a mesh as a view shows it, pixel by pixel."""
+"""Maps of a mesh in a view, one value per pixel."""
 
 from dataclasses import dataclass
 
@@ -19,14 +19,14 @@ _GREY = 0.5  # colour of a mesh of unknown albedo
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ViewMaps(Record):
-    """A mesh seen through the pixels of one camera.
+    """A mesh rendered to the pixels of one camera.
 
     Attributes:
         seen: True where the ray through the pixel's centre meets the mesh.
-        depth: Along the camera's z; NaN where nothing is seen.
-        normals_cam: Unit, camera frame, as the mesh carries them; zero where nothing is seen.
-        albedo: As the mesh carries it; zero where nothing is seen.
-        expected_error: The same, scene units; ``None`` where the mesh carries none.
+        depth: Along the camera's z; NaN off the mesh.
+        normals_cam: Unit, camera frame, interpolated from the mesh; zero off the mesh.
+        albedo: Interpolated from the mesh; zero off the mesh.
+        expected_error: Likewise, scene units; ``None`` if the mesh has none.
     """
 
     seen: Mask
@@ -37,7 +37,7 @@ class ViewMaps(Record):
     expected_error: Map | None = None
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return what NPZ files hold: depth, mask, confidence, and expected error where known."""
+        """Return the arrays of NPZ files: depth, mask, confidence, and expected error if known."""
         maps = {"depth": self.depth, "mask": self.seen, "confidence": self.confidence}
         if self.expected_error is not None:
             maps["expected_error"] = self.expected_error
@@ -45,13 +45,13 @@ class ViewMaps(Record):
 
 
 def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None) -> ViewMaps:
-    """Look at a mesh through one camera.
+    """Render the maps of a mesh in one camera. Not differentiable.
 
-    A mesh without normals shows those of its faces, averaged around the vertices; one without
-    albedo is grey, one without confidence has full confidence. A constant to autograd.
+    A mesh without normals gets vertex normals; one without albedo is grey, and one without
+    confidence has full confidence.
 
     Args:
-        hits: Of the view's rays on the mesh, if they are known already.
+        hits: Of the view's rays on the mesh, if already computed.
     """
     hits = hits or cast_view(mesh, cameras, view)
     vertices = mesh.vertices_world
@@ -60,61 +60,61 @@ def view_maps(mesh: Mesh, cameras: Cameras, view: int, hits: Hits | None = None)
     error = mesh.expected_error
     seen = hits.face >= 0
 
-    def shown(values: Float[Tensor, "vertex channel"]) -> Float[Tensor, "height width channel"]:
+    def rendered(values: Float[Tensor, "vertex channel"]) -> Float[Tensor, "height width channel"]:
         return hits.interpolate(values, mesh.faces)
 
-    normals_world = normalize(shown(carried_normals(mesh)), dim=-1)
+    normals_world = normalize(rendered(carried_normals(mesh)), dim=-1)
     return ViewMaps(
         seen=seen,
         depth=torch.where(seen, hits.distance, torch.nan),
         normals_cam=rotate(cameras.cam_from_world[view], normals_world),
-        albedo=shown(albedo),
-        confidence=shown(confidence[:, None])[..., 0],
-        expected_error=None if error is None else shown(error[:, None])[..., 0],
+        albedo=rendered(albedo),
+        confidence=rendered(confidence[:, None])[..., 0],
+        expected_error=None if error is None else rendered(error[:, None])[..., 0],
     )
 
 
 def carried_normals(mesh: Mesh) -> Vertices:
-    """Return a mesh's normals; without, those of its faces, averaged around the vertices."""
+    """Return a mesh's normals; without normals, the means of adjacent faces' normals."""
     if mesh.normals_world is None:
         return vertex_normals(mesh.vertices_world, mesh.faces)
     return mesh.normals_world
 
 
 def normal_colors(normals_cam: Vectors) -> Vectors:
-    """Colour normals the usual way: red to the right, green up, blue to the viewer.
+    """Return the usual colours of normals: red to the right, green up, blue to the viewer.
 
-    Zero, where there is no normal, is black.
+    A zero vector, for a missing normal, is black.
 
     >>> normal_colors(torch.tensor([0.0, 0.0, -1.0]))  # faces the camera
     tensor([0.5000, 0.5000, 1.0000])
     """
     colors = 0.5 + 0.5 * normals_cam * normals_cam.new_tensor([1.0, -1.0, -1.0])
-    there = (normals_cam != 0).any(dim=-1, keepdim=True)
-    return torch.where(there, colors.clamp(0, 1), 0)
+    present = (normals_cam != 0).any(dim=-1, keepdim=True)
+    return torch.where(present, colors.clamp(0, 1), 0)
 
 
 def albedo_scale(mesh: Mesh) -> float:
-    """Choose the factor that brings a mesh's albedo, free up to a scale, into [0, 1].
+    """Return the factor that scales a mesh's albedo, known up to a scale, to [0, 1].
 
-    It takes the brightest vertices but for one in a hundred, which highlights may have
-    spoilt, to 0.9.
+    It scales the 99th percentile of the brightest channel to 0.9, because highlights may have
+    corrupted brighter vertices.
     """
     if mesh.albedo is None or not len(mesh.albedo):
         return 1.0
     brightest = mesh.albedo.detach().amax(dim=-1).nan_to_num(0)
-    known = brightest[brightest > 0]
-    if not len(known):
+    positive = brightest[brightest > 0]
+    if not len(positive):
         return 1.0
-    rank = max(1, round(0.99 * len(known)))
-    return float(0.9 / known.kthvalue(rank).values)
+    rank = max(1, round(0.99 * len(positive)))
+    return float(0.9 / positive.kthvalue(rank).values)
 
 
 def base_color(mesh: Mesh, scale: float | None = None) -> Float[Tensor, "vertex channel"]:
-    """Return a mesh's albedo in [0, 1], linear: glTF's base colour; grey where it has none.
+    """Return a mesh's linear albedo in [0, 1], glTF's base colour; grey without albedo.
 
     Args:
-        scale: Of the albedo; :func:`albedo_scale` without.
+        scale: Of the albedo; by default :func:`albedo_scale`.
     """
     if mesh.albedo is None:
         return torch.full_like(mesh.vertices_world, _GREY)

@@ -10,35 +10,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _RULER_MM = 100
-# White cells are drawn along rows and along columns: viewers leave hairlines between shapes that
-# only touch.
+# White cells are drawn along rows and along columns, because viewers show hairlines between shapes
+# that only touch.
 _HINT = (
-    "Print at 100 %, not fitted to the page, and check that the ruler has 100 mm.",
+    "Print at 100 %, not fitted to the page, and check that the ruler measures 100 mm.",
     "Lay the sheet flat, put the object on it, and photograph both.",
 )
 
 
 def write_sheet(path: Path | str, side_mm: int = SIDE_MM, paper: Paper = "a4") -> None:
-    """Write a sheet of markers, to be printed and photographed with the object, as PDF.
+    """Write a sheet of markers as PDF, to be printed and photographed with the object.
 
-    AprilTags of the family 36h11 along the border, and a ruler of 100 mm in the middle that shows
-    whether the printer scaled the page. The same arguments give the same bytes.
+    It has AprilTags of the family 36h11 along the border, and a ruler of 100 mm in the middle to
+    check the scale of the print. The same arguments give the same bytes.
 
     Args:
-        side_mm: Of the black squares, 10 to 36; the markers' numbers encode it.
+        side_mm: Side of the black squares, 10 to 36; encoded in the markers' numbers.
     """
     figure = draw_sheet(side_mm, paper)
     figure.savefig(path, format="pdf", metadata={"CreationDate": None, "Title": TITLE})
 
 
 def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
-    """Draw a sheet of markers in its size.
+    """Draw a sheet of markers at its size.
 
     Args:
-        side_mm: Of the black squares, 10 to 36.
+        side_mm: Side of the black squares, 10 to 36.
     """
-    # Local, so that importing the package does not load matplotlib; Figure without pyplot leaves no
-    # global state behind.
+    # Imported here so that importing the package does not load matplotlib; Figure without pyplot
+    # leaves no global state.
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.figure import Figure
 
@@ -52,11 +52,11 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
     for code, (left, top) in layout(side_mm, paper).items():
         _draw_marker(axes, code, left, top, side_mm)
     left, y = (width - _RULER_MM) / 2, height / 2
-    for at in range(0, _RULER_MM + 1):
-        length = 6 if at % 10 == 0 else 4 if at % 5 == 0 else 2.5
-        axes.plot([left + at, left + at], [y, y - length], color="black", linewidth=0.3)
-        if at % 10 == 0:
-            axes.text(left + at, y - 7, str(at), ha="center", fontsize=7)
+    for mark in range(0, _RULER_MM + 1):
+        length = 6 if mark % 10 == 0 else 4 if mark % 5 == 0 else 2.5
+        axes.plot([left + mark, left + mark], [y, y - length], color="black", linewidth=0.3)
+        if mark % 10 == 0:
+            axes.text(left + mark, y - 7, str(mark), ha="center", fontsize=7)
     axes.plot([left, left + _RULER_MM], [y, y], color="black", linewidth=0.3)
     axes.text(left + _RULER_MM / 2, y + 5, "100 mm", ha="center", fontsize=8)
     sentences = (*_HINT, f"pimper markers: sides of {side_mm} mm, AprilTag 36h11.")
@@ -76,9 +76,9 @@ def _draw_marker(axes: Any, code: int, left: float, top: float, side: float) -> 
 
 
 def _runs(white: list[bool]) -> list[tuple[int, int]]:
-    """List where runs start, and how long they are."""
-    starts = [at for at, one in enumerate(white) if one and not (at and white[at - 1])]
-    ends = [at for at, one in enumerate(white, 1) if one and not (at < len(white) and white[at])]
+    """Return the start and length of every run of true values."""
+    starts = [i for i, cell in enumerate(white) if cell and not (i and white[i - 1])]
+    ends = [i for i, cell in enumerate(white, 1) if cell and not (i < len(white) and white[i])]
     return [(start, end - start) for start, end in zip(starts, ends, strict=True)]
 
 

@@ -1,4 +1,4 @@
-"""Shaded pictures of a mesh, honest about its geometry."""
+"""Shaded images of a mesh that show only its geometry."""
 
 import math
 
@@ -17,45 +17,45 @@ from pimper_torch.records import Cameras, Mesh
 
 Pixel = Float[Tensor, " 2"]
 
-# Raking light from up on the left shows the relief; a weaker one next to the viewer keeps the far
-# side from drowning.
+# Raking light from the upper left shows the relief; a weaker one next to the viewer brightens the
+# far side.
 _POINT_LIGHTS_CAM = ((0.62, (-0.60, -0.60, -0.53)), (0.26, (0.0, 0.0, -1.0)))
 _INSIDE = (0.55, 0.62, 0.75)  # tint of faces seen from behind
 
 
 def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "height width 3"]:
-    """Draw a mesh as grey matte stuff under a raking point light.
+    """Draw a mesh as a grey matte surface under raking light. Not differentiable.
 
-    Its own shape is shaded, never the normals that it carries: relief that is seen is there.
-    Faces seen from behind are bluish. A constant to autograd.
+    Shading is computed from the geometry, never from the mesh's stored normals, so visible relief
+    exists. Faces seen from behind are bluish.
 
     Args:
-        flat: Every face has one tone; else tones are blended between vertices, whose normals are
-            their faces' mean.
+        flat: One tone per face; otherwise, tones are interpolated between vertices, with the mean
+            normals of their faces.
 
     Returns:
-        sRGB in [0, 1], white where nothing is seen.
+        sRGB in [0, 1], white off the mesh.
     """
     fine = camera.replace(
         intrinsics=scale_intrinsics(camera.intrinsics, 2.0, 2.0), sizes_px=camera.sizes_px * 2
     )
     hits = cast_view(mesh, fine, 0)
-    seen = hits.face >= 0
+    visible = hits.face >= 0
     per_face = unit_face_normals(mesh.vertices_world, mesh.faces)
     corners = mesh.vertices_world[mesh.faces]
     from_behind = ((corners[:, 0] - fine.centers_world[0]) * per_face).sum(dim=-1) > 0
-    shown = per_face[:, None].expand_as(corners)
+    normals = per_face[:, None].expand_as(corners)
     if not flat:
-        shown = vertex_normals(mesh.vertices_world, mesh.faces)[mesh.faces]
+        normals = vertex_normals(mesh.vertices_world, mesh.faces)[mesh.faces]
     normals_cam = rotate(
-        fine.cam_from_world, torch.where(from_behind[:, None, None], -shown, shown)
+        fine.cam_from_world, torch.where(from_behind[:, None, None], -normals, normals)
     )
     light = lambertian(normals_cam)
     tint = torch.where(from_behind[:, None], light.new_tensor(_INSIDE), 1.0)
-    face = hits.face[seen]
-    blended = (hits.barycentric[seen] * light[face]).sum(dim=-1, keepdim=True)
+    face = hits.face[visible]
+    blended = (hits.barycentric[visible] * light[face]).sum(dim=-1, keepdim=True)
     radiance = torch.ones_like(hits.barycentric)
-    radiance[seen] = blended * tint[face]
+    radiance[visible] = blended * tint[face]
     radiance = avg_pool2d(radiance.movedim(-1, 0)[None], 2)[0].movedim(0, -1)
     return tone(radiance)
 
@@ -63,13 +63,13 @@ def shade(mesh: Mesh, camera: Cameras, *, flat: bool = False) -> Float[Tensor, "
 def tone(radiance: Scalars) -> Scalars:
     """Encode the radiance of matte surfaces for a display, in [0, 1].
 
-    Well short of a display's curve: steeper tones show more of the shape.
+    The curve is flatter than sRGB's, which shows more of the shape.
     """
     return radiance.clamp(0, 1) ** (1 / 1.3)
 
 
 def lambertian(normals_cam: Vectors) -> Scalars:
-    """Return the radiance of white matte surfaces under the lights of all pictures.
+    """Return the radiance of white matte surfaces under the lights of all renderings.
 
     Args:
         normals_cam: Unit, camera frame.
@@ -82,10 +82,10 @@ def lambertian(normals_cam: Vectors) -> Scalars:
 
 
 def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
-    """Move a camera around a point, about the vertical of the picture.
+    """Rotate a camera around a point, about the image's vertical axis.
 
     Args:
-        center_world: The point, which stays at its pixel and its distance.
+        center_world: The point; its pixel and distance do not change.
         angle_deg: Positive moves to the right and shows the object's right side.
     """
     angle = math.radians(angle_deg)
@@ -97,20 +97,20 @@ def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: floa
 
 
 def frame(camera: Cameras, points_world: Points, longer_side_px: int, margin: float) -> Cameras:
-    """Crop and scale a camera's picture to the bounding box of some points.
+    """Crop and scale a camera's image to the bounding box of points.
 
     Args:
-        points_world: At least one of them in front of the camera.
+        points_world: At least one is in front of the camera.
         margin: Around the box, as a fraction of its longer side.
     """
     return crop(camera, *bounding_box(camera, points_world, margin), longer_side_px)
 
 
 def crop(camera: Cameras, low: Pixel, high: Pixel, longer_side_px: int) -> Cameras:
-    """Crop and scale a camera's picture to a rectangle.
+    """Crop and scale a camera's image to a rectangle.
 
     Args:
-        low: Upper left corner, pixels; the rectangle may be outside of the picture.
+        low: Upper left corner, pixels; the rectangle may extend beyond the image.
     """
     factor = longer_side_px / float((high - low).detach().max())
     cropped = camera.intrinsics.clone()
@@ -121,9 +121,9 @@ def crop(camera: Cameras, low: Pixel, high: Pixel, longer_side_px: int) -> Camer
 
 
 def bounding_box(camera: Cameras, points_world: Points, margin: float) -> tuple[Pixel, Pixel]:
-    """Return the corners (top left, bottom right) of the pixels that some points cover."""
+    """Return the corners (top left, bottom right) of the points' bounding box in pixels."""
     pixels, depth = project(points_world, camera.cam_from_world[0], camera.intrinsics[0])
     pixels = pixels[depth > 0]
     low, high = pixels.amin(dim=0), pixels.amax(dim=0)
-    room = margin * (high - low).max().clamp_min(1)
-    return low - room, high + room
+    padding = margin * (high - low).max().clamp_min(1)
+    return low - padding, high + padding

@@ -1,4 +1,4 @@
-"""A turning picture of a surface: a loop that browsers and file managers play."""
+"""An animated image of a rotating surface, for browsers and file managers."""
 
 import math
 from pathlib import Path
@@ -18,18 +18,18 @@ from pimper_torch.result.viz.maps import albedo_scale
 from pimper_torch.result.viz.render import lambertian, tone
 from pimper_torch.runtime.parallel import side_by_side
 
-# Choices: a turn in three seconds, seen from a little above, in 0.2 MB.
+# Choices: a turn in three seconds, seen from slightly above, in 0.2 MB.
 _FRAMES, _FRAME_MS = 30, 100
 _OVERSAMPLING = 2
 _ELEVATION_DEG, _FOV_DEG, _MARGIN = 15.0, 30.0, 1.03
-_QUALITY, _EXPOSURE = 70, 1.4  # the latter takes albedo under the raking light to its own tones
+_QUALITY, _EXPOSURE = 70, 1.4  # the exposure preserves the albedo's brightness under raking light
 
 
 def up_world(cameras: Cameras) -> Vector:
-    """Return the direction that pictures call up: y, unless photographs were held otherwise.
+    """Return the up direction of images: y, unless the photographs contradict it.
 
-    The frame has y up where a plane or level cameras showed it; otherwise up is that of the
-    photographs on average.
+    The frame has y up if a plane or level cameras determined it; otherwise up is the mean up
+    direction of the photographs.
     """
     mean = normalize(-cameras.cam_from_world[:, 1, :3].mean(dim=0), dim=0)
     return torch.tensor([0.0, 1.0, 0.0]).to(mean) if float(mean[1]) > 0.5 else mean
@@ -41,11 +41,11 @@ def draw_turn(
 ) -> None:
     """Draw one turn of a surface, its shape on the left and its lit albedo on the right.
 
-    An animated WebP with a transparent ground. The light stays next to the viewer.
+    The file is an animated WebP with transparent background. The light moves with the viewer.
 
     Args:
-        cameras: Of the photographs, which show where up is.
-        reference: View whose side of the surface is seen first.
+        cameras: Of the photographs; they determine up.
+        reference: View from whose side the turn starts.
     """
     mesh, cameras = mesh.to("cpu"), cameras.to("cpu")
     start = cameras.centers_world[reference]
@@ -56,18 +56,18 @@ def draw_turn(
     look = torch.cat([normals, colors], dim=1)
 
     def drawn(view: int) -> Image.Image:
-        """Draw the shape and the lit albedo side by side, averaged over the pixels' parts."""
+        """Draw the shape and the lit albedo side by side, with anti-aliasing."""
         hits, pose = cast_view(mesh, circle, view), circle.cam_from_world[view]
-        seen = hits.face >= 0
-        values = hits.take(seen).interpolate(look, mesh.faces)
+        visible = hits.face >= 0
+        values = hits.take(visible).interpolate(look, mesh.faces)
         shading = lambertian(normalize(rotate(pose, values[:, :3]), dim=-1))[:, None]
         lit = srgb_from_linear((_EXPOSURE * shading * values[:, 3:]).clamp(0, 1))
-        layers = seen.float().repeat(4, 2, 1, 1)
-        layers[:3, :, seen] = torch.stack([tone(shading).expand_as(lit), lit]).movedim(-1, 0)
+        layers = visible.float().repeat(4, 2, 1, 1)
+        layers[:3, :, visible] = torch.stack([tone(shading).expand_as(lit), lit]).movedim(-1, 0)
         colors = avg_pool2d(layers.transpose(1, 2).flatten(2), _OVERSAMPLING).movedim(0, -1)
         opacity = colors[..., 3:]
-        picture = torch.cat([colors[..., :3] / opacity.clamp_min(1e-6), opacity], dim=-1)
-        return Image.fromarray((255 * picture).round().to(torch.uint8).numpy())
+        image = torch.cat([colors[..., :3] / opacity.clamp_min(1e-6), opacity], dim=-1)
+        return Image.fromarray((255 * image).round().to(torch.uint8).numpy())
 
     frames = list(side_by_side(drawn, range(_FRAMES), tracked=False))
     frames[0].save(
@@ -83,24 +83,24 @@ def draw_turn(
 
 
 def circling(mesh: Mesh, up: Vector, start: Vector, number: int, side_px: int) -> Cameras:
-    """Return square pinholes that look at a mesh from a circle around it.
+    """Return square pinholes on a circle around a mesh, looking at it.
 
     Args:
         up: Unit, world frame.
-        start: World point on whose side of the mesh the first pinhole is.
-        number: Of cameras, equally far apart.
+        start: World point; the first pinhole is on its side of the mesh.
+        number: Number of cameras, equally spaced.
     """
     low, high = mesh.vertices_world.amin(dim=0), mesh.vertices_world.amax(dim=0)
     center = (low + high) / 2
     radius = float((mesh.vertices_world - center).norm(dim=1).max())
-    ahead = start - center
-    ahead = normalize(ahead - (ahead @ up) * up, dim=0)
-    beside = torch.linalg.cross(up, ahead)
+    front = start - center
+    front = normalize(front - (front @ up) * up, dim=0)
+    side = torch.linalg.cross(up, front)
     elevation = math.radians(_ELEVATION_DEG)
     angles = torch.arange(number).to(up) * (2 * math.pi / number)
-    level = angles.cos()[:, None] * ahead + angles.sin()[:, None] * beside
+    horizontal = angles.cos()[:, None] * front + angles.sin()[:, None] * side
     half = math.radians(_FOV_DEG) / 2
-    back = math.cos(elevation) * level + math.sin(elevation) * up
+    back = math.cos(elevation) * horizontal + math.sin(elevation) * up
     eyes = center + _MARGIN * radius / math.sin(half) * back
     focal_px = side_px / 2 / math.tan(half)
     return pinholes(look_at(eyes, center, up), focal_px, side_px, side_px)
