@@ -78,14 +78,14 @@ def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
 
     The file is memory-mapped: pages are read on first use, and writing into a tensor does not
     change the file. Fields that shared a tensor share it again. Structure, names and shapes are
-    checked before a tensor's memory is read; values are checked by the stages that
+    checked before a tensor's memory is read; stages check the values when they
     use the record (:meth:`~pimper_torch.records.record.Record.check`).
 
     Returns:
         The record, on the CPU.
 
     Raises:
-        InputError: The file does not exist, is damaged, has another format, or contains a record
+        InputError: The file does not exist, is damaged, has a different format, or contains a record
             other than ``cls`` as its fields are annotated.
     """
     return load_with_metadata(cls, path)[0]

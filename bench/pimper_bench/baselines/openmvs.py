@@ -168,7 +168,7 @@ def run_program(command: Sequence[Path | str], folder: Path, deadline: float, th
     printed = _text(log.name)
     if status != 0:
         ending = f"exit status {status}" if status > 0 else f"ended by signal {-status}"
-        hint = "; hint because memory ran out" if status == -signal.SIGKILL else ""
+        hint = "; often because memory ran out" if status == -signal.SIGKILL else ""
         raise ReconstructionError(f"{name} failed ({ending}{hint}).{_last_lines(printed)}")
     return printed
 

@@ -269,7 +269,7 @@ def legend(table: Table) -> list[str]:
     if any(row.published for row in table.rows):
         sentences.append(
             f"{_PUBLISHED_MARK} As published, on other photographs (real ones, 30 of 1600x1200) "
-            "and another machine; its error is not defined there."
+            "and on a different machine; its error is not defined there."
         )
     settings = ", ".join(f"{name} {_plain(str(value))}" for name, value in table.settings.items())
     measured = f"Scale {table.scale}, {table.date}, on {_plain(table.machine.summary)}"

@@ -98,7 +98,7 @@ def run_bench(
         (staging / "meshes").mkdir()
         for scene in config.scenes:
             try:
-                scene_rows, panels = _scene(scene, methods, config, Path(workspace), staging, cache)
+                measured, pictured = _scene(scene, methods, config, Path(workspace), staging, cache)
             except KeyboardInterrupt:
                 if not rows:
                     raise
@@ -108,8 +108,8 @@ def run_bench(
                     stacklevel=2,
                 )
                 break
-            rows += scene_rows
-            sheet_rows += panels
+            rows += measured
+            sheet_rows += pictured
         table = Table(
             rows=with_published(rows),
             machine=this_machine(),

@@ -78,7 +78,7 @@ _OPTIONS = tuple(field.name for field in dataclasses.fields(ReadOptions))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConvertJob:
-    """Read a data set in one layout and write its photographs and cameras in another.
+    """Read a data set in one layout and write its photographs and cameras in a different one.
 
     Photographs are written as 8-bit sRGB, undistorted, with pinhole cameras.
 

@@ -1,7 +1,7 @@
-"""Readers of public data sets, and their layouts as formats to write.
+"""Readers of public data sets, and writers of their layouts.
 
-Where a folder is laid out otherwise, or a file is missing or damaged, a reader raises
-:class:`~pimper_torch.runtime.errors.InputError`, which says what was expected and what was found.
+If a folder has a different layout, or a file is missing or damaged, a reader raises
+:class:`~pimper_torch.runtime.errors.InputError` with the expected and the found layout.
 """
 
 from pimper_bench.datasets.colmap import write_colmap

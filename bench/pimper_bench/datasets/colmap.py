@@ -1,4 +1,4 @@
-"""COLMAP: photographs and masks beside a model, written."""
+"""Writing of COLMAP models with photographs and masks."""
 
 from pathlib import Path
 
@@ -15,17 +15,17 @@ from pimper_torch.records import Cameras, Views
 def write_colmap(
     views: Views, cameras: Cameras, folder: Path | str, *, points_world: Points | None = None
 ) -> None:
-    """Write photographs, masks and pinholes as COLMAP reads them.
+    """Write photographs, masks and pinholes for COLMAP.
 
-    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with another
-    ``.png`` behind, ``sparse/0/`` the model, binary.
+    ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with ``.png``
+    appended, ``sparse/0/`` the model, binary.
 
     Args:
         views: Undistorted.
-        points_world: A cloud to put in the model, without tracks and black.
+        points_world: Points of the model, without tracks and black.
 
     Raises:
-        InputError: A camera has a skew, which COLMAP's pinhole cannot have.
+        InputError: A camera has a skew, which COLMAP's pinhole does not support.
     """
     folder = Path(folder)
     refuse_skew(cameras, views.names, "a COLMAP model")

@@ -18,7 +18,7 @@ from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.doors.camera_files.posed_camera import decompose_projections
 from pimper_torch.doors.io.meshes import read_mesh
 
-# Photometric stereo's axes are x right, y up, z towards the viewer; this turns them to ours.
+# Photometric stereo's axes are x right, y up, z towards the viewer; this converts them to ours.
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 _VIEW = re.compile(r"view_(\d{2})")
 
@@ -34,20 +34,20 @@ def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Cap
         view_01/filenames.txt            their order; 001.png and so on where it is absent
         view_01/light_directions.txt, light_intensities.txt, mask.png, Normal_gt.mat
 
-    Light directions and normals come in each view's own frame with x right, **y up and z
-    towards the viewer**; they are turned into the world. ``Rc`` is not exactly orthogonal in
-    the published files: what is left over goes into ``K``, so that points project exactly
-    where they do with the files' own product. ``KK`` counts pixel centres from 0.
+    Light directions and normals are in each view's frame with x right, **y up and z
+    towards the viewer**; they are converted to the world. ``Rc`` is not exactly orthogonal in
+    the published files: the remainder is moved to ``K``, so points project exactly as with the
+    product in the files. ``KK`` counts pixel centres from 0.
 
     Args:
         options: See :func:`~pimper_bench.datasets.sampling.read_shots`; views and lights
             count from 1.
 
     Returns:
-        ``truth.lights_world`` has the lights' mean intensity.
+        ``truth.lights_world`` has the lights' mean intensity over channels.
 
     Source: Li, Zhou, Wu, Shi, Diao & Tan, Multi-view photometric stereo, IEEE TIP 29, 2020;
-    layout and axes as its benchmark page and public loaders (PS-NeRF, SuperNormal) have them.
+    layout and axes as in its benchmark page and public loaders (PS-NeRF, SuperNormal).
     """
     root = DataSetPath(Path(folder), "DiLiGenT-MV")
     root.expect(root.path.is_dir(), "an object's folder such as mvpmsData/bearPNG")
@@ -59,27 +59,27 @@ def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Cap
     root.expect(bool(folders), "folders view_01, view_02 and so on")
     calibration, mesh = root.inner("Calib_Results.mat"), root.path / "mesh_Gt.ply"
     shots = [shot for view, inner in folders.items() for shot in _shots(view, inner, root)]
-    found = read_shots(
+    selection = read_shots(
         shots,
         root,
         lambda views: decompose_projections(read_toolbox_projections(calibration, views)),
         **options,
     )
-    views, position = found.capture.views, found.capture.position
-    world_from_cam = found.cam_from_world[:, :3, :3].mT
-    directions = [shot.direction for shot in found.chosen if shot.direction is not None]
-    strength = torch.tensor([shot.strength for shot in found.chosen], dtype=torch.float64)
+    views, position = selection.capture.views, selection.capture.position
+    world_from_cam = selection.cam_from_world[:, :3, :3].mT
+    directions = [shot.direction for shot in selection.chosen if shot.direction is not None]
+    strength = torch.tensor([shot.strength for shot in selection.chosen], dtype=torch.float64)
     directions_world = world_from_cam @ torch.stack(directions)[..., None]
     width, height = views.sizes_px[0].tolist()
     seen, index = torch.unique(position, return_inverse=True)
     maps = [_normals(folders[view]) for view in seen.tolist()]
     first = [position.tolist().index(view) for view in seen.tolist()]
     normals = [
-        normalize(nearest(one, width, height) @ world_from_cam[row].mT.float(), dim=-1)
-        for one, row in zip(maps, first, strict=True)
-        if one is not None
+        normalize(nearest(normal, width, height) @ world_from_cam[row].mT.float(), dim=-1)
+        for normal, row in zip(maps, first, strict=True)
+        if normal is not None
     ]
-    return found.capture.replace(
+    return selection.capture.replace(
         truth=Truth(
             mesh=read_mesh(mesh) if mesh.is_file() else None,
             normals_world=torch.stack(normals)[index] if len(normals) == len(maps) else None,
@@ -92,13 +92,13 @@ def read_diligent_mv(folder: Path | str, **options: Unpack[LightOptions]) -> Cap
 def directed_lights(
     directions_world: Float[Tensor, "view 3"], strength: Float[Tensor, " view"]
 ) -> Float[Tensor, "view 4"]:
-    """Return the first-order light of distant point lights without any ambient light."""
+    """Return the first-order light of distant point lights without ambient light."""
     directed = strength[:, None] * directions_world
     return torch.cat([torch.zeros_like(directed[:, :1]), directed], dim=1).float()
 
 
 def _shots(view: int, folder: DataSetPath, root: DataSetPath) -> list[Shot]:
-    """List a viewpoint's photographs with their lights, in the order of ``filenames.txt``."""
+    """Return a viewpoint's photographs with their lights, in the order of ``filenames.txt``."""
     directions, intensities = (
         _rows_of_three(folder.inner(f"light_{what}.txt")) for what in ("directions", "intensities")
     )
@@ -111,7 +111,7 @@ def _shots(view: int, folder: DataSetPath, root: DataSetPath) -> list[Shot]:
         "as many photographs as light directions and intensities",
         f"{len(names)}, {len(directions)} and {len(intensities)}",
     )
-    folder.expect(len(set(names)) == len(names), "photographs of unlike names", "others")
+    folder.expect(len(set(names)) == len(names), "photographs of different names", "duplicates")
     folder.expect(bool((intensities > 0).all()), "intensities above 0", "others")
     rows = zip(names, normalize(directions, dim=-1), intensities.mean(dim=1), strict=True)
     return [
@@ -142,9 +142,9 @@ def _normals(folder: DataSetPath) -> Float[Tensor, "height width 3"] | None:
 
 
 def facing_us(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
-    """Turn normals with y up and z to the viewer into our camera frame, ``n_z < 0``.
+    """Convert normals with y up and z to the viewer to our camera frame, ``n_z < 0``.
 
-    Zero where they are not known: not finite, or shorter than half, as on a background.
+    Zero where unknown: not finite, or shorter than 0.5, as on a background.
     """
     rotated = normals.nan_to_num(0) * FLIP.float()
     known = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > 0.5

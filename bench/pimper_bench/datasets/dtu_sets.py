@@ -1,4 +1,4 @@
-"""The two DTU sets: one calibrated camera on a robot's arm, several lights a position."""
+"""The two DTU sets: one calibrated camera on a robot's arm, several lights per position."""
 
 import re
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ from pimper_torch.doors.io.meshes import read_mesh
 
 _POINTS = "the DTU point feature set"
 _MVS = "the DTU multi-view stereo set of 2014"
-_SIZE_PX = (1600, 1200)  # that both are calibrated for; copies of half the size exist
+_SIZE_PX = (1600, 1200)  # size of both calibrations; copies of half the size exist
 ALL_LIGHTS = 7
-"""Our number for ``max``, the brightest of the seven photographs at each pixel."""
+"""Index of ``max``, the brightest of the seven photographs at each pixel."""
 
 _POINTS_NAME = re.compile(r"Img(\d{3})_(\d{2})\.(?:bmp|png)", re.IGNORECASE)
 _MVS_NAME = re.compile(r"rect_(\d{3})_(\d_r5000|max)\.png")
@@ -32,22 +32,22 @@ _SCANS = ("CleanRecon_2009_11_16", "reconstructions", ".")
 def read_dtu_points(folder: Path | str, scan: int, **options: Unpack[LightOptions]) -> Capture:
     """Read a scene of the DTU point feature set.
 
-    A robot carried the camera to 119 positions, and at each of them 19 LEDs were lit one after
-    the other. ``folder`` holds what the set's page offers, unpacked::
+    A robot moved the camera to 119 positions, and at each, 19 LEDs were lit one after
+    the other. ``folder`` contains the unpacked downloads of the set's page::
 
         SET001/Img001_01.bmp ... Img119_19.bmp     position, LED; 1600 x 1200 or 800 x 600
         Calib_Results_11.mat                       also as calibrationFile.mat
         CleanRecon_2009_11_16/Clean_Reconstruction_01.mat    also under reconstructions/
 
     The world is the calibration's, in metres. The truth is the structured-light scan,
-    where its file is there. The set gives no positions of its LEDs, so lights are unknown.
-    It states no transfer curve either; experiments with it relight scenes by adding
-    photographs up as linear radiance, and so they are read. The calibration counts pixels
-    from the centre of the first one; its lens distortion is neglected, as in the set's own
+    if its file exists. The set has no positions of its LEDs, so lights are unknown.
+    It does not specify a transfer curve; experiments with it relight scenes by adding
+    photographs as linear radiance, so they are read as linear. The calibration counts pixels
+    from the centre of the first one; its lens distortion is neglected, as in the set's
     evaluation.
 
     Args:
-        folder: With ``SET001`` and so on.
+        folder: With ``SET001``, ``SET002``, ...
         scan: Number of the scene, from 1.
         options: See :func:`~pimper_bench.datasets.sampling.read_shots`; positions and
             LEDs count from 1.
@@ -60,31 +60,31 @@ def read_dtu_points(folder: Path | str, scan: int, **options: Unpack[LightOption
     shots = _shots(root, f"SET{scan:03d}", _POINTS_NAME, "Img001_01.bmp (position, LED)")
     calibration = file_in(folder, _CALIBRATIONS, _POINTS)
     photographs = root.inner(f"SET{scan:03d}")
-    found = read_shots(
+    selection = read_shots(
         shots,
         photographs,
         lambda positions: decompose_projections(read_toolbox_projections(calibration, positions)),
         size_px=_SIZE_PX,
         **options,
     )
-    return found.capture.replace(truth=Truth(points_world=_halves(root, scan)))
+    return selection.capture.replace(truth=Truth(points_world=_halves(root, scan)))
 
 
 def read_dtu_mvs(folder: Path | str, scan: int, **options: Unpack[LightOptions]) -> Capture:
     """Read a scan of the DTU multi-view stereo set.
 
-    49 or 64 positions of a camera on a robot's arm, under seven lights each. ``folder`` is what
-    the set's page calls ``MVS Data``::
+    The camera on a robot's arm has 49 or 64 positions, under seven lights each. ``folder`` is
+    ``MVS Data`` of the set's page::
 
         Rectified/scan1/rect_001_0_r5000.png ... rect_064_6_r5000.png     position, light
         Rectified/scan1/rect_001_max.png ...                              brightest of them
         Calibration/cal18/pos_001.txt ...                                 3x4 projections
         Points/stl/stl001_total.ply                                       scan, in mm
 
-    The world is in millimetres. Photographs are rectified: free of lens distortion. Pixels of the
-    camera files count from the centre of the first one. MVSNet's camera files are not read. Nothing
-    is published on the photographs' transfer curve; as those of the set's sister from the
-    same camera they are taken for linear. Directions of the lights are not published.
+    The world is in millimetres. Photographs are rectified: without lens distortion. Pixels of the
+    camera files count from the centre of the first one. MVSNet's camera files are not read. The
+    photographs' transfer curve is not published; like those of the point feature set, from the
+    same camera, they are assumed to be linear. Directions of the lights are not published.
 
     Args:
         folder: With ``Rectified``.
@@ -100,7 +100,7 @@ def read_dtu_mvs(folder: Path | str, scan: int, **options: Unpack[LightOptions])
     shots = _shots(root, inner, _MVS_NAME, "rect_001_0_r5000.png")
     if options.get("lights") is None:
         shots = [shot for shot in shots if shot.light != ALL_LIGHTS]
-    found = read_shots(
+    selection = read_shots(
         shots,
         root.inner(inner),
         lambda positions: _mvs_cameras(root, positions),
@@ -109,13 +109,13 @@ def read_dtu_mvs(folder: Path | str, scan: int, **options: Unpack[LightOptions])
     )
     scanned = root.path / "Points" / "stl" / f"stl{scan:03d}_total.ply"
     points = read_mesh(scanned).vertices_world.float() if scanned.is_file() else None
-    return found.capture.replace(truth=Truth(points_world=points))
+    return selection.capture.replace(truth=Truth(points_world=points))
 
 
 def read_dtu_protocol(folder: Path | str, scan: int) -> DtuProtocol:
-    """Read the observability mask and the table's plane of the set's own evaluation.
+    """Read the observability mask and the table's plane of the set's evaluation.
 
-    ``ObsMask/ObsMask<scan>_10.mat`` holds ``ObsMask``, its box ``BB`` (two rows) and voxel
+    ``ObsMask/ObsMask<scan>_10.mat`` has ``ObsMask``, its box ``BB`` (two rows) and voxel
     size ``Res``; ``ObsMask/Plane<scan>.mat`` the table's ``P``.
 
     Args:
@@ -144,7 +144,7 @@ def read_dtu_protocol(folder: Path | str, scan: int) -> DtuProtocol:
 
 
 def _shots(root: DataSetPath, inner: str, name: re.Pattern[str], example: str) -> list[Shot]:
-    """List a scene's photographs, whose names tell position and light."""
+    """Return a scene's photographs; their names contain position and light."""
     photographs = root.inner(inner)
     root.expect(photographs.path.is_dir(), f"photographs in {inner}")
     shots = [
@@ -162,7 +162,7 @@ def _shots(root: DataSetPath, inner: str, name: re.Pattern[str], example: str) -
 
 
 def _halves(root: DataSetPath, scan: int) -> Float[Tensor, "point 3"] | None:
-    """Read the structured-light points, of which there is a near and a far half."""
+    """Read the structured-light points, which consist of a near and a far half."""
     name = f"Clean_Reconstruction_{scan:02d}.mat"
     path = first_of([root.path / folder / name for folder in _SCANS])
     if path is None:
@@ -181,9 +181,9 @@ def _halves(root: DataSetPath, scan: int) -> Float[Tensor, "point 3"] | None:
 def _mvs_cameras(
     root: DataSetPath, positions: Sequence[int]
 ) -> tuple[Float[Tensor, "view 3 3"], Float[Tensor, "view 4 4"]]:
-    """Read the cameras of positions from the set's own files."""
+    """Read the cameras of positions from the set's files."""
     folder = root.inner("Calibration/cal18")
-    needed = "Calibration/cal18/pos_001.txt and so on, as the set's SampleSet has them"
+    needed = "Calibration/cal18/pos_001.txt and others, as in the set's SampleSet"
     root.expect(folder.path.is_dir(), needed)
     projections = []
     for position in positions:

@@ -1,4 +1,4 @@
-"""Photographs beside their cameras, as programs and data sets lay them out."""
+"""Readers of photographs with cameras, in the layouts of programs and data sets."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -49,36 +49,36 @@ def read_colmap(
     masks: Path | str | None = None,
     **options: Unpack[PosedOptions],
 ) -> Capture:
-    """Read a COLMAP model, text or binary, and the photographs it was made from.
+    """Read a COLMAP model, text or binary, and its photographs.
 
-    COLMAP counts pixels as we do (centre of the top-left one at (0.5, 0.5), "Camera models"
-    in its documentation) and has our camera axes. Lenses with distortion are undistorted.
-    Its cloud was found, not measured, so it is no truth; ``Reconstruct`` reads it.
+    COLMAP has our pixel convention (centre of the top-left pixel at (0.5, 0.5), "Camera models"
+    in its documentation) and our camera axes. Lenses with distortion are undistorted.
+    Its cloud is an estimate, so it is not used as truth; ``Reconstruct`` reads it.
 
     Args:
         folder: With ``cameras``, ``images`` and ``points3D``, or with them in ``sparse/0``,
             ``sparse``, ``model`` or ``0``.
-        images: Folder of the photographs; by default ``images`` beside or above the model.
-        masks: Folder of masks; by default ``masks`` beside that, if there is one.
+        images: Folder of the photographs; by default ``images`` next to or above the model.
+        masks: Folder of masks; by default ``masks`` next to that, if it exists.
     """
     root = DataSetPath(Path(folder), _COLMAP)
     files = [root.path / name / f"cameras{end}" for name in _MODELS for end in (".bin", ".txt")]
-    found = first_of(files)
-    if found is None:
+    path = first_of(files)
+    if path is None:
         root.refuse("cameras.bin or cameras.txt here or in sparse/0")
-    around = [*found.parents[:3], root.path]
-    pictures = Path(images) if images else first_of([one / "images" for one in around])
+    around = [*path.parents[:3], root.path]
+    pictures = Path(images) if images else first_of([parent / "images" for parent in around])
     if pictures is None or not pictures.is_dir():
-        root.refuse("a folder `images` beside or above the model, or that of the photographs named")
-    model = read_model(found.parent)
+        root.refuse("a folder `images` next to or above the model, or that of the photographs")
+    model = read_model(path.parent)
     cameras = [
         PosedCamera(name=name, lens=lens, cam_from_world=pose)
         for name, lens, pose in zip(model.names, model.lenses, model.cam_from_world, strict=True)
     ]
-    place, drawn = root._replace(path=pictures), masks or first_of([pictures.parent / "masks"])
-    photographs = _beside(cameras, lambda camera: place.inside(camera.name), drawn, place)
-    named = [one.replace(name=name) for one, name in zip(photographs, model.names, strict=True)]
-    return assemble(named, root._replace(path=found.parent), **options)
+    location, masked = root._replace(path=pictures), masks or first_of([pictures.parent / "masks"])
+    photographs = _paired(cameras, lambda camera: location.inside(camera.name), masked, location)
+    named = [item.replace(name=name) for item, name in zip(photographs, model.names, strict=True)]
+    return assemble(named, root._replace(path=path.parent), **options)
 
 
 def read_llff(
@@ -88,7 +88,7 @@ def read_llff(
     masks: Path | str | None = None,
     **options: Unpack[PosedOptions],
 ) -> Capture:
-    """Read the cameras of ``poses_bounds.npy`` and the photographs beside it.
+    """Read the cameras of ``poses_bounds.npy`` and the photographs next to it.
 
     A row of the file has 17 numbers: a 3x5 matrix, row by row, and the nearest and farthest
     depth. The matrix's columns are, in the world frame, the camera's directions *down, right
@@ -97,18 +97,18 @@ def read_llff(
     forward. (LLFF's README, "Using your own poses without running COLMAP", and its
     ``poses/pose_utils.py``.)
 
-    The file has no principal point. LLFF made it with COLMAP's ``SIMPLE_RADIAL``, which
-    keeps the principal point at (width / 2, height / 2) from the corner of the image, and
-    drops the distortion: so do we, no half pixel is added. The rows belong to the
-    photographs in plain order of their names (``1, 10, 11, 2``).
+    The file has no principal point. LLFF wrote it from COLMAP's ``SIMPLE_RADIAL``, which
+    fixes the principal point at (width / 2, height / 2) from the corner of the image, and
+    dropped the distortion. This reader does the same, without adding half a pixel. The rows
+    correspond to the photographs sorted by name (``1, 10, 11, 2``).
 
     Args:
         folder: With ``poses_bounds.npy``.
-        images: Folder of photographs, full size or a smaller copy, by path or by its name in
+        images: Folder of photographs, full size or smaller, as a path or as a name in
             ``folder``; by default ``images``, else the largest of ``images_2``, ``images_4``
-            and so on.
-        masks: Folder of masks; by default ``masks``, ``mask`` or ``images_mask``, if there is
-            one.
+            and others.
+        masks: Folder of masks; by default ``masks``, ``mask`` or ``images_mask``, if one
+            exists.
     """
     root = DataSetPath(Path(folder), _LLFF)
     file = root.inner("poses_bounds.npy")
@@ -126,28 +126,28 @@ def read_llff(
     matrices = torch.from_numpy(rows[:, :15].reshape(-1, 3, 5).astype(np.float64))
     pictures = {path.name: path for path in paths}
     cameras = [_llff_camera(name, row, root) for name, row in zip(pictures, matrices, strict=True)]
-    drawn = masks or first_of([root.path / name for name in _LLFF_MASKS])
-    return assemble(_beside(cameras, lambda one: pictures[one.name], drawn, root), root, **options)
+    masked = masks or first_of([root.path / name for name in _LLFF_MASKS])
+    return assemble(_paired(cameras, lambda c: pictures[c.name], masked, root), root, **options)
 
 
 def _llff_images(root: DataSetPath, images: Path | str | None) -> Path:
     if images is not None:
         return first_of([root.path / images, Path(images)]) or root.path / images
     reduced = [
-        (int(found[1]), path)
+        (int(match[1]), path)
         for path in root.path.iterdir()
-        if (found := re.fullmatch(r"images_(\d+)", path.name))
+        if (match := re.fullmatch(r"images_(\d+)", path.name))
     ]
-    whole = root.path / "images"
-    root.expect(whole.is_dir() or bool(reduced), "a folder `images`, or `images_4` and such")
-    return whole if whole.is_dir() else min(reduced)[1]
+    full_size = root.path / "images"
+    root.expect(full_size.is_dir() or bool(reduced), "a folder `images`, or one such as `images_4`")
+    return full_size if full_size.is_dir() else min(reduced)[1]
 
 
 def _llff_camera(name: str, row: Float[Tensor, "3 5"], root: DataSetPath) -> PosedCamera:
     height, width, focal_px = row[:, 4].tolist()
-    whole = height.is_integer() and width.is_integer()
+    integers = height.is_integer() and width.is_integer()
     root.expect(
-        min(height, width, focal_px) > 0 and whole,
+        min(height, width, focal_px) > 0 and integers,
         "height, width and focal length in column 5",
         f"{height}, {width}, {focal_px}",
     )
@@ -164,12 +164,12 @@ def _llff_camera(name: str, row: Float[Tensor, "3 5"], root: DataSetPath) -> Pos
 def read_idr(
     folder: Path | str, *, camera_file: str | None = None, **options: Unpack[PosedOptions]
 ) -> Capture:
-    """Read the cameras of ``cameras.npz`` with ``image/`` and, if it is there, ``mask/``.
+    """Read the cameras of ``cameras.npz`` with ``image/`` and, if it exists, ``mask/``.
 
-    Their meaning is that of
+    For their meaning, see
     :func:`~pimper_torch.doors.camera_files.camera_arrays.read_camera_arrays`. ``scale_mat_i``, from
-    the unit sphere round the object to the world, is left out: cameras and truth are in the world's
-    units. Arrays and masks belong to the images in plain order of their names.
+    the unit sphere around the object to the world, is ignored: cameras and truth are in the world's
+    units. Arrays and masks correspond to the images sorted by name.
 
     Args:
         camera_file: Its name; by default ``cameras.npz``, ``cameras_sphere.npz`` or
@@ -177,11 +177,11 @@ def read_idr(
     """
     root = DataSetPath(Path(folder), _IDR)
     file = file_in(folder, (camera_file,) if camera_file else _IDR_CAMERAS, _IDR)
-    drawn, pictures = root.inner("mask"), root.inner("image")
+    mask_folder, pictures = root.inner("mask"), root.inner("image")
     files = image_files(pictures)
-    masks = image_files(drawn) if drawn.path.is_dir() else [None] * len(files)
+    masks = image_files(mask_folder) if mask_folder.path.is_dir() else [None] * len(files)
     needed = f"{len(files)} masks, one for each image"
-    drawn.expect(len(masks) == len(files), needed, f"{len(masks)}")
+    mask_folder.expect(len(masks) == len(files), needed, f"{len(masks)}")
     names = [path.name for path in files]
     cameras = read_camera_arrays(
         file.path, names, lambda names: _sizes([pictures.inside(name) for name in names])
@@ -205,46 +205,46 @@ def read_camera_file(
     masks: Path | str | None = None,
     **options: Unpack[PosedOptions],
 ) -> Capture:
-    """Read a file of cameras that ``--sparse`` takes, as of Metashape or Meshroom.
+    """Read a file of cameras in a format of ``--sparse``, such as Metashape's or Meshroom's.
 
     Args:
         folder: The file, or the folder with one by its usual name, see
             :data:`~pimper_torch.doors.camera_files.read_cameras.FORMATS`.
-        images: Folder of the photographs. They are looked up by the name in the file, without its
-            folders, and if need be without suffixes. By default ``images`` beside the file, or the
-            file's own folder.
+        images: Folder of the photographs. They are found by the name in the file, without its
+            folders, and if necessary without suffixes. By default ``images`` next to the file, or
+            the file's folder.
     """
-    file = file_in(folder, [each.name for each in FORMATS], "a file of cameras")
+    file = file_in(folder, [item.name for item in FORMATS], "a file of cameras")
     pictures = _pictures(file, images)
     files = image_files(pictures)
 
     def find(camera: str) -> Path:
-        name = PureWindowsPath(camera).name  # takes both kinds of slash
-        found = [path for path in files if path.name == name]
-        found = found or [path for path in files if path.stem == name]
-        found = found or [path for path in files if path.stem == PureWindowsPath(name).stem]
-        there = some([path.name for path in found or files])
-        pictures.expect(len(found) == 1, f"one photograph called {name}", there)
-        return found[0]
+        name = PureWindowsPath(camera).name  # accepts both kinds of slash
+        matches = [path for path in files if path.name == name]
+        matches = matches or [path for path in files if path.stem == name]
+        matches = matches or [path for path in files if path.stem == PureWindowsPath(name).stem]
+        listed = some([path.name for path in matches or files])
+        pictures.expect(len(matches) == 1, f"one photograph named {name}", listed)
+        return matches[0]
 
     def sizes_of(names: Sequence[str]) -> list[tuple[int, int]]:
         return _sizes([find(name) for name in names])
 
     cameras = read_cameras(file.path, [path.name for path in files], sizes_of)
-    photographs = _beside(cameras, lambda camera: find(camera.name), masks, file)
+    photographs = _paired(cameras, lambda camera: find(camera.name), masks, file)
     return assemble(photographs, file, **options)
 
 
 def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capture:
     """Read the cameras of a ``transforms.json`` and the photographs it names.
 
-    Their meaning is that of
+    For their meaning, see
     :func:`~pimper_torch.doors.camera_files.transforms_json.read_transforms_cameras`. Lenses are
-    undistorted. The mask is ``mask_path`` where a frame has one, else the image's alpha channel.
-    Photographs are called as their files, or by whole paths in the file where these are not unique.
+    undistorted. The mask is ``mask_path`` if a frame has one, else the image's alpha channel.
+    Photographs are named by their files, or by full paths in the file if these are not unique.
 
     Args:
-        folder: With ``transforms.json`` or ``transforms_train.json``; or a file of that kind.
+        folder: With ``transforms.json`` or ``transforms_train.json``; or a file of this kind.
     """
     file = file_in(folder, _TRANSFORMS, transforms_json.KIND)
     around = file._replace(path=file.path.parent)
@@ -265,33 +265,33 @@ def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capt
         for frame in frames
     ]
     photographs = [
-        PosedPhotograph.of(*one) for one in zip(cameras, images, masks, names, strict=True)
+        PosedPhotograph.of(*row) for row in zip(cameras, images, masks, names, strict=True)
     ]
     return assemble(photographs, file, **options)
 
 
 def _with_suffix(image: Path) -> Path:
-    """Find the file of a photograph, whose suffix may be left out."""
+    """Return the file of a photograph, whose suffix may be missing."""
     if image.suffix.lower() in SUFFIXES:
         return image
-    tried = [image.with_name(image.name + suffix) for suffix in (".png", *SUFFIXES)]
-    return first_of(tried) or tried[0]
+    candidates = [image.with_name(image.name + suffix) for suffix in (".png", *SUFFIXES)]
+    return first_of(candidates) or candidates[0]
 
 
 def _pictures(file: DataSetPath, images: Path | str | None) -> DataSetPath:
-    """Return the folder of the photographs, by default beside the file of cameras."""
-    beside = file.path.parent / "images"
-    place = Path(images) if images else beside if beside.exists() else file.path.parent
-    return file._replace(path=place)
+    """Return the folder of the photographs, by default next to the file of cameras."""
+    default = file.path.parent / "images"
+    path = Path(images) if images else default if default.exists() else file.path.parent
+    return file._replace(path=path)
 
 
-def _beside(
+def _paired(
     cameras: Sequence[PosedCamera],
     find: Callable[[PosedCamera], Path],
     masks: Path | str | None,
     data_set: DataSetPath,
 ) -> list[PosedPhotograph]:
-    """Find the photographs of cameras, and their masks by name."""
+    """Return the photographs of cameras, with their masks by name."""
     mask_of = mask_finder(masks, data_set.kind)
-    found = [(camera, find(camera)) for camera in cameras]
-    return [PosedPhotograph.of(camera, image, mask_of(image)) for camera, image in found]
+    pairs = [(camera, find(camera)) for camera in cameras]
+    return [PosedPhotograph.of(camera, image, mask_of(image)) for camera, image in pairs]

@@ -1,4 +1,4 @@
-"""IDR and NeuS: ``cameras.npz`` beside ``image/`` and ``mask/``, written."""
+"""Writing of IDR and NeuS sets: ``cameras.npz``, ``image/`` and ``mask/``."""
 
 from pathlib import Path
 
@@ -25,12 +25,12 @@ def write_idr(
 ) -> None:
     """Write ``image/``, ``mask/`` and ``cameras.npz`` (and the same as ``cameras_sphere.npz``).
 
-    Images are numbered in the order of the views. Their masks are white all over where there
-    are none: the programs want some.
+    Images are numbered in the order of the views. Views without masks get white ones, because
+    programs require masks.
 
     Args:
-        points_world: On the object: ``scale_mat`` puts them into the unit sphere. Without
-            them the sphere is guessed from masks and cameras, see :func:`unit_sphere`.
+        points_world: On the object: ``scale_mat`` scales them into the unit sphere. Without
+            them, the sphere is estimated from masks and cameras, see :func:`unit_sphere`.
     """
     folder = Path(folder)
     digits = max(3, len(str(views.num_views - 1)))
@@ -56,35 +56,35 @@ def unit_sphere(
     points_world: Float[Tensor, "point 3"] | None = None,
     masks: Bool[Tensor, "view height width"] | None = None,
 ) -> Float[Tensor, "4 4"]:
-    """Return ``world_from_unit`` of a sphere that holds the object.
+    """Return ``world_from_unit`` of a sphere that contains the object.
 
-    With points it is centred on their bounding box, and nine tenths of its radius reach the
-    farthest. Without, it is centred where the optical axes come nearest to one another (in
-    the least-squares sense); there it reaches as far as the masks do in the view that shows
-    most, by nine tenths, or else as the corners of the median view.
+    With points, it is centred on their bounding box, and the farthest point is at nine tenths of
+    its radius. Without, it is centred at the point nearest to all optical axes (least squares);
+    the masks extend to nine tenths of its radius in the view where they extend farthest, or
+    without masks, it extends to the corners of the median image.
 
     Args:
-        cameras: Not all looking the same way, unless there are points.
+        cameras: Not all of the same direction, unless points are given.
         points_world: On the object; at least two different ones.
         masks: True on the object.
 
     Raises:
-        InputError: The points are one and the same, the axes are parallel, or the cameras
-            look away from where they meet.
+        InputError: All points are equal, the axes are parallel, or the cameras
+            look away from the centre.
     """
     if points_world is not None:
         points = points_world.detach().cpu().double()
         center = (points.amin(dim=0) + points.amax(dim=0)) / 2
         radius = float((points - center).norm(dim=-1).max()) / 0.9
     else:
-        center = _looked_at(cameras)
-        reaches = torch.tensor(
-            [_reach(cameras, center, masks, v) for v in range(len(cameras.sizes_px))]
+        center = _fixation(cameras)
+        radii = torch.tensor(
+            [_extent(cameras, center, masks, v) for v in range(len(cameras.sizes_px))]
         )
-        radius = float(reaches.median() if masks is None else reaches.max() / 0.9)
+        radius = float(radii.median() if masks is None else radii.max() / 0.9)
     if not radius > 0:
         raise InputError(
-            "the sphere round the object has no size; needed: points on the object, or cameras "
+            "the sphere around the object has no size; needed: points on the object, or cameras "
             "that look at it from several sides."
         )
     world_from_unit = torch.eye(4, dtype=torch.float64)
@@ -93,28 +93,28 @@ def unit_sphere(
     return world_from_unit
 
 
-def _looked_at(cameras: Cameras) -> Float[Tensor, "3"]:
-    """Find the point nearest to all optical axes."""
+def _fixation(cameras: Cameras) -> Float[Tensor, "3"]:
+    """Return the point nearest to all optical axes."""
     axes = cameras.cam_from_world[:, 2, :3].detach().cpu().double()
     centers = cameras.centers_world.detach().cpu().double()
     # A point's squared distance from an axis is |(I - a a^T) (x - c)|^2.
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
-    system, right = across.sum(dim=0), (across @ centers[..., None]).sum(dim=0)[:, 0]
+    system, constant = across.sum(dim=0), (across @ centers[..., None]).sum(dim=0)[:, 0]
     if float(torch.linalg.eigvalsh(system)[0]) < 1e-6 * len(axes):
         raise InputError(
-            "the cameras all look the same way, so nothing tells where the object is; needed: "
+            "the cameras all look the same way, so the object's position is undetermined; needed: "
             "points on it (a mesh), or cameras that look at it from several sides."
         )
-    return torch.linalg.solve(system, right)
+    return torch.linalg.solve(system, constant)
 
 
-def _reach(
+def _extent(
     cameras: Cameras,
     center: Float[Tensor, "3"],
     masks: Bool[Tensor, "view height width"] | None,
     view: int,
 ) -> float:
-    """Find how far a view's mask, or image, reaches from a point, at the depth of the point."""
+    """Return how far a view's mask, or image, extends from a point, at the depth of the point."""
     pose = cameras.cam_from_world[view].detach().cpu().double()
     K = cameras.intrinsics[view].detach().cpu().double()
     width, height = (float(side) for side in cameras.sizes_px[view])
@@ -123,7 +123,7 @@ def _reach(
     else:
         pixels = torch.nonzero(masks[view].cpu()).flip(-1) + 0.5
         pixels = pixels.to(K)
-    here, depth = project(center[None], pose, K)
+    projected, depth = project(center[None], pose, K)
     if not len(pixels) or float(depth) <= 0:
         return 0.0
-    return float(((pixels - here) / K.diagonal()[:2]).norm(dim=-1).max() * depth)
+    return float(((pixels - projected) / K.diagonal()[:2]).norm(dim=-1).max() * depth)

@@ -1,7 +1,7 @@
-"""Arrays from MATLAB files of version 5 to 7, and cameras as its calibration toolbox writes them.
+"""Arrays from MATLAB files of version 5 to 7, and cameras of its calibration toolbox.
 
-SciPy's reader ends the process on some damaged files; this one takes no memory that they have no
-room for.
+SciPy's reader crashes on some damaged files. This reader also limits memory by the size of the
+file.
 
 Source: MathWorks, MAT-File Format, "MAT-File Level 5".
 """
@@ -20,7 +20,7 @@ from torch import Tensor
 from pimper_torch.doors.camera_files.layout import DataSetPath
 from pimper_torch.runtime.errors import some
 
-# Numbers by their type in the file, and classes of arrays that hold numbers.
+# Number types by their code in the file, and array classes of numbers.
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
 _KINDS |= {12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
@@ -33,43 +33,43 @@ MAX_BYTES = 2**29
 def read_variables(
     path: Path | str, wanted: Callable[[str], bool] = lambda name: True
 ) -> dict[str, np.ndarray | None]:
-    """Read the arrays of real numbers whose names are wanted; ``None`` for other variables.
+    """Read the real numeric arrays whose names are wanted; ``None`` for other variables.
 
     Raises:
-        ValueError: It is no such file, is cut short, or unpacks to more than 512 MB: says which.
+        ValueError: The file is not of this kind, is truncated, or unpacks to more than 512 MB.
     """
     data = Path(path).read_bytes()
     if len(data) < 128 or data[126:128] not in (b"IM", b"MI"):
-        raise ValueError("it is no MATLAB file of version 5 to 7")
+        raise ValueError("it is not a MATLAB file of version 5 to 7")
     order = "<" if data[126:128] == b"IM" else ">"
     if struct.unpack_from(f"{order}H", data, 124)[0] != 0x0100:
         raise ValueError("its version is 7.3 or unknown")
-    found: dict[str, np.ndarray | None] = {}
-    at, room = 128, MAX_BYTES
-    while at + 8 <= len(data):
-        kind, size = struct.unpack_from(f"{order}2I", data, at)
-        body = data[at + 8 : at + 8 + size]
+    arrays: dict[str, np.ndarray | None] = {}
+    offset, budget = 128, MAX_BYTES
+    while offset + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}2I", data, offset)
+        body = data[offset + 8 : offset + 8 + size]
         if len(body) < size:
-            raise ValueError("it is cut short")
-        at += 8 + size
+            raise ValueError("it is truncated")
+        offset += 8 + size
         if kind == _COMPRESSED:
-            body = _unpacked(body, room)
-            room -= len(body)
+            body = _unpacked(body, budget)
+            budget -= len(body)
             kind, size = struct.unpack_from(f"{order}2I", body) if len(body) >= 8 else (0, 0)
             body = body[8 : 8 + size]
         if kind == _MATRIX:
             name, array = _variable(body, order, wanted)
-            found[name] = array
-    return found
+            arrays[name] = array
+    return arrays
 
 
-def _unpacked(body: bytes, room: int) -> bytes:
+def _unpacked(body: bytes, budget: int) -> bytes:
     try:
         unpacker = zlib.decompressobj()
-        unpacked = unpacker.decompress(body, max(room, 1))
+        unpacked = unpacker.decompress(body, max(budget, 1))
     except zlib.error as error:
-        raise ValueError("what is compressed in it is damaged") from error
-    if not unpacker.eof and (unpacker.unconsumed_tail or len(unpacked) >= room):
+        raise ValueError("its compressed data are damaged") from error
+    if not unpacker.eof and (unpacker.unconsumed_tail or len(unpacked) >= budget):
         raise ValueError(f"its arrays would take more than {MAX_BYTES} bytes")
     return unpacked
 
@@ -77,83 +77,81 @@ def _unpacked(body: bytes, room: int) -> bytes:
 def _variable(
     body: bytes, order: str, wanted: Callable[[str], bool]
 ) -> tuple[str, np.ndarray | None]:
-    _, flags, at = _element(body, 0, order)
+    _, flags, offset = _element(body, 0, order)
     if len(flags) < 8:
         raise ValueError("a variable has no class")
     (flag,) = struct.unpack_from(f"{order}I", flags)
-    _, sides, at = _element(body, at, order)
+    _, sides, offset = _element(body, offset, order)
     shape = np.frombuffer(sides[: len(sides) // 4 * 4], f"{order}i4").tolist()
-    _, name, at = _element(body, at, order)
+    _, name, offset = _element(body, offset, order)
     text = name.decode("latin-1")
     if flag & 0xFF not in _CLASSES or flag & _COMPLEX or not wanted(text):
         return text, None
-    kind, values, _ = _element(body, at, order)
+    kind, values, _ = _element(body, offset, order)
     if kind not in _KINDS or not 2 <= len(shape) <= 8 or any(side < 0 for side in shape):
-        raise ValueError(f"{text[:40]!r} has no type or shape")
+        raise ValueError(f"{text[:40]!r} has no valid type or shape")
     packed = np.dtype(f"{order}{_KINDS[kind]}")
     if math.prod(shape) * packed.itemsize != len(values):
-        raise ValueError(
-            f"{text[:40]!r} says that its shape is {shape}, and has {len(values)} bytes"
-        )
+        raise ValueError(f"{text[:40]!r} has the shape {shape}, but {len(values)} bytes")
     array = np.frombuffer(values, packed).astype(_CLASSES[flag & 0xFF])
     return text, array.reshape(shape, order="F")
 
 
-def _element(body: bytes, at: int, order: str) -> tuple[int, bytes, int]:
-    """Return type and bytes of an element, short ones in their tag, and where the next begins."""
-    if at + 8 > len(body):
-        raise ValueError("a variable is cut short")
-    (word,) = struct.unpack_from(f"{order}I", body, at)
+def _element(body: bytes, offset: int, order: str) -> tuple[int, bytes, int]:
+    """Return type and bytes of an element (short ones are in the tag), and the next offset."""
+    if offset + 8 > len(body):
+        raise ValueError("a variable is truncated")
+    (word,) = struct.unpack_from(f"{order}I", body, offset)
     if word >> 16:
         size = word >> 16
         if size > 4:
-            raise ValueError("a variable has a tag that is none")
-        return word & 0xFFFF, body[at + 4 : at + 4 + size], at + 8
-    (size,) = struct.unpack_from(f"{order}I", body, at + 4)
-    if size > len(body) - at - 8:
-        raise ValueError("a variable is cut short")
-    return word, body[at + 8 : at + 8 + size], at + 8 + size + -size % 8
+            raise ValueError("a variable has an invalid tag")
+        return word & 0xFFFF, body[offset + 4 : offset + 4 + size], offset + 8
+    (size,) = struct.unpack_from(f"{order}I", body, offset + 4)
+    if size > len(body) - offset - 8:
+        raise ValueError("a variable is truncated")
+    return word, body[offset + 8 : offset + 8 + size], offset + 8 + size + -size % 8
 
 
 _FORMAT = "a MATLAB file of version 5 to 7"
 
 
 def read_matlab(file: DataSetPath, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Read arrays of numbers of a MATLAB file (up to version 7)."""
-    found = _variables(file, names)
-    absent = [name for name in names if name not in found]
-    there = some(sorted(found), most=12) or "none"
-    file.expect(not absent, f"the variables {some(absent)}", f"variables {there}")
+    """Read numeric arrays of a MATLAB file (up to version 7)."""
+    variables = _variables(file, names)
+    absent = [name for name in names if name not in variables]
+    present = some(sorted(variables), most=12) or "none"
+    file.expect(not absent, f"the variables {some(absent)}", f"variables {present}")
     arrays = {}
     for name in names:
-        array = found[name]
+        array = variables[name]
         if array is None:
-            file.refuse(f"real numbers in {name}", "another class")
+            file.refuse(f"real numbers in {name}", "a different class")
         arrays[name] = array
     return arrays
 
 
 def _variables(file: DataSetPath, names: Sequence[str] = ()) -> dict[str, np.ndarray | None]:
-    """Read arrays of these names, and name the other variables."""
+    """Read arrays of these names; other variables are ``None``."""
     return file.read(lambda path: read_variables(path, lambda name: name in names), _FORMAT)
 
 
 def read_toolbox_projections(
     file: DataSetPath, numbers: Sequence[int]
 ) -> Float[Tensor, "view 3 4"]:
-    """Read ``K [R | t]`` from what Bouguet's calibration toolbox for MATLAB saves.
+    """Read ``K [R | t]`` from files of Bouguet's calibration toolbox for MATLAB.
 
-    ``KK`` (or ``fc`` and ``cc``) hold the intrinsics, ``Rc_<i>`` and ``Tc_<i>`` take points
+    ``KK`` (or ``fc`` and ``cc``) are the intrinsics, ``Rc_<i>`` and ``Tc_<i>`` transform points
     from the world to camera i. The toolbox counts pixel centres from 0. Lens distortion
-    (``kc``) is not looked at: the sets that come in this form are used without it.
+    (``kc``) is ignored: sets in this form are used without it.
 
     Args:
         file: ``Calib_Results.mat``.
 
     Returns:
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is
-        taken as it stands: in published files it is not exactly orthogonal, which
-        :func:`~pimper_torch.doors.camera_files.posed_camera.decompose_projections` settles.
+        not corrected: in published files it is not exactly orthogonal, which
+        :func:`~pimper_torch.doors.camera_files.posed_camera.decompose_projections` handles.
     """
     poses = [name for number in numbers for name in (f"Rc_{number}", f"Tc_{number}")]
     intrinsic = ["KK"] if "KK" in _variables(file) else ["fc", "cc"]

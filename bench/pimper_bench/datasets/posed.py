@@ -1,4 +1,4 @@
-"""Photographs whose cameras are known: from files to a capture."""
+"""Photographs with known cameras: from files to a capture."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ class PosedPhotograph(PosedCamera):
     """Camera and file of one photograph.
 
     Attributes:
-        image: Its file; it may be a smaller copy of what the lens is for.
-        mask: File of its mask; ``None`` where there is none. Of any size: it is stretched
-            over the photograph.
+        image: Its file, of the lens's size or smaller.
+        mask: File of its mask, of any size; ``None`` without one. It is scaled to the
+            photograph.
     """
 
     image: Path
@@ -40,7 +40,7 @@ class PosedPhotograph(PosedCamera):
     def of(
         cls, camera: PosedCamera, image: Path, mask: Path | None, name: str = ""
     ) -> "PosedPhotograph":
-        """Put a photograph, called as its file by default, beside its camera."""
+        """Combine a photograph, by default named by its file, with its camera."""
         return cls(
             name=name or image.name,
             cam_from_world=camera.cam_from_world,
@@ -58,8 +58,8 @@ class PosedOptions(TypedDict, total=False):
         names: Keep these photographs, in this order; ``None`` for all.
         mesh: File of the true surface, in the data set's frame.
         encoding: Response, saturation and black level of the files.
-        max_size_px: Shrink photographs whose longer side is longer; the cameras follow. 0 leaves
-            them as they are.
+        max_size_px: Maximum length of the photographs' longer side; larger ones are shrunk, with
+            their cameras. 0 for no limit.
     """
 
     names: Sequence[str] | None
@@ -77,29 +77,29 @@ def assemble(
     encoding: Encoding = FROM_FILES,
     max_size_px: int = 0,
 ) -> Capture:
-    """Read photographs, undistort them and put them beside their cameras.
+    """Read photographs, undistort them and combine them with their cameras.
 
-    A photograph without a mask file shows the object where its alpha channel, if it has one
-    that is somewhere transparent, is opaque; else everywhere.
+    A photograph without a mask file shows the object where its alpha channel is opaque if
+    some of it is transparent; otherwise everywhere.
 
     Args:
-        photographs: All that the data set has.
-        names: And the others, see :class:`PosedOptions`.
+        photographs: All photographs of the data set.
+        names: Like the other options, see :class:`PosedOptions`.
 
     Returns:
         Photographs in float32, cameras and truth in float64, on the CPU.
 
     Raises:
-        InputError: A name that is not there or there twice, a missing or damaged file, or a
+        InputError: An unknown or duplicate name, a missing or damaged file, or a
             photograph whose shape is not its camera's.
     """
     chosen = _select(photographs, names, data_set)
     views = read_photographs(
-        [one.image for one in chosen],
-        [one.name for one in chosen],
+        [photograph.image for photograph in chosen],
+        [photograph.name for photograph in chosen],
         encoding=encoding,
         max_size_px=max_size_px,
-        masks=[one.mask for one in chosen],
+        masks=[photograph.mask for photograph in chosen],
     )
     lenses = fitted_lenses(chosen, views)
     undistorted, _ = undistort(views, lenses)
@@ -108,9 +108,9 @@ def assemble(
         views=undistorted,
         cameras=Cameras(
             intrinsics=torch.stack(
-                [_intrinsics(one, lens) for one, lens in zip(chosen, lenses, strict=True)]
+                [_intrinsics(camera, lens) for camera, lens in zip(chosen, lenses, strict=True)]
             ),
-            cam_from_world=torch.stack([one.cam_from_world for one in chosen]),
+            cam_from_world=torch.stack([camera.cam_from_world for camera in chosen]),
             sizes_px=undistorted.sizes_px,
         ),
         truth=Truth(mesh=None if mesh is None else read_mesh(mesh)),
@@ -120,15 +120,15 @@ def assemble(
 
 
 def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple[CameraModel, ...]:
-    """Let each lens follow its photograph to the size it was read at."""
+    """Scale each lens to the size at which its photograph was read."""
     lenses = []
-    for one, (width, height) in zip(photographs, views.sizes_px.tolist(), strict=True):
-        lens = one.lens
+    for photograph, (width, height) in zip(photographs, views.sizes_px.tolist(), strict=True):
+        lens = photograph.lens
         if not resize_fits(lens, width, height):
             raise InputError(
-                f"{one.image}: has the shape {width} x {height}, but its camera is for "
+                f"{photograph.image}: has the shape {width} x {height}, but its camera is for "
                 f"{lens.width} x {lens.height}. Needed: the photograph that the camera belongs to, "
-                "or a smaller copy of it, not cropped and not turned (EXIF orientation is applied)."
+                "or a smaller copy of it, not cropped or rotated (EXIF orientation is applied)."
             )
         same = (width, height) == (lens.width, lens.height)
         lenses.append(lens if same else rescale_lens(lens, width, height))
@@ -136,10 +136,10 @@ def fitted_lenses(photographs: Sequence[PosedPhotograph], views: Views) -> tuple
 
 
 def image_files(folder: DataSetPath) -> list[Path]:
-    """List a folder's images in plain order of their names, as Python's ``sorted`` has it.
+    """Return a folder's images in the order of Python's ``sorted``.
 
-    Data sets that number their cameras, not name them, mean this order: ``10`` before ``2``. Links
-    are followed wherever they lie.
+    Data sets that number their cameras instead of naming them use this order: ``10`` before ``2``.
+    Links are followed.
     """
     folder.expect(folder.path.is_dir(), "a folder of images")
     paths = [path for path in folder.path.iterdir() if path.suffix.lower() in SUFFIXES]
@@ -151,26 +151,27 @@ def image_files(folder: DataSetPath) -> list[Path]:
 def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path | None]:
     """Return a function that finds the mask of a photograph in a folder.
 
-    A mask is called as its photograph but for the suffix, as COLMAP has it (``17.jpg.png``),
-    or begins with that name and goes on with ``-``, ``_`` or a dot (``17-mask.png``).
+    A mask has the photograph's name with a different suffix, or with ``.png`` appended as for COLMAP
+    (``17.jpg.png``), or its name continues with ``-``, ``_`` or a dot (``17-mask.png``).
 
     Raises:
-        InputError: The folder holds no images; the function raises it for a photograph
+        InputError: The folder contains no images; the function raises it for a photograph
             without a mask or with several.
     """
     if folder is None:
         return lambda photograph: None
-    place = DataSetPath(Path(folder), kind)
-    paths = image_files(place)
+    directory = DataSetPath(Path(folder), kind)
+    paths = image_files(directory)
 
     def find(photograph: Path) -> Path | None:
         stem = photograph.stem
         exact = [path for path in paths if path.stem in (stem, photograph.name)]
         longer = [path for path in paths if path.name.startswith((f"{stem}-", f"{stem}_"))]
-        found = exact or longer
-        there = some([path.name for path in found or paths])
-        place.expect(len(found) == 1, f"one mask for {photograph.name}, such as {stem}.png", there)
-        return found[0]
+        matches = exact or longer
+        listed = some([path.name for path in matches or paths])
+        one = len(matches) == 1
+        directory.expect(one, f"one mask for {photograph.name}, such as {stem}.png", listed)
+        return matches[0]
 
     return find
 
@@ -178,31 +179,31 @@ def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path |
 def _select(
     photographs: Sequence[PosedPhotograph], names: Sequence[str] | None, data_set: DataSetPath
 ) -> list[PosedPhotograph]:
-    by_name = {one.name: one for one in photographs}
-    repeated = sorted({one.name for one in photographs if by_name[one.name] is not one})
-    data_set.expect(not repeated, "photographs of unlike names", f"several {some(repeated)}")
+    by_name = {item.name: item for item in photographs}
+    repeated = sorted({item.name for item in photographs if by_name[item.name] is not item})
+    data_set.expect(not repeated, "photographs of different names", f"several {some(repeated)}")
     data_set.expect(bool(photographs), "photographs with cameras", "none")
     wanted = list(by_name) if names is None else list(names)
     unknown = [name for name in wanted if name not in by_name]
     if unknown or not wanted or len(set(wanted)) < len(wanted):
         raise InputError(
-            f"{data_set.path}: asked for {some(unknown or wanted) or 'no photographs'}; needed: "
-            f"some of its {len(by_name)} photographs, each once: {some(list(by_name))}."
+            f"{data_set.path}: {some(unknown or wanted) or 'no photographs'} requested; needed: "
+            f"any of its {len(by_name)} photographs, each once: {some(list(by_name))}."
         )
     chosen = [by_name[name] for name in wanted]
-    missing = [one.image.name for one in chosen if not one.image.is_file()]
+    missing = [item.image.name for item in chosen if not item.image.is_file()]
     data_set.expect(not missing, "the files of its photographs", f"no {some(missing)}")
     return chosen
 
 
-def _intrinsics(one: PosedPhotograph, lens: CameraModel) -> Float[Tensor, "3 3"]:
-    assert one.skew_px == 0 or is_pinhole(lens), "skew and distortion together are undefined here"
+def _intrinsics(photograph: PosedPhotograph, lens: CameraModel) -> Float[Tensor, "3 3"]:
+    assert photograph.skew_px == 0 or is_pinhole(lens), "skew with distortion is not supported"
     K = pinhole_for(lens).clone()
-    K[0, 1] = one.skew_px * lens.width / one.lens.width
+    K[0, 1] = photograph.skew_px * lens.width / photograph.lens.width
     if not bool(K.isfinite().all() & (K.diagonal() > 0).all()):
         raise InputError(
-            f"{one.image}: its lens ({lens.model}) leaves no pinhole when it is undistorted: "
-            f"{K.tolist()}; needed: distortion of a real lens. Export the cameras again."
+            f"{photograph.image}: its lens ({lens.model}) gives no pinhole after undistortion: "
+            f"{K.tolist()}; needed: the distortion of a real lens. Export the cameras again."
         )
     return K
 
@@ -213,10 +214,10 @@ def first_of(candidates: Sequence[Path]) -> Path | None:
 
 
 def file_in(given: Path | str, names: Sequence[str], kind: str) -> DataSetPath:
-    """Return a file, or the first one of these names that is in a folder.
+    """Return a file, or the first file with one of these names in a folder.
 
     Raises:
-        InputError: There is none.
+        InputError: No such file exists.
     """
     given = Path(given)
     if given.is_file():

@@ -1,4 +1,4 @@
-"""Rendered scenes, as :func:`pimper_bench.scenes.rendered_folder` writes them."""
+"""Reader of scenes that :func:`pimper_bench.scenes.rendered_folder` wrote."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,32 +34,32 @@ def read_rendered(
     maps: bool = True,
     photographs: bool = True,
 ) -> Capture:
-    """Read a rendered scene, or as much of it as memory should hold.
+    """Read a rendered scene, or parts of it to save memory.
 
     A view of 1600 x 1200 takes 23 MB of memory for its photograph and 60 MB for its maps.
 
     Args:
-        views: Numbers of those wanted, in the order wanted; ``None`` is all.
-        maps: Read depth, normals, albedo and masks too; without, they are ``None``.
-        photographs: Read these and the object's masks too; without, the images are zeros
-            that take no memory, and there are no masks.
+        views: Indices of the views to read, in order; ``None`` for all.
+        maps: Whether to read depth, normals, albedo and masks; if not, they are ``None``.
+        photographs: Whether to read photographs and the object's masks; if not, the images are
+            zeros that take no memory, and masks are ``None``.
 
     Returns:
-        Cameras and lights in float64. Every view has a light of its own, and a position of its own
-        unless ``lights_per_pose`` share one.
+        Cameras and lights in float64. Every view has a different light, and a different position
+        unless ``lights_per_pose`` views share one.
     """
     root = DataSetPath(Path(folder), _KIND)
     names, settings = _read_report(root)
     chosen = list(range(len(names)) if views is None else views)
     root.expect(
-        len(set(chosen)) == len(chosen) > 0 and all(0 <= one < len(names) for one in chosen),
+        len(set(chosen)) == len(chosen) > 0 and all(0 <= view < len(names) for view in chosen),
         f"different views between 0 and {len(names) - 1}",
-        f"a wish for {chosen}",
+        f"a request for {chosen}",
     )
-    named = [names[one] for one in chosen]
+    named = [names[view] for view in chosen]
     truth_of = root.inner("truth")
     cameras = _read_cameras(truth_of.inner("sparse"), named)
-    pictures = _read_views(root, named, settings, cameras, photographs)
+    photographed = _read_views(root, named, settings, cameras, photographs)
     lights = _read_lights(truth_of.inner("lights.json"), len(names))
     moving = settings.fixed_table or settings.turned_over
     truth = Truth(
@@ -72,16 +72,16 @@ def read_rendered(
     order = torch.tensor(chosen)
     position = order // settings.lights_per_pose
     if settings.lights_per_pose > 1:
-        pictures = pictures.replace(poses=position)
-    return Capture(views=pictures, cameras=cameras, truth=truth, position=position, light=order)
+        photographed = photographed.replace(poses=position)
+    return Capture(views=photographed, cameras=cameras, truth=truth, position=position, light=order)
 
 
 def _read_report(root: DataSetPath) -> tuple[tuple[str, ...], SceneConfig]:
     file = root.inner("truth/scene.json")
     report = file.read_json()
-    found = (report.get("format"), report.get("format_version"))
+    header = (report.get("format"), report.get("format_version"))
     needed = f"format {FORMAT!r}, version {FORMAT_VERSION}"
-    file.expect(found == (FORMAT, FORMAT_VERSION), needed, "{!r}, version {!r}".format(*found))
+    file.expect(header == (FORMAT, FORMAT_VERSION), needed, "{!r}, version {!r}".format(*header))
     names, settings = report.get("names"), report.get("settings")
     if not isinstance(settings, dict) or not isinstance(names, list):
         file.refuse("a list `names` of file names, and `settings`", f"names {names!r}")
@@ -89,9 +89,9 @@ def _read_report(root: DataSetPath) -> tuple[tuple[str, ...], SceneConfig]:
         ok = isinstance(name, str) and Path(name).name and ".." not in Path(name).parts
         file.expect(bool(ok), "a list `names` of file names, and `settings`", f"names {names!r}")
     try:
-        # Settings that have gone since changed nothing that is read here.
-        known = {name: settings[name] for name in SceneConfig.__slots__ if name in settings}
-        config = build(SceneConfig, known, str(file.path))
+        # Settings that were removed since do not affect the values read here.
+        present = {name: settings[name] for name in SceneConfig.__slots__ if name in settings}
+        config = build(SceneConfig, present, str(file.path))
     except ConfigError as error:
         raise InputError(f"{file.path}: {error}") from error
     ok = len(names) == config.num_views and len(set(names)) == len(names)
@@ -125,7 +125,7 @@ def _read_views(
     encoding = Encoding(response=settings.encoding, saturation=1.0)
     views = read_photographs(paths, names, encoding=encoding, masks=masks)
     for name, size in zip(names, views.sizes_px.tolist(), strict=True):
-        needed = f"{width} x {height} pixels as scene.json says"
+        needed = f"{width} x {height} pixels as in scene.json"
         ok = size == [width, height]
         root.expect(ok, f"{name} of {needed}", f"{size[0]} x {size[1]}")
     return views.replace(images=views.images.expand(-1, 3, -1, -1))
@@ -135,7 +135,7 @@ def _read_maps(
     folder: DataSetPath, names: Sequence[str], settings: SceneConfig
 ) -> dict[str, Tensor]:
     read: dict[str, list[Tensor]] = {name: [] for name in MAP_NAMES}
-    size = f"{settings.width} x {settings.height} pixels as scene.json says"
+    size = f"{settings.width} x {settings.height} pixels as in scene.json"
     for name in track(names):
         inner = folder.inside(Path(name).with_suffix(".npz").as_posix())
         file = folder._replace(path=inner)
@@ -143,8 +143,8 @@ def _read_maps(
         for key, values in maps.items():
             ok = values.shape[:2] == (settings.height, settings.width)
             file.expect(ok, f"{key} of {size}", f"a shape of {tuple(values.shape)}")
-            finite = key == "depth" or bool(values.isfinite().all())  # depth is infinite off it
-            file.expect(finite, f"finite numbers as {key}", "others")
+            finite = key == "depth" or bool(values.isfinite().all())  # depth is infinite for misses
+            file.expect(finite, f"finite numbers as {key}", "values that are not finite")
             read[key].append(values)
     return {key: torch.stack(values) for key, values in read.items()}
 

@@ -1,4 +1,4 @@
-"""Sets of several lights a position: choice of photographs, and captures of them."""
+"""Sets with several lights per position: selection and reading of photographs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ Positions = Sequence[int]
 CamerasOf = Callable[
     [Positions], tuple[Float[Tensor, "position 3 3"], Float[Tensor, "position 4 4"]]
 ]
-"""Intrinsics, whose pixels count from the centre of the first one, and poses of positions."""
+"""Intrinsics and poses of positions; pixels count from the centre of the first one."""
 
 
 class LightOptions(TypedDict, total=False):
-    """Options of every reader of a set of several lights a position; see :func:`read_shots`."""
+    """Options of readers of sets with several lights per position; see :func:`read_shots`."""
 
     positions: Positions | None
     lights: Sequence[int] | None
@@ -40,7 +40,7 @@ class Shot(Record):
     """A photograph of such a set.
 
     Attributes:
-        direction: Unit, to the light, in our camera's axes, where it is known.
+        direction: Unit, to the light, in our camera axes, if known.
     """
 
     position: int
@@ -53,7 +53,7 @@ class Shot(Record):
 
 
 class Shots(NamedTuple):
-    """The photographs that were chosen, and a capture of them without truth.
+    """The selected photographs, and a capture of them without truth.
 
     Attributes:
         cam_from_world: In float64.
@@ -76,14 +76,14 @@ def read_shots(
     max_size_px: int = 0,
     encoding: Encoding = LINEAR,
 ) -> Shots:
-    """Choose and read photographs, and put each beside the camera of its position.
+    """Select and read photographs with the cameras of their positions.
 
     Args:
-        shots: All that there are, under different lights where they share a position.
-        size_px: Of photographs that the intrinsics are for; by default that of the files.
-        light_seed: Read one light a position, chosen by this seed, see
-            :func:`one_light_per_position`; ``None`` reads all. Decided before anything is decoded.
-        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+        shots: All photographs of the set, under different lights if they share a position.
+        size_px: Of the photographs to which the intrinsics refer; by default that of the files.
+        light_seed: Read one light per position, selected with this seed, see
+            :func:`one_light_per_position`; ``None`` reads all. Decided before decoding.
+        max_size_px: Maximum length of the photographs' longer side; 0 for no limit.
         encoding: Response, saturation and black level of the files.
     """
     numbers = [shot.position for shot in shots], [shot.light for shot in shots]
@@ -120,38 +120,37 @@ def one_light_per_position(
     light: Int[Tensor, " photograph"],
     generator: torch.Generator,
 ) -> Int[Tensor, " chosen"]:
-    """Choose one photograph at every position, each under another light than its neighbour.
+    """Select one photograph at every position, under a different light than its predecessor.
 
-    The setting of this package: every photograph has its own position and its own light. The
-    positions are gone through in the order of their numbers. Each takes, by chance, one of
-    the lights that were taken least so far, and not the light of the position before it if
-    there is another. Where every position offers the same lights, no light is taken more
-    than once oftener than another.
+    This is the setting of this package: every photograph has its own position and light.
+    Positions are processed in the order of their numbers. Each gets one of the lights used least so
+    far, at random, except the light of the previous position if there is another. If every position
+    has the same lights, the numbers of uses differ by at most one.
 
     Args:
-        light: Of every photograph there is; unique among those of one position.
-        generator: Decides; the same seed gives the same choice.
+        light: Of all photographs; unique among those of one position.
+        generator: The same seed gives the same selection.
 
     Returns:
-        Indices of photographs, one a position, by rising position.
+        Indices of photographs, one per position, by increasing position.
 
     >>> one_light_per_position(
     ...     torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 0, 1]), torch.Generator().manual_seed(0)
     ... )
     tensor([0, 3])
     """
-    taken: dict[int, int] = {}
+    uses: dict[int, int] = {}
     chosen: list[int] = []
     last: int | None = None
     for camera in sorted(set(position.tolist())):
         (photographs,) = torch.nonzero(position == camera, as_tuple=True)
-        offered = sorted((int(light[index]), int(index)) for index in photographs)
-        others = [pair for pair in offered if pair[0] != last] or offered
-        least = min(taken.get(point_light, 0) for point_light, _ in others)
-        rarest = [pair for pair in others if taken.get(pair[0], 0) == least]
+        available = sorted((int(light[index]), int(index)) for index in photographs)
+        candidates = [pair for pair in available if pair[0] != last] or available
+        least = min(uses.get(point_light, 0) for point_light, _ in candidates)
+        rarest = [pair for pair in candidates if uses.get(pair[0], 0) == least]
         draw = int(torch.randint(len(rarest), (1,), generator=generator))
         last, index = rarest[draw]
-        taken[last] = taken.get(last, 0) + 1
+        uses[last] = uses.get(last, 0) + 1
         chosen.append(index)
     return torch.tensor(chosen, dtype=torch.long)
 
@@ -165,22 +164,22 @@ def choose_photographs(
     lights: Sequence[int] | None = None,
     light_seed: int | None = None,
 ) -> list[int]:
-    """Decide which photographs of a set are read, as :func:`read_shots` says.
+    """Return which photographs of a set are read; see :func:`read_shots`.
 
     Returns:
         Indices of photographs, by position and then light.
     """
-    for there, wanted, what in ((position, positions, "positions"), (light, lights, "lights")):
-        absent, known = (
+    for existing, wanted, what in ((position, positions, "positions"), (light, lights, "lights")):
+        absent, present = (
             some([str(number) for number in sorted(numbers)], most=25)
-            for numbers in (set(wanted or ()) - set(there), set(there))
+            for numbers in (set(wanted or ()) - set(existing), set(existing))
         )
-        folder.expect(not absent, f"photographs of {what} {absent}", f"{what} {known}")
+        folder.expect(not absent, f"photographs of {what} {absent}", f"{what} {present}")
     table = zip(position, light, range(len(light)), strict=True)
     kept = [
         index
-        for place, point_light, index in sorted(table)
-        if (positions is None or place in positions) and (lights is None or point_light in lights)
+        for number, point_light, index in sorted(table)
+        if (positions is None or number in positions) and (lights is None or point_light in lights)
     ]
     folder.expect(bool(kept), "photographs of these positions under these lights", "none")
     if light_seed is None:

@@ -1,4 +1,4 @@
-"""Figures that compare a result with the truth, each under its own named convention."""
+"""Figures that compare a result with ground truth, each by a named convention."""
 
 from pimper_bench.metrics.camera_errors import (
     CameraFigures,

@@ -18,11 +18,11 @@ from pimper_torch.records import Cameras, Mesh, Record
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LightFigures(Record):
-    """Angles between the directions of lights that both have, in degrees.
+    """Angles between the directions of common lights, in degrees.
 
     Attributes:
-        mean_deg: In the frame of the truth, after the estimate was aligned.
-        mean_rotated_deg: Up to the one rotation of all lights that brings them nearest.
+        mean_deg: In the frame of the truth, after alignment of the estimate.
+        mean_rotated_deg: After the one rotation of all lights that fits best.
     """
 
     mean_deg: float
@@ -38,11 +38,11 @@ def compare_lights(
     lights_true: Float[Tensor, "view 4"],
     rotation: Float[Tensor, "3 3"],
 ) -> LightFigures | None:
-    """Compare the directions of first-order lights, as they are and up to a rotation.
+    """Compare the directions of first-order lights, as given and up to a rotation.
 
-    Uncalibrated methods leave a rotation of all lights and normals together free. The one here
-    minimises the summed squares of the distances between unit directions; two lights or fewer, or
-    lights in a plane with the origin, are aligned more closely than they deserve.
+    Uncalibrated methods leave a common rotation of all lights and normals undetermined. The
+    rotation minimises the summed squared distances between unit directions. With two lights or
+    fewer, or lights in a plane with the origin, it overfits.
 
     Args:
         lights: World frame of the estimate; rows that are zero or not finite are unknown.
@@ -74,19 +74,19 @@ def compare_lights(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraFigures(Record):
-    """Errors of cameras, over the views that have one in both.
+    """Errors of cameras, over the common views.
 
     Attributes:
-        views: Photographs in the truth.
-        missing: Photographs without a camera in the estimate.
+        views: Number of photographs in the truth.
+        missing: Number of photographs without a camera in the estimate.
         mean_center: Distance between the cameras' positions, scene units of the truth.
         mean_center_percent: Of each true camera's distance from the object's centre; NaN
-            where the object is unknown.
-        mean_focal_percent: Of the focal length, absolute, relative to the image's longer side.
-        mean_position_percent: Distance of the object's points from the intersections of our
-            cameras' rays through their true pixels, of the diagonal: the best that a surface made
-            with these cameras can be. NaN where the object is unknown.
-        mean_bend_percent: The same after the points were aligned by a similarity.
+            if the object is unknown.
+        mean_focal_percent: Absolute error of the focal length.
+        mean_position_percent: Distance of the object's points from the intersections of the
+            estimated cameras' rays through their true pixels, of the diagonal: a lower bound for
+            surfaces made with these cameras. NaN if the object is unknown.
+        mean_bend_percent: The same after a similarity between the points.
     """
 
     views: int
@@ -109,13 +109,13 @@ def compare_cameras(
     views: int,
     surface: Mesh | None = None,
 ) -> CameraFigures:
-    """Compare cameras after a similarity carried ours to the frame of the truth.
+    """Compare cameras after transforming the estimate to the frame of the truth.
 
     Args:
         truth: The same views in the same order.
-        truth_from_world: Similarity; on these cameras, for the usual figure.
+        truth_from_world: Similarity; by convention that between these cameras.
         views: Number of all photographs.
-        surface: The true one; vertices alone of a cloud.
+        surface: The true one; of a point cloud, only the vertices are used.
     """
     truth_from_ours = truth_from_world.double().cpu()
     _, rotation = similarity.split_similarity(truth_from_ours)
@@ -132,12 +132,12 @@ def compare_cameras(
         corners = surface.vertices_world.double().cpu()
         centre = (corners.amin(dim=0) + corners.amax(dim=0)) / 2
         away, diagonal = (centers_true - centre).norm(dim=1), bounding_diagonal(surface)
-        found, right = _positions(ours, truth, corners[:: max(1, len(corners) // 2000)])
-        if len(found) >= 10:
-            fitted = similarity.similarity_between_points(found, right)
+        points, points_true = _positions(ours, truth, corners[:: max(1, len(corners) // 2000)])
+        if len(points) >= 10:
+            fitted = similarity.similarity_between_points(points, points_true)
             position, bend = (
-                float(100 * (transform(transferred, found) - right).norm(dim=1).mean() / diagonal)
-                for transferred in (truth_from_ours, fitted)
+                float(100 * (transform(moving, points) - points_true).norm(dim=1).mean() / diagonal)
+                for moving in (truth_from_ours, fitted)
             )
     return CameraFigures(
         views=views,
@@ -156,24 +156,24 @@ def compare_cameras(
 def _positions(
     ours: Cameras, truth: Cameras, points_true: Float[Tensor, "point 3"]
 ) -> tuple[Float[Tensor, "position 3"], Float[Tensor, "position 3"]]:
-    """Return where our cameras put points that the true ones have in their images, and these."""
+    """Return points triangulated by our cameras from their true pixels, and the true points."""
     pixels, depth = project(
         points_true, truth.cam_from_world.double().cpu(), truth.intrinsics.double().cpu()
     )
     sizes = truth.sizes_px[:, None].cpu()
     seen = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
-    often = seen.sum(dim=0) >= 3
+    observed = seen.sum(dim=0) >= 3
     resized = ours.sizes_px[:, None].cpu().double() / sizes
     cameras = ours.replace(
         intrinsics=ours.intrinsics.double().cpu(),
         cam_from_world=ours.cam_from_world.double().cpu(),
         sizes_px=ours.sizes_px.cpu(),
     )
-    pixels = (pixels * resized)[:, often].movedim(0, 1)
-    return triangulate_rays(cameras, pixels, seen[:, often].mT), points_true[often]
+    pixels = (pixels * resized)[:, observed].movedim(0, 1)
+    return triangulate_rays(cameras, pixels, seen[:, observed].mT), points_true[observed]
 
 
 def _focal(cameras: Cameras) -> Float[Tensor, " view"]:
-    """Return the mean focal length in units of the image's longer side."""
-    both = cameras.intrinsics.double().cpu().diagonal(dim1=-2, dim2=-1)[:, :2]
-    return both.mean(dim=1) / cameras.sizes_px.cpu().amax(dim=1)
+    """Return the mean of both focal lengths in units of the image's longer side."""
+    focal = cameras.intrinsics.double().cpu().diagonal(dim1=-2, dim2=-1)[:, :2]
+    return focal.mean(dim=1) / cameras.sizes_px.cpu().amax(dim=1)

@@ -1,4 +1,4 @@
-"""A result's page with its errors against the truth."""
+"""A result's page with its errors relative to ground truth."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,12 +25,12 @@ from pimper_torch.result.report.vertex_layers import LengthUnit, length_layer
 from pimper_torch.runtime.config import read_mapping
 
 _DISTANCE, _ANGLE = "_DISTANCE_TO_TRUTH", "_NORMAL_ERROR_DEG"
-# Titles and units by the names of the asset's attributes.
+# Titles and units by the asset's attributes.
 _LAYERS = {
     _DISTANCE: ("distance to the truth", "units of the truth"),
     _ANGLE: ("error of normals", "degrees"),
 }
-_ABOUT = "At every vertex, to the nearest point of the truth"
+_ABOUT = "At every vertex, relative to the nearest point of the truth"
 
 
 def write_compared_page(
@@ -42,13 +42,13 @@ def write_compared_page(
         truth: A mesh, or points without faces, which have no normals.
 
     Raises:
-        InputError: The folder is no result, or its photographs are gone.
+        InputError: The folder is not a result, or its photographs are missing.
     """
-    found = read_result(folder)
-    few = Simplify()(found.mesh, MeshFiles(faces="all")).few
-    scene = found.scene
-    relighting = Relight()(few, scene, found.silhouettes)
-    asset = Texture()(found.mesh, few, relighting)
+    result = read_result(folder)
+    few = Simplify()(result.mesh, MeshFiles(faces="all")).few
+    scene = result.scene
+    relighting = Relight()(few, scene, result.silhouettes)
+    asset = Texture()(result.mesh, few, relighting)
     errors = errors_of(asset.mesh.replace(normals_world=asset.normals), truth, truth_from_world)
     layers = [
         length_layer(name.lower(), title, _ABOUT, errors[name], LengthUnit(factor=1, name=unit))
@@ -61,16 +61,16 @@ def write_compared_page(
         write_page(
             path,
             title=f"{folder.absolute().name}, compared with the truth",
-            mesh=found.mesh,
+            mesh=result.mesh,
             asset=glb.read_bytes(),
             surface=asset.mesh,
             scene=scene,
-            silhouettes=found.silhouettes,
-            reference=scene.views.names.index(found.reference),
+            silhouettes=result.silhouettes,
+            reference=scene.views.names.index(result.reference),
             predictions=predictions(few, scene, relighting),
-            summary=found.summary,
+            summary=result.summary,
             settings=read_mapping(folder / "config.yaml"),
-            lights_world=found.lights_world,
+            lights_world=result.lights_world,
             layers=layers,
         )
 
@@ -81,7 +81,7 @@ def errors_of(
     """Return the distance of every vertex to the truth, and the angle between normals in degrees.
 
     Args:
-        truth: Its normals are those of its faces; without faces, angles are left out.
+        truth: Its normals are those of its faces; without faces, no angles are returned.
     """
     moved = transfer(mesh, truth_from_world)
     near = NearestSurface(truth).query(moved.vertices_world)

@@ -1,4 +1,4 @@
-"""The protocol of the DTU multi-view stereo set of 2014, as in its evaluation code."""
+"""The evaluation protocol of the DTU multi-view stereo set of 2014, as in its code."""
 
 from dataclasses import dataclass
 
@@ -13,19 +13,19 @@ from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.errors import InputError
 
-# The fewest points visited at once.
+# Minimum size of a batch of points.
 _BATCH = 100_000
 
 
 def thin(
     points: Float[Tensor, "point 3"], distance: float, generator: torch.Generator
 ) -> Int[Tensor, " kept"]:
-    """Visit points in random order; keep each that no kept point is within ``distance`` of.
+    """Thin points in random order: keep a point if no kept point is within ``distance``.
 
-    Done in batches: earlier points remove some of a batch, which is then settled among itself.
+    Done in batches: kept points remove neighbours in a batch, which is then thinned separately.
 
     Returns:
-        Indices of the kept points, in the order they were visited.
+        Indices of the kept points, in the order of processing.
 
     Source: Jensen et al., CVPR 2014, supplementary code.
     """
@@ -33,22 +33,22 @@ def thin(
     order = torch.randperm(len(positions), generator=generator)
     kept = order[:0]
     while len(order):
-        # As large as what is kept, so that few trees are built.
+        # As large as the kept set, so that few trees are built.
         batch, order = order.tensor_split([max(_BATCH, len(kept))])
         if len(kept):
             nearest, _ = cKDTree(positions[kept].numpy()).query(
                 positions[batch].numpy(), distance_upper_bound=np.nextafter(distance, np.inf)
             )
             batch = batch[torch.from_numpy(nearest > distance)]
-        kept = torch.cat([kept, batch[_settled(positions[batch], distance)]])
+        kept = torch.cat([kept, batch[_thinned(positions[batch], distance)]])
     return kept
 
 
-def _settled(positions: Float[Tensor, "point 3"], distance: float) -> Bool[Tensor, " point"]:
-    """Keep each point, first to last, that no kept one before it is near.
+def _thinned(positions: Float[Tensor, "point 3"], distance: float) -> Bool[Tensor, " point"]:
+    """Keep each point, first to last, without an earlier kept neighbour.
 
-    A round keeps the points that no undecided point before them is near, and drops the
-    neighbours of what it kept; what is kept is the same as one by one.
+    A round keeps the points without an earlier undecided neighbour, and drops their
+    neighbours; the result is the same as one by one.
     """
     undecided = np.ones(len(positions), dtype=bool)
     kept = np.zeros(len(positions), dtype=bool)
@@ -66,8 +66,8 @@ def _settled(positions: Float[Tensor, "point 3"], distance: float) -> Bool[Tenso
     return torch.from_numpy(kept)
 
 
-# Of the published code, in millimetres: the density of points, the distance past which a point
-# is an outlier, and the side of the cells by which it searches for neighbours.
+# Of the published code, in millimetres: the density of points, the distance from which a point
+# is an outlier, and the side of the cells in which it searches for neighbours.
 THINNING_MM, CAP_MM, _CELL_MM = 0.2, 20.0, 60.0
 
 
@@ -81,7 +81,7 @@ class DtuFigures(Record):
         points: Of the result after thinning.
         evaluated: Points of the result inside the mask.
         evaluated_true: Points of the scan above the table.
-        capped_fraction: Fraction of the evaluated points 20 mm off or more, which are left out.
+        capped_fraction: Fraction of the evaluated points 20 mm off or more, which are excluded.
     """
 
     mean_accuracy: float
@@ -102,14 +102,14 @@ def dtu_figures(
     """Evaluate a result by the protocol.
 
     The vertices, and points on the faces, are thinned in random order until no two are within
-    0.2 mm. Distances are between points. Accuracy is over the result's points whose nearest voxel
-    of the observability mask is set; completeness over the scan's points above the plane of the
-    table. Distances of 20 mm and more count in neither, and neither do points outside the cells
-    that the code lays on the bounding box.
+    0.2 mm. Distances are between points. Accuracy is over the result's points in voxels
+    of the observability mask; completeness over the scan's points above the plane of the
+    table. Distances of 20 mm and more are excluded, and so are points outside the cells
+    with which the code covers the bounding box.
 
     Args:
         mesh: In the frame of the set, millimetres.
-        scan: The set's own points, thinned already.
+        scan: The set's points, already thinned.
 
     Raises:
         InputError: No point of the result is inside the mask and near the scan, or no point
@@ -127,10 +127,10 @@ def dtu_figures(
     completeness = _near(evaluated_true, points, protocol)
     if len(accuracy) == 0 or len(completeness) == 0:
         raise InputError(
-            f"of {len(points)} points of the result {len(evaluated)} lie in the observability mask "
-            f"and {len(accuracy)} of these within {CAP_MM:g} mm of the scan; {len(completeness)} "
-            "of the scan's are as near to the result. Needed: a result in the frame and the "
-            "millimetres of the set. Align it by its cameras first."
+            f"{len(evaluated)} of {len(points)} points of the result are in the observability "
+            f"mask, {len(accuracy)} of these within {CAP_MM:g} mm of the scan; "
+            f"{len(completeness)} of the scan's points are as near to the result. Needed: a result "
+            "in the frame and the millimetres of the set. Align it by its cameras first."
         )
     return DtuFigures(
         mean_accuracy=float(accuracy.mean()),
@@ -147,10 +147,10 @@ def dtu_figures(
 
 
 def observed(points: Float[Tensor, "point 3"], protocol: DtuProtocol) -> Bool[Tensor, " point"]:
-    """Find which points lie in a voxel of the observability mask."""
+    """Return whether points are in a voxel of the observability mask."""
     mask = protocol.obs_mask.cpu()
     lower = protocol.bounding_box[0].to(points)
-    # Halves round up, as in Matlab; torch's own rounding takes them to even numbers.
+    # Halves round up, as in Matlab; torch rounds them to even numbers.
     voxel = ((points - lower) / protocol.resolution + 0.5).floor().long()
     shape = torch.tensor(mask.shape)
     inside = ((voxel >= 0) & (voxel < shape)).all(dim=1)
@@ -159,11 +159,11 @@ def observed(points: Float[Tensor, "point 3"], protocol: DtuProtocol) -> Bool[Te
 
 
 def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
-    """Return the vertices, and the published grid on each face about ``distance`` apart.
+    """Return the vertices, and the published grid on each face, about ``distance`` apart.
 
     With edges ``v1, v2`` of twice-area ``A``, it has ``n_i = floor(|v_i| / (distance
     sqrt(|v1||v2| / A)))`` steps along ``v_i``, its points at half steps. A face too small for
-    a step has its vertices only.
+    a step has only its vertices.
     """
     vertices = mesh.vertices_world.detach().cpu().double()
     faces = mesh.faces.cpu()
@@ -178,7 +178,7 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
     n1, n2 = n1[usable].long(), n2[usable].long()
     counts = (n1 + 1) * (n2 + 1)
     total = float(counts.double().sum())
-    # The sets' objects have some ten million; a hundred million take gigabytes.
+    # The sets' objects have some ten million points; a hundred million take gigabytes.
     if total > 2e8:
         raise InputError(
             f"points {distance:g} apart on the faces would be about {total / 2:.1g}; needed: at "
@@ -186,9 +186,9 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
             "by its cameras first."
         )
     face = torch.arange(len(usable)).repeat_interleave(counts)
-    within = torch.arange(len(face)) - (counts.cumsum(0) - counts)[face]
-    k1 = (within // (n2[face] + 1) + 0.5) / n1[face]
-    k2 = (within % (n2[face] + 1) + 0.5) / n2[face]
+    offset = torch.arange(len(face)) - (counts.cumsum(0) - counts)[face]
+    k1 = (offset // (n2[face] + 1) + 0.5) / n1[face]
+    k2 = (offset % (n2[face] + 1) + 0.5) / n2[face]
     inside = k1 + k2 < 1
     chosen = usable[face[inside]]
     subdivision = a[chosen] + k1[inside, None] * v1[chosen] + k2[inside, None] * v2[chosen]
@@ -198,12 +198,12 @@ def supersample(mesh: Mesh, distance: float) -> Float[Tensor, "point 3"]:
 def _near(
     points: Float[Tensor, "point 3"], others: Float[Tensor, "other 3"], protocol: DtuProtocol
 ) -> Float[Tensor, " near"]:
-    """Return distances to the nearest of the others, of the points that count."""
+    """Return distances below the cap from points inside the cells to the nearest other point."""
     lower, upper = protocol.bounding_box.to(points)
     reach = lower + _CELL_MM * (((upper - lower) / _CELL_MM).floor() + 1)
-    asked = points[((points >= lower) & (points < reach)).all(dim=1)]
-    if len(asked) == 0 or len(others) == 0:
-        return asked.new_zeros(0)
-    found, _ = cKDTree(others.numpy()).query(asked.numpy(), distance_upper_bound=CAP_MM)
-    distance = torch.from_numpy(np.asarray(found))
+    inside = points[((points >= lower) & (points < reach)).all(dim=1)]
+    if len(inside) == 0 or len(others) == 0:
+        return inside.new_zeros(0)
+    nearest, _ = cKDTree(others.numpy()).query(inside.numpy(), distance_upper_bound=CAP_MM)
+    distance = torch.from_numpy(np.asarray(nearest))
     return distance[distance < CAP_MM]

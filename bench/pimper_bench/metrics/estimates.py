@@ -1,4 +1,4 @@
-"""Results of this package as estimates to evaluate."""
+"""Conversion of this package's results to estimates for evaluation."""
 
 import torch
 
@@ -8,9 +8,9 @@ from pimper_torch.records import Estimate, Reconstruction
 
 
 def estimate_of(result: Reconstruction) -> Estimate:
-    """Return a run's estimate of the object, in the frame that its files have.
+    """Return a run's estimate of the object, in the frame of its files.
 
-    A view's light is that of all patches that determine it, NaN where none does; see
+    A view's light is that of all patches that determine it, NaN if none does; see
     :func:`pimper_torch.doors.io.reports.common_lights`.
     """
     lights, counts = common_lights(result)

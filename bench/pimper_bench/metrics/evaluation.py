@@ -1,4 +1,4 @@
-"""A result against the truth: every figure that the truth allows."""
+"""Evaluation of a result against ground truth: every figure that the truth allows."""
 
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,18 +28,18 @@ class EvaluateConfig:
     """Settings of an evaluation.
 
     Attributes:
-        alignment: Before measuring: `none`, `cameras` (similarity on the cameras both have),
-            `icp` (trimmed similarity between the surfaces, from the cameras or a guess at units,
-            axes and a shift on), or `auto`: cameras if there are two on both sides, else none.
-        views: Names of the photographs to compare normals, albedo and relative error in; the
-            result's reference view unless given, or the middle one if it has none.
+        alignment: Before measuring: `none`, `cameras` (similarity between the common cameras),
+            `icp` (trimmed similarity ICP of the surfaces, starting from the cameras or a guess of
+            units, axes and translation), or `auto`: cameras if at least two are common, else none.
+        views: Names of the photographs in which normals, albedo and relative error are compared;
+            by default the result's reference view, or the middle one if it has none.
         thresholds_percent: For precision, recall and F-score, in per cent of the diagonal of
             the true object's bounding box.
-        seen_from: Completeness is given once more over the truth that this many positions of the
-            camera see.
-        samples: Points drawn on each surface.
-        seed: Of every draw.
-        trimmed_fraction: Fraction of the result's samples that each step of `icp` leaves out.
+        seen_from: Completeness is repeated over the part of the truth that is visible from at least
+            this many camera positions.
+        samples: Number of points drawn on each surface.
+        seed: Of all random samples.
+        trimmed_fraction: Fraction of the result's samples that each step of `icp` excludes.
     """
 
     alignment: similarity.Method = "auto"
@@ -51,16 +51,16 @@ class EvaluateConfig:
     trimmed_fraction: Annotated[float, Range(least=0, below=1)] = 0.2
 
     def __post_init__(self) -> None:
-        within = all(0 < percent <= 100 for percent in self.thresholds_percent)
-        require(within, "thresholds_percent", self.thresholds_percent, "above 0, at most 100 each")
+        valid = all(0 < percent <= 100 for percent in self.thresholds_percent)
+        require(valid, "thresholds_percent", self.thresholds_percent, "above 0, at most 100 each")
         require_ranges(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation(Record):
-    """All figures; a part is ``None`` (or empty) where either side lacks what it needs.
+    """All figures; ``None`` (or empty) if either side lacks the required data.
 
-    Those of the cameras are after the similarity on cameras, all others after ``alignment``.
+    Figures of the cameras are after the similarity on cameras, all others after ``alignment``.
     """
 
     alignment: similarity.Alignment
@@ -80,18 +80,18 @@ def evaluate(
     maps: Capture | None = None,
     dtu: DtuProtocol | None = None,
 ) -> Evaluation:
-    """Measure a result by everything the truth determines; views are paired by :func:`.pair_views`.
+    """Compute every figure that the truth determines; views are paired by :func:`.pair_views`.
 
     Args:
-        capture: The truth; its views may be a part of those the estimate was made from.
-        surface: That of ``capture``, where many estimates are measured against it; see
+        capture: The truth; its views may be a subset of the estimate's.
+        surface: That of ``capture``, to be reused for several estimates; see
             :func:`prepared_surface`.
-        maps: The same data set with the maps of the views to compare in, where ``capture``
-            was read without any to save memory.
-        dtu: Evaluation region of a scan of the DTU set; needs the scan's points.
+        maps: The same data set with the maps of the compared views, if ``capture`` was read
+            without maps to save memory.
+        dtu: Evaluated region of a scan of the DTU set; needs the scan's points.
 
     Raises:
-        InputError: The alignment cannot be made, a view that was asked for is unknown, or
+        InputError: The alignment is impossible, a requested view is unknown, or
             the surfaces are in different frames; see :class:`.Frames`.
     """
     config = config or EvaluateConfig()
@@ -100,7 +100,7 @@ def evaluate(
         estimate, capture, config.alignment, config.trimmed_fraction, generator=generator
     )
     moved = similarity.transfer(estimate.mesh, alignment.truth_from_world)
-    if _knows_surface(capture):
+    if _has_surface(capture):
         pairs = similarity.paired_cameras(estimate, capture)
         cameras = 0 if pairs is None else pairs[0].num_views
         Frames(moved, true_surface(capture)).require_met(alignment.method, cameras)
@@ -124,27 +124,27 @@ def evaluate(
 
 def prepared_surface(capture: Capture, config: EvaluateConfig) -> TrueSurface | None:
     """Prepare the true surface for :func:`evaluate`; ``None`` if it is unknown."""
-    if not _knows_surface(capture):
+    if not _has_surface(capture):
         return None
     return TrueSurface(
         capture, seen_from=config.seen_from, samples=config.samples, seed=config.seed
     )
 
 
-def _knows_surface(capture: Capture) -> bool:
+def _has_surface(capture: Capture) -> bool:
     return capture.truth.mesh is not None or capture.truth.points_world is not None
 
 
 def chosen_views(estimate: Estimate, capture: Capture, config: EvaluateConfig) -> tuple[int, ...]:
-    """Return the indices of the views to compare in."""
+    """Return the indices of the compared views."""
     names = capture.views.names
     chosen: dict[int, None] = {}
-    for asked in config.views:
+    for name in config.views:
         try:
-            chosen[int(similarity.pair_views([asked], names)[1][0])] = None
+            chosen[int(similarity.pair_views([name], names)[1][0])] = None
         except InputError as error:
             raise InputError(
-                f"there is no view {asked!r} in the truth; it has {', '.join(names[:5])}"
+                f"there is no view {name!r} in the truth; it has {', '.join(names[:5])}"
                 f"{', ...' if len(names) > 5 else ''}. Choose one of these."
             ) from error
     if not chosen and estimate.reference is not None:
@@ -169,10 +169,10 @@ def _lights(
 
 
 def camera_figures(estimate: Estimate, capture: Capture) -> camera_errors.CameraFigures | None:
-    """Compare the cameras of the views that both have.
+    """Compare the cameras of the common views.
 
     Returns:
-        ``None`` for fewer than two, or where they agree but for their rolls.
+        ``None`` for fewer than two, or if they agree except for their rolls.
     """
     pairs = similarity.paired_cameras(estimate, capture)
     if pairs is None or pairs[0].num_views < 2 or similarity.rolled_cameras(*pairs):
@@ -183,5 +183,5 @@ def camera_figures(estimate: Estimate, capture: Capture) -> camera_errors.Camera
         truth,
         similarity.similarity_between_cameras(ours, truth),
         views=capture.views.num_views,
-        surface=true_surface(capture) if _knows_surface(capture) else None,
+        surface=true_surface(capture) if _has_surface(capture) else None,
     )

@@ -20,11 +20,11 @@ from pimper_bench.metrics.surface_distances import (
 
 
 class FigureRow(NamedTuple):
-    """A figure as a person reads it.
+    """A figure for display.
 
     Attributes:
         name: Of the convention, as in the JSON.
-        meaning: Of the figure, and over which part of the result.
+        meaning: Of the figure, and the evaluated part of the result.
     """
 
     name: str
@@ -33,10 +33,10 @@ class FigureRow(NamedTuple):
 
 
 def report(evaluation: Evaluation) -> dict[str, object]:
-    """Return all figures as plain mappings, lists and numbers; what is not finite is ``None``.
+    """Return all figures as plain mappings, lists and numbers; ``None`` if not finite.
 
-    Names are those of the records; those that end in ``_percent``, ``_deg`` are in these
-    units, the other lengths in scene units of the truth, and those of ``dtu`` in millimetres.
+    Names are those of the records. Names ending in ``_percent`` and ``_deg`` are in these
+    units, other lengths in scene units of the truth, and those of ``dtu`` in millimetres.
     """
     figures = plain(evaluation)
     assert isinstance(figures, dict)
@@ -46,10 +46,10 @@ def report(evaluation: Evaluation) -> dict[str, object]:
 def rows(
     evaluation: Evaluation, relighting: Mapping[str, Any] | None = None
 ) -> list[tuple[str, list[FigureRow]]]:
-    """Return the figures as a table: its sections with their rows, none of them empty.
+    """Return the figures as a table: its non-empty sections with their rows.
 
     Args:
-        relighting: What ``summary.json`` of the result tells under this name.
+        relighting: The entry of this name in the result's ``summary.json``.
     """
     sections: list[tuple[str, Iterator[FigureRow]]] = [("alignment", _alignment_rows(evaluation))]
     if evaluation.surface is not None:
@@ -63,33 +63,31 @@ def rows(
         sections.append(("DTU protocol", _dtu_rows(evaluation.dtu)))
     if relighting is not None:
         sections.append((f"photographs {relighting['photographs']}", _relit_rows(relighting)))
-    return [(title, found) for title, lines in sections if (found := list(lines))]
+    return [(title, listed) for title, lines in sections if (listed := list(lines))]
 
 
 def _alignment_rows(evaluation: Evaluation) -> Iterator[FigureRow]:
-    found = evaluation.alignment
-    yield FigureRow("method", found.method, found.description)
-    value = f"{_number(found.scale)}, {found.rotation_deg:.2f}°"
-    yield FigureRow(
-        "scale, rotation", value, "of the similarity that carries the result to the truth"
-    )
-    if found.residual is not None:
-        state = "came to rest" if found.converged else "stopped by the limit of iterations"
-        meaning = f"root mean square of the samples kept, scene units; {state}"
-        yield FigureRow("residual", _number(found.residual), meaning)
+    alignment = evaluation.alignment
+    yield FigureRow("method", alignment.method, alignment.description)
+    value = f"{_number(alignment.scale)}, {alignment.rotation_deg:.2f}°"
+    yield FigureRow("scale, rotation", value, "of the similarity from the result to the truth")
+    if alignment.residual is not None:
+        state = "converged" if alignment.converged else "stopped at the maximum of iterations"
+        meaning = f"root mean square of the kept samples, scene units; {state}"
+        yield FigureRow("residual", _number(alignment.residual), meaning)
 
 
 def _surface_rows(surface: SurfaceComparison) -> Iterator[FigureRow]:
-    meaning = "of the true object's bounding box, scene units; % below are of it"
+    meaning = "of the true object's bounding box, scene units; % below are relative to it"
     yield FigureRow("diagonal", _number(surface.diagonal), meaning)
     if surface.accuracy is not None:
         yield _distance_row("accuracy", surface.accuracy, "result to truth: mean; median")
     if surface.surroundings_fraction > 0:
-        meaning = "of the result lies nearer to the surroundings; left out of the accuracy"
+        meaning = "of the result is nearer to the surroundings; excluded from the accuracy"
         value = _fraction(surface.surroundings_fraction)
         yield FigureRow("surroundings_fraction", value, meaning)
     if surface.whole is not None:
-        yield from _two_sided_rows(surface.whole, "", "the whole truth")
+        yield from _two_sided_rows(surface.whole, "", "the complete truth")
     if surface.seen is not None and surface.seen_fraction is not None:
         seen = _fraction(surface.seen_fraction)
         part = f"the {seen} of it seen from {surface.seen_from} positions"
@@ -98,16 +96,16 @@ def _surface_rows(surface: SurfaceComparison) -> Iterator[FigureRow]:
         yield from _calibration_rows(surface.calibration, surface.diagonal)
 
 
-def _calibration_rows(found: Calibration, diagonal: float) -> Iterator[FigureRow]:
-    within = f"{_fraction(found.within_one)}, {_fraction(found.within_two)}"
+def _calibration_rows(calibration: Calibration, diagonal: float) -> Iterator[FigureRow]:
+    within = f"{_fraction(calibration.within_one)}, {_fraction(calibration.within_two)}"
     yield FigureRow(
         "expected_error",
-        f"{found.ratio:.2f}; {within}; {found.rank_correlation:.2f}",
+        f"{calibration.ratio:.2f}; {within}; {calibration.rank_correlation:.2f}",
         "true over expected error, 1 if calibrated; true error within one and two "
         "expected, 68 and 95 % if calibrated; rank correlation",
     )
-    for which, one in (("surest", found.bins[0]), ("least sure", found.bins[-1])):
-        errors = (one.expected, one.root_mean_square)
+    for which, tenth in (("surest", calibration.bins[0]), ("least sure", calibration.bins[-1])):
+        errors = (tenth.expected, tenth.root_mean_square)
         value = "; ".join(f"{_number(100 * error / diagonal)} %" for error in errors)
         meaning = "expected error; true error, root mean squares"
         yield FigureRow(f"{which} tenth", value, meaning)
@@ -121,28 +119,28 @@ def _two_sided_rows(figures: TwoSided, mark: str, part: str) -> Iterator[FigureR
         ("sum", figures.chamfer_sum, figures.chamfer_sum_percent),
     ):
         meaning = f"{name} of mean accuracy and mean completeness{mark}"
-        yield FigureRow(f"chamfer_{name}{mark}", _percent_too(length, percent), meaning)
-    for at in figures.thresholds:
+        yield FigureRow(f"chamfer_{name}{mark}", _with_percent(length, percent), meaning)
+    for scores in figures.thresholds:
         meaning = (
-            f"precision {_fraction(at.precision)}, recall{mark} {_fraction(at.recall)}, "
-            f"nearer than {_number(at.threshold)}"
+            f"precision {_fraction(scores.precision)}, recall{mark} {_fraction(scores.recall)}, "
+            f"nearer than {_number(scores.threshold)}"
         )
-        name = f"f_score{mark} at {at.threshold_percent:g} %"
-        yield FigureRow(name, _fraction(at.f_score), meaning)
+        name = f"f_score{mark} at {scores.threshold_percent:g} %"
+        yield FigureRow(name, _fraction(scores.f_score), meaning)
 
 
 def _view_rows(view: ViewFigures) -> Iterator[FigureRow]:
     value = f"{_number(view.relative_error)} %"
-    yield FigureRow("relative_error", value, "100 ||S - S'|| / ||S - mean S|| where both are met")
-    meaning = f"of {view.pixels} true pixels are met by the result"
+    yield FigureRow("relative_error", value, "100 ||S - S'|| / ||S - mean S|| where both are hit")
+    meaning = f"of {view.pixels} true pixels are covered by the result"
     yield FigureRow("coverage", _fraction(view.coverage), meaning)
-    for name, angles, whose in (
+    for name, angles, origin in (
         ("shape_normals", view.shape_normals, "of the mesh's shape"),
-        ("transferred_normals", view.transferred_normals, "the mesh carries"),
+        ("transferred_normals", view.transferred_normals, "stored with the mesh"),
     ):
         if angles is not None:
             value = f"{_degrees(angles)}; {angles.pitted_percent:.2f} %"
-            yield FigureRow(name, value, f"normals {whose}: mean; median; pitted")
+            yield FigureRow(name, value, f"normals {origin}: mean; median; pitted")
     if (albedo := view.albedo) is not None:
         value = f"{albedo.one_scale_percent:.1f} %; {albedo.one_scale_median_percent:.1f} %"
         meaning = "after one scale: root mean square, least squares; median, median ratio"
@@ -166,18 +164,18 @@ def _camera_rows(cameras: CameraFigures) -> Iterator[FigureRow]:
     value = f"{cameras.mean_rotation_deg:.3f}°; {cameras.median_rotation_deg:.3f}°"
     yield FigureRow("rotation", value, "after the similarity on cameras: mean; median")
     percent = cameras.mean_center_percent
-    away = "" if math.isnan(percent) else f", {_number(percent)} % of the way to the object"
+    away = "" if math.isnan(percent) else f", {_number(percent)} % of the distance to the object"
     value = f"{_number(cameras.mean_center)}; {_number(cameras.median_center)}"
     meaning = f"after the similarity on cameras, scene units: mean; median{away}"
     yield FigureRow("center", value, meaning)
     value = f"{_number(cameras.mean_focal_percent)} %"
-    yield FigureRow("focal", value, "mean of the absolute differences of the focal length")
+    yield FigureRow("focal", value, "mean absolute error of the focal length")
     if not math.isnan(cameras.mean_position_percent):
         yield FigureRow(
             "positions",
             f"{cameras.mean_position_percent:.4f} %; {cameras.mean_bend_percent:.4f} %",
-            "of the diagonal, that exact rays put points off: after the similarity on "
-            "cameras; after the best one",
+            "of the diagonal, error of points triangulated from exact pixels: after the similarity "
+            "on cameras; after the best one",
         )
 
 
@@ -190,9 +188,9 @@ def _relit_rows(relighting: Mapping[str, Any]) -> Iterator[FigureRow]:
         value = relighting.get(f"psnr_{kind}_db" if kind else "psnr_db")
         if value is not None:
             yield FigureRow(f"PSNR, {kind}" if kind else "PSNR", f"{value:.2f} dB", meaning)
-    for one in relighting["materials"]:
-        value = f"{one['roughness']:.2f}, {one['specular']:.2f}, {one['metallic']:.2f}"
-        meaning = f"glTF's material of {one['vertices']:.0%} of the vertices"
+    for material in relighting["materials"]:
+        value = ", ".join(f"{material[key]:.2f}" for key in ("roughness", "specular", "metallic"))
+        meaning = f"glTF's material of {material['vertices']:.0%} of the vertices"
         yield FigureRow("roughness, specular, metallic", value, meaning)
 
 
@@ -211,12 +209,12 @@ def _capped(part: str, fraction: float) -> str:
 
 
 def _distance_row(name: str, figures: DistanceFigures, meaning: str) -> FigureRow:
-    mean = _percent_too(figures.mean, figures.mean_percent)
-    median = _percent_too(figures.median, figures.median_percent)
+    mean = _with_percent(figures.mean, figures.mean_percent)
+    median = _with_percent(figures.median, figures.median_percent)
     return FigureRow(name, f"{mean}; {median}", meaning)
 
 
-def _percent_too(length: float, percent: float) -> str:
+def _with_percent(length: float, percent: float) -> str:
     return f"{_number(length)} ({_number(percent)} %)"
 
 
@@ -233,7 +231,7 @@ def _fraction(value: float) -> str:
 
 
 def plain(value: object) -> object:
-    """Return records as mappings, tensors and tuples as lists, and numbers not finite as None."""
+    """Return records as mappings, tensors and tuples as lists, non-finite numbers as ``None``."""
     if dataclasses.is_dataclass(value):
         fields = dataclasses.fields(value)
         return {field.name: plain(getattr(value, field.name)) for field in fields}

@@ -1,4 +1,4 @@
-"""Whether the frames of a result and of the truth meet, and a guess at their difference if not."""
+"""Test whether a result and the truth are in one frame, and a guess of their difference if not."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from pimper_torch.runtime.errors import InputError
 
 _SAMPLES = 500  # of each surface: a choice
 # Distances below are medians, as fractions of the truth's diagonal, and choices. A ball that is a
-# third larger than the true one is 0.1 from it.
+# third larger than the true one has a distance of 0.1.
 _MEETS = 0.1
 _APART = 0.5
 _FITS = 0.03
-_LARGEST_RATIO = 20.0  # of sizes, also of a result that has its surroundings: a choice
+_LARGEST_RATIO = 20.0  # of sizes, also of a result that includes its surroundings: a choice
 _UNITS = {
     1000.0: "metres and millimetres",
     100.0: "metres and centimetres",
@@ -31,19 +31,19 @@ _UNITS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Guess(Record):
-    """A similarity that brings a result and the truth together.
+    """A similarity that aligns a result with the truth.
 
     Attributes:
-        told: The difference of the frames, for a message.
+        description: The difference of the frames, for a message.
     """
 
     truth_from_world: Float[Tensor, "4 4"]
-    told: str
+    description: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class _Sampled:
-    """A surface with samples and their box."""
+    """A surface with samples and their bounding box."""
 
     surface: NearestSurface
     points: Float[Tensor, "sample 3"]
@@ -65,35 +65,35 @@ class _Sampled:
         return (self.low + self.high) / 2
 
     def distance(self, points: Float[Tensor, "sample 3"]) -> float:
-        """Return the median distance of points; of far ones to the box, as searches are slow."""
-        beside = (self.low - points).clamp_min(0) + (points - self.high).clamp_min(0)
-        distance = beside.norm(dim=1)
+        """Return the median distance of points; of far points, to the box, as searches are slow."""
+        outside = (self.low - points).clamp_min(0) + (points - self.high).clamp_min(0)
+        distance = outside.norm(dim=1)
         near = distance < 2 * self.size
         distance[near] = self.surface.query(points[near]).distance
         return float(distance.median())
 
 
 class Frames:
-    """A result and the truth, compared as they are and under guesses.
+    """A result and the truth, compared as given and under guesses.
 
     Args:
-        mesh: The result, in the frame that is taken for that of the truth.
+        mesh: The result, assumed to be in the frame of the truth.
         truth: Surface or point cloud.
     """
 
     def __init__(self, mesh: Mesh, truth: Mesh) -> None:
         self._ours, self._truth = _Sampled.of(mesh), _Sampled.of(truth)
-        self._here = self._distances(torch.eye(4).double())
+        self._distance = self._distances(torch.eye(4).double())
 
     def require_met(self, method: str, cameras: int) -> None:
-        """Refuse surfaces that are apart, or that other units, axes or a shift bring together.
+        """Raise if surfaces are apart, or if other units, axes or a translation align them.
 
         Args:
-            method: That they were aligned by.
-            cameras: That both have.
+            method: Method of the alignment.
+            cameras: Number of common cameras.
         """
         guess = self.guess()
-        if guess is None and min(self._here) <= _APART:
+        if guess is None and min(self._distance) <= _APART:
             return
         if method == "cameras":
             advice = (
@@ -101,47 +101,47 @@ class Frames:
                 "photographs, and that the result is in the frame of its cameras."
             )
         elif method == "none" and cameras >= 2:
-            advice = f"Align them by the {cameras} cameras that both have (`--alignment cameras`)."
+            advice = f"Align them by their {cameras} common cameras (`--alignment cameras`)."
         elif method == "none" and guess:
-            advice = "`--alignment icp` begins with that."
+            advice = "`--alignment icp` starts from that."
         else:
             advice = (
-                "Move the result to the frame of the truth, or give a folder whose cameras the "
-                "truth has (`--alignment cameras`)."
+                "Transform the result to the frame of the truth, or give a folder that has cameras "
+                "in common with the truth (`--alignment cameras`)."
             )
         ours, truth = self._ours, self._truth
         between = float((ours.center - truth.center).norm())
         raise InputError(
             f"the result and the truth are in different frames: the result is {ours.size:.4g} "
             f"across, the truth {truth.size:.4g}, and their centres are {between:.4g} apart. "
-            f"{f'They fit if {guess.told}. ' if guess else ''}{advice}"
+            f"{f'They fit if {guess.description}. ' if guess else ''}{advice}"
         )
 
     def guess(self) -> Guess | None:
-        """Return other units, axes or a shift that bring the surfaces together.
+        """Return other units, axes or a translation that align the surfaces.
 
         Returns:
-            ``None`` where they meet already, or where none does.
+            ``None`` if they are aligned already, or if no guess aligns them.
         """
-        plain = max(self._here)
+        plain = max(self._distance)
         if plain <= _MEETS:
             return None
         scale = self._scale()
         centered = [(axes, self._about_center(scale * axes)) for axes in _axes()]
-        found = [max(self._distances(one)) for _, one in centered]
-        least = min(found)
+        distances = [max(self._distances(guess)) for _, guess in centered]
+        least = min(distances)
         if least > min(_FITS, plain / 3):
             return None
-        # Symmetric objects fit under several: the first is the plainest.
+        # Symmetric objects fit under several: use the first, which is the simplest.
         tie = least + _FITS / 3
-        axes, best = next(one for one, far in zip(centered, found, strict=True) if far <= tie)
+        axes, best = next(g for g, far in zip(centered, distances, strict=True) if far <= tie)
         about_origin = rigid(scale * axes, torch.zeros(3).double())
         if max(self._distances(about_origin)) <= tie:
             best = about_origin
-        return Guess(truth_from_world=best, told=_told(scale, axes, best[:3, 3]))
+        return Guess(truth_from_world=best, description=_described(scale, axes, best[:3, 3]))
 
     def _distances(self, truth_from_world: Float[Tensor, "4 4"]) -> tuple[float, float]:
-        """Return median distances to the truth and from it, over the truth's diagonal."""
+        """Return median distances to the truth and from it, as fractions of its diagonal."""
         ours, truth = self._ours, self._truth
         scale = float(torch.linalg.det(truth_from_world[:3, :3])) ** (1 / 3)
         ratio = scale * ours.size / truth.size
@@ -152,12 +152,12 @@ class Frames:
         return truth.distance(moved) / truth.size, scale * ours.distance(back) / truth.size
 
     def _scale(self) -> float:
-        """Return the ratio of sizes: of units that are near it; 1 where they are similar."""
+        """Return the ratio of sizes: that of common units if near; 1 if sizes are similar."""
         ratio = self._truth.size / self._ours.size
         if 0.5 < ratio < 2:
             return 1.0
-        known = (known for unit in _UNITS for known in (unit, 1 / unit))
-        return next((one for one in known if 0.9 < ratio / one < 1.1), ratio)
+        ratios = (value for unit in _UNITS for value in (unit, 1 / unit))
+        return next((value for value in ratios if 0.9 < ratio / value < 1.1), ratio)
 
     def _about_center(self, linear: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
         moved = transform(rigid(linear, torch.zeros(3).double()), self._ours.points)
@@ -166,24 +166,24 @@ class Frames:
 
 
 def _axes() -> Iterator[Float[Tensor, "3 3"]]:
-    """Yield the 24 rotations that carry axes to axes, the identity first."""
+    """Yield the 24 rotations between axes, the identity first."""
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         rotation = torch.tensor(signs).double()[:, None] * torch.eye(3).double()[[*order]]
         if torch.linalg.det(rotation) > 0:
             yield rotation
 
 
-def _told(scale: float, axes: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"]) -> str:
-    """List the parts of a guess: units, axes and a shift."""
+def _described(scale: float, axes: Float[Tensor, "3 3"], translation: Float[Tensor, " 3"]) -> str:
+    """Describe a guess: units, axes and a translation."""
     parts = []
     if scale != 1:
         factor = max(scale, 1 / scale)
         units = f" ({_UNITS[factor]}?)" if factor in _UNITS else ""
-        how = "larger" if scale > 1 else "smaller"
-        parts.append(f"the result is made {factor:.4g} times {how}{units}")
+        change = "enlarged" if scale > 1 else "reduced"
+        parts.append(f"the result is {change} by a factor of {factor:.4g}{units}")
     if not torch.equal(axes, torch.eye(3).double()):
         names = [f"{'-' if row.sum() < 0 else ''}{'xyz'[int(row.abs().argmax())]}" for row in axes]
         parts.append(f"x, y, z of the truth are {', '.join(names)} of the result")
     if bool(translation.any()):
-        parts.append(f"the result is moved by ({', '.join(f'{one:.4g}' for one in translation)})")
+        parts.append(f"the result is moved by ({', '.join(f'{t:.4g}' for t in translation)})")
     return " and ".join(parts)

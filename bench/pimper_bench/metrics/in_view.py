@@ -25,7 +25,7 @@ def relative_error(
 
     .. math:: 100 \lVert S - \hat S \rVert_F / \lVert S - \bar S \rVert_F
 
-    Translating both sets, or scaling them, changes nothing. Differentiable where the points
+    It is invariant to a common translation and scale. Differentiable where the points
     differ from the true ones.
 
     >>> square = torch.tensor([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]])
@@ -39,7 +39,7 @@ def relative_error(
 def angles_deg(
     normals: Float[Tensor, "*batch 3"], normals_true: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch"]:
-    """Return the angles between vectors, accurate also where they nearly agree."""
+    """Return the angles between vectors, also accurate for small angles."""
     sine = torch.linalg.cross(normals, normals_true).norm(dim=-1)
     cosine = (normals * normals_true).sum(dim=-1)
     return torch.rad2deg(torch.atan2(sine, cosine))
@@ -48,13 +48,13 @@ def angles_deg(
 def pitted_percent(
     angle_deg: Float[Tensor, "height width"], known: Bool[Tensor, "height width"]
 ) -> float:
-    """Return the fraction of known pixels whose normals are 5 degrees worse than those around.
+    """Return the percentage of pixels with normals 5 degrees worse than their surroundings.
 
-    Pits hardly move the mean or the median of all normals. Those around, 21 x 21 pixels, must be
-    less than 3 degrees off in the mean, so that rims that are wrong as a whole do not count.
+    Pits hardly change the mean or the median of all normals. The surroundings, 21 x 21 pixels, must
+    be less than 3 degrees off on average, so that inaccurate rims do not count.
 
     Args:
-        angle_deg: Error of the normal; ignored where it is not known.
+        angle_deg: Error of the normal; ignored where not ``known``.
 
     >>> angle = torch.zeros(50, 50)
     >>> angle[10, 10] = 20.0
@@ -62,8 +62,8 @@ def pitted_percent(
     0.04
     """
     weight = known.double()
-    both = torch.stack([torch.where(known, angle_deg, 0).double() * weight, weight])
-    total, count = avg_pool2d(both, 21, stride=1, padding=10)
+    sums = torch.stack([torch.where(known, angle_deg, 0).double() * weight, weight])
+    total, count = avg_pool2d(sums, 21, stride=1, padding=10)
     around = total / torch.where(known, count, 1)
     pit = (around < 3.0) & (angle_deg - around > 5.0)
     return 100 * float(pit[known].double().mean())
@@ -71,16 +71,16 @@ def pitted_percent(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlbedoFigures(Record):
-    """Errors of albedo, which photographs determine up to scale, after a scale was fitted.
+    """Errors of albedo, which photographs determine up to scale, after fitting a scale.
 
     Attributes:
         one_scale_percent: ``100 ||s a - t|| / ||t||`` over samples and channels, with the
-            scale ``s`` of least squares.
-        channel_scales_percent: The same with one such scale a channel, which forgives the
+            least-squares scale ``s``.
+        channel_scales_percent: The same with a scale per channel, which is invariant to the
             colour of the lights.
         one_scale_median_percent: Median of ``100 |s a - t| / t``, with ``s`` the median of
             ``t / a``: robust to outliers.
-        channels: Compared; 1 if either side is grey, whose other side is then averaged.
+        channels: Number compared; 1 if either side is grey, and the other is then averaged.
     """
 
     one_scale_percent: float
@@ -96,7 +96,7 @@ def compare_albedo(
     """Compare linear albedo sample by sample, up to scale.
 
     Returns:
-        ``None`` if no sample has both: finite, and above zero in the sum of its channels.
+        ``None`` if no sample has both: finite, and with a positive sum of channels.
     """
     ours, truth = albedo.cpu().double(), albedo_true.cpu().double()
     if ours.shape[1] != truth.shape[1]:
@@ -106,15 +106,15 @@ def compare_albedo(
     if not bool(known.any()):
         return None
     ours, truth = ours[known], truth[known]
-    one = (ours * truth).sum() / ours.square().sum()
-    each = (ours * truth).sum(dim=0) / ours.square().sum(dim=0).clamp_min(1e-300)
+    scale = (ours * truth).sum() / ours.square().sum()
+    channel_scales = (ours * truth).sum(dim=0) / ours.square().sum(dim=0).clamp_min(1e-300)
     positive = (ours > 0) & (truth > 0)
-    there, here = truth[positive], ours[positive]
-    robust = (there / here).median()
+    t, a = truth[positive], ours[positive]
+    robust = (t / a).median()
     return AlbedoFigures(
-        one_scale_percent=float(100 * (one * ours - truth).norm() / truth.norm()),
-        channel_scales_percent=float(100 * (each * ours - truth).norm() / truth.norm()),
-        one_scale_median_percent=float(100 * ((robust * here - there).abs() / there).median()),
+        one_scale_percent=float(100 * (scale * ours - truth).norm() / truth.norm()),
+        channel_scales_percent=float(100 * (channel_scales * ours - truth).norm() / truth.norm()),
+        one_scale_median_percent=float(100 * ((robust * a - t).abs() / t).median()),
         channels=ours.shape[1],
         samples=len(ours),
     )
@@ -126,9 +126,9 @@ class Meeting(Record):
 
     Attributes:
         valid: True where a ray meets the truth.
-        both: True where it meets the mesh too.
-        points: Of the mesh, from the camera's centre.
-        normals_true: Zero where unknown; ``None`` where none is known.
+        both: True where it meets both the truth and the mesh.
+        points: On the mesh, relative to the camera's centre.
+        normals_true: Zero where unknown; ``None`` if all are unknown.
     """
 
     valid: Bool[Tensor, "height width"]
@@ -142,11 +142,11 @@ class Meeting(Record):
 
     @property
     def coverage(self) -> float:
-        """Fraction of the rays that meet the truth which meet the mesh too."""
+        """Fraction of the rays meeting the truth that also meet the mesh."""
         return float(self.both.sum() / self.valid.sum())
 
     def only(self, where: Bool[Tensor, "height width"]) -> "Meeting":
-        """Count all other rays as misses of the mesh."""
+        """Restrict ``both``: other rays count as misses of the mesh."""
         kept = where[self.both]
         normals = self.normals_true
         return self.replace(
@@ -159,7 +159,7 @@ class Meeting(Record):
     def interpolate(
         self, per_vertex: Float[Tensor, "vertex channel"]
     ) -> Float[Tensor, "ray channel"]:
-        """Interpolate values of the mesh's vertices where both are met."""
+        """Interpolate vertex values of the mesh at the rays that meet both."""
         return self.hits.interpolate(per_vertex, self.faces)[self.both]
 
 
@@ -174,19 +174,19 @@ def meet_in_view(
 
     Args:
         mesh: Frame of the truth.
-        depth_true: Along that camera's z; infinite where there is nothing.
+        depth_true: Along that camera's z; infinite off the truth.
 
     Raises:
-        InputError: No pixel is left to compare, or no ray meets the mesh.
+        InputError: No pixel can be compared, or no ray meets the mesh.
     """
     valid = depth_true.isfinite() if where is None else depth_true.isfinite() & where
     hits = cast_view(mesh, cameras_true, view)
     both = valid & (hits.face >= 0)
     if not both.any():
         raise InputError(
-            f"view {view}: {int(valid.sum())} pixels have a true depth, and the mesh is met by "
-            f"{int((hits.face >= 0).sum())} rays, none of them at those pixels. Check the frame "
-            "of the mesh."
+            f"view {view}: {int(valid.sum())} pixels have a true depth, and "
+            f"{int((hits.face >= 0).sum())} rays meet the mesh, none at those pixels. Check the "
+            "frame of the mesh."
         )
     pixels = pixel_centers(both.shape[1], both.shape[0], like=cameras_true.intrinsics)[both]
     rays = rays_through(pixels, cameras_true.cam_from_world[view], cameras_true.intrinsics[view])
@@ -202,25 +202,25 @@ def meet_in_view(
 
 
 def without_surroundings(met: Meeting, truth: Truth) -> Meeting:
-    """Count rays that meet the surroundings behind the object as misses.
+    """Count rays that meet the mesh on the surroundings behind the object as misses.
 
-    Where a surface has a hole on the object and continues over the table, a ray through the
-    hole meets the table: no error of the object's shape, but a missing part. Such a point lies
-    behind the true one on its ray, and nearer to the true surroundings than to the true object.
+    If a surface has a hole in the object and continues over the table, a ray through the hole meets
+    the table. This is a missing part, not an error of the object's shape. Such a point is behind
+    the true one on its ray, and nearer to the true surroundings than to the true object.
     """
     if truth.mesh is None or truth.surroundings is None or not len(truth.surroundings.faces):
         return met
-    off = (met.points - met.points_true).norm(dim=1)
-    asked = (met.points.norm(dim=1) > met.points_true.norm(dim=1)).nonzero()[:, 0]
-    points = met.center_world.to(met.points) + met.points[asked]
+    distance = (met.points - met.points_true).norm(dim=1)
+    candidates = (met.points.norm(dim=1) > met.points_true.norm(dim=1)).nonzero()[:, 0]
+    points = met.center_world.to(met.points) + met.points[candidates]
     aside = NearestSurface(truth.surroundings).query(points).distance
-    # The object is no farther than its point on the ray, so that most need no query.
-    unsure = aside < off[asked]
-    asked, points, aside = asked[unsure], points[unsure], aside[unsure]
-    beside = torch.zeros(len(off), dtype=torch.bool, device=off.device)
-    beside[asked] = aside < NearestSurface(truth.mesh).query(points).distance
+    # The object is no farther than its point on the ray, so most candidates need no query.
+    undecided = aside < distance[candidates]
+    candidates, points, aside = candidates[undecided], points[undecided], aside[undecided]
+    on_surroundings = torch.zeros(len(distance), dtype=torch.bool, device=distance.device)
+    on_surroundings[candidates] = aside < NearestSurface(truth.mesh).query(points).distance
     kept = met.both.clone()
-    kept[met.both] = ~beside
+    kept[met.both] = ~on_surroundings
     return met.only(kept)
 
 
@@ -238,13 +238,12 @@ class ViewFigures(Record):
     """Errors of a mesh along the rays of one true camera.
 
     Attributes:
-        coverage: Fraction of the true pixels whose ray meets the mesh, and not where it shows
-            the surroundings; the other figures are over these.
-        transferred_normals: Of the normals at the mesh's vertices; ``None`` if it has none or
+        coverage: Fraction of the true pixels with a ray that meets the mesh, excluding its
+            surroundings; the other figures are over these pixels.
+        transferred_normals: Of the stored vertex normals; ``None`` without these, or if
             the true ones are unknown.
-        shape_normals: Of the normals of its shape: its faces', averaged at the vertices by
-            area and interpolated between them.
-        albedo: ``None`` where either side has none.
+        shape_normals: Of the normals of its shape: area-weighted vertex normals, interpolated.
+        albedo: ``None`` if either side has none.
     """
 
     name: str
@@ -257,7 +256,7 @@ class ViewFigures(Record):
 
 
 def compare_along_rays(mesh: Mesh, capture: Capture, view: int) -> ViewFigures | None:
-    """Compare a mesh in the frame of the truth with it, over the rays of :func:`meet_truth`."""
+    """Compare a mesh with the truth, in the frame of the truth, over :func:`meet_truth`'s rays."""
     met = meet_truth(mesh, capture, view)
     return None if met is None else figures_of(met, mesh, capture, view)
 
@@ -265,12 +264,12 @@ def compare_along_rays(mesh: Mesh, capture: Capture, view: int) -> ViewFigures |
 def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
     """Cast the rays of a true view on a mesh in the frame of the truth.
 
-    The truth's maps are used; where it has no depth map, its mesh is ray cast. The object alone is
-    compared where that is known: the truth's foreground, else the masks of the photographs. Rays
-    that pass the object and meet the mesh on the truth's surroundings are misses.
+    The truth's depth map is used, or rays are cast on its mesh. Only the object is compared if
+    it is known: the truth's foreground, else the masks of the photographs. Rays that pass the
+    object and meet the mesh on the truth's surroundings are misses.
 
     Returns:
-        ``None`` where the truth has neither depth maps nor a mesh, or no cameras.
+        ``None`` if the truth has neither depth maps nor a mesh, or no cameras.
     """
     cameras, maps = capture.cameras, _true_maps(capture, view)
     if cameras is None or maps is None or len(mesh.faces) == 0:
@@ -281,14 +280,14 @@ def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
     met = without_surroundings(met, capture.truth)
     if not met.both.any():
         raise InputError(
-            f"view {capture.views.names[view]}: where rays through the object meet the mesh, it "
-            "lies on the surroundings. Check that the mesh holds the object."
+            f"view {capture.views.names[view]}: all rays through the object meet the mesh on the "
+            "surroundings. Check that the mesh contains the object."
         )
     return met
 
 
 def figures_of(met: Meeting, mesh: Mesh, capture: Capture, view: int) -> ViewFigures:
-    """Compare a mesh with the truth over rays that meet both, all or some; at least one."""
+    """Compare a mesh with the truth over the rays of ``met`` that meet both, at least one."""
     albedo = None
     if mesh.albedo is not None and capture.truth.albedo is not None:
         albedo = compare_albedo(met.interpolate(mesh.albedo), capture.truth.albedo[view][met.both])
@@ -313,7 +312,7 @@ _Maps = tuple[
 
 
 def _true_maps(capture: Capture, view: int) -> _Maps | None:
-    """Return the truth's maps, or cast the rays of a view on its mesh."""
+    """Return the truth's maps, or render them from its mesh."""
     truth, cameras = capture.truth, capture.cameras
     if truth.depth is not None:
         masks = capture.views.masks if truth.foreground is None else truth.foreground
@@ -321,9 +320,9 @@ def _true_maps(capture: Capture, view: int) -> _Maps | None:
         return truth.depth[view], normals, None if masks is None else masks[view]
     if truth.mesh is None or len(truth.mesh.faces) == 0 or cameras is None:
         return None
-    whole = with_surroundings(truth.mesh, truth)
-    hits = cast_view(whole, cameras, view)
-    normals = hits.interpolate(vertex_normals(whole.vertices_world, whole.faces), whole.faces)
+    joined = with_surroundings(truth.mesh, truth)
+    hits = cast_view(joined, cameras, view)
+    normals = hits.interpolate(vertex_normals(joined.vertices_world, joined.faces), joined.faces)
     return hits.distance, normals, (hits.face >= 0) & (hits.face < len(truth.mesh.faces))
 
 
@@ -337,10 +336,10 @@ def _angles(met: Meeting, normals: Float[Tensor, "vertex 3"] | None) -> AngleFig
     angles = angles_deg(normalize(ours[known], dim=1), normalize(truth[known], dim=1))
     where = met.both.clone()
     where[met.both] = known
-    spread = torch.zeros(where.shape, dtype=angles.dtype, device=angles.device)
-    spread[where] = angles
+    error = torch.zeros(where.shape, dtype=angles.dtype, device=angles.device)
+    error[where] = angles
     return AngleFigures(
         mean_deg=float(angles.mean()),
         median_deg=float(angles.median()),
-        pitted_percent=pitted_percent(spread, where),
+        pitted_percent=pitted_percent(error, where),
     )

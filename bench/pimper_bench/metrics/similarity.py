@@ -1,4 +1,4 @@
-"""Similarities that put a result in the frame of the truth.
+"""Similarities from the frame of a result to that of the truth.
 
 They are 4x4 matrices ``truth_from_world`` whose upper left block is scale times rotation;
 :func:`pimper_torch.ground.geometry.rigid.transform` applies them.
@@ -23,7 +23,7 @@ from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.records import Cameras, Estimate, Mesh, Record
 from pimper_torch.runtime.errors import InputError, caution
 
-# Choices. Cameras agree up to the first two, and look the same way up to the last.
+# Choices. The first two are for centres and rotations in agreement, the last for optical axes.
 _MOST_RESIDUAL = 0.1  # root mean square of the centres' distances, over that from their mean
 _MOST_TURNED_DEG = 45.0
 _MOST_OFF_DEG = 15.0
@@ -32,11 +32,11 @@ _MOST_OFF_DEG = 15.0
 def pair_views(
     names: Sequence[str], names_true: Sequence[str]
 ) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
-    """Find views of the same name, for results that lack some of the photographs.
+    """Pair views of the same name, for results that lack some of the photographs.
 
-    Where a name is not among the true ones, the view whose name differs in folder and suffix
-    alone is the same: ``raw/07.tif`` and ``07.png``. A stem that two views of a set share
-    pairs nothing.
+    If a name is not among the true ones, it is paired with the view whose name differs only in
+    folder and suffix: ``raw/07.tif`` and ``07.png``. A stem that is not unique in a set is
+    not paired.
 
     Returns:
         Indices in ``names`` and in ``names_true``, in the order of the former; at least one.
@@ -52,15 +52,15 @@ def pair_views(
             pairs.append((index, by_stem_true[stem]))
     if not pairs:
         raise InputError(
-            f"no view is in both sets: found {', '.join(names[:3])}, ... and "
-            f"{', '.join(names_true[:3])}, ... Give the photographs the same names in both."
+            f"no view is in both sets: {', '.join(names[:3])}, ... and "
+            f"{', '.join(names_true[:3])}, ... Use the same names for the photographs in both."
         )
     ours, truth = torch.tensor(pairs).unbind(dim=1)
     return ours, truth
 
 
 def _stems(names: Sequence[str]) -> dict[str, int]:
-    """Return the index of every stem that one name alone has."""
+    """Return the index of every unique stem."""
     stems = [PurePath(name).stem for name in names]
     counts = Counter(stems)
     return {stem: index for index, stem in enumerate(stems) if counts[stem] == 1}
@@ -69,9 +69,9 @@ def _stems(names: Sequence[str]) -> dict[str, int]:
 def similarity_between_points(
     points: Float[Tensor, "point 3"], points_true: Float[Tensor, "point 3"]
 ) -> Float[Tensor, "4 4"]:
-    """Return the similarity that carries points nearest to true ones, in least squares.
+    """Return the least-squares similarity from points to true points.
 
-    Three points not on a line determine it; fewer leave a rotation free.
+    Three points not on a line determine it; fewer leave a rotation undetermined.
 
     Source: Umeyama, PAMI 13(4), 1991.
     """
@@ -80,15 +80,15 @@ def similarity_between_points(
 
 
 def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "4 4"]:
-    """Return the similarity that carries our cameras nearest to the true ones, in the same order.
+    """Return the similarity from our cameras to the true ones, which are in the same order.
 
-    Scale and translation are Umeyama's on the cameras' centres. Centres on a line leave a
-    rotation about it free, so the rotation is fitted to the centres and to the cameras' axes
-    together, each axis as long as the centres' root mean square distance from their mean.
+    Scale and translation are Umeyama's on the cameras' centres. Centres on a line leave a rotation
+    about it undetermined, so the rotation is fitted to the centres and the cameras' axes
+    together, each axis scaled to the centres' root mean square distance from their mean.
     """
     if ours.num_views != truth.num_views:
         raise InputError(
-            f"found {ours.num_views} cameras and {truth.num_views} true ones; needed: the same "
+            f"got {ours.num_views} cameras and {truth.num_views} true ones; needed: the same "
             "views in the same order. Pair them by name first."
         )
     source, target = ours.centers_world.double(), truth.centers_world.double()
@@ -100,11 +100,11 @@ def similarity_between_cameras(ours: Cameras, truth: Cameras) -> Float[Tensor, "
 
 
 def rolled_cameras(ours: Cameras, truth: Cameras) -> tuple[Float[Tensor, "4 4"], str] | None:
-    """Find cameras that are where the true ones are, but turned about their own axes.
+    """Detect cameras with true positions that are rotated about their optical axes or reversed.
 
     Returns:
-        The similarity on centres and optical axes alone, and a sentence on the difference; ``None``
-        where centres and rotations agree, or disagree in some other way.
+        The similarity on centres and optical axes only, and a sentence on the difference; ``None``
+        if centres and rotations agree, or disagree in a different way.
     """
     source, target = ours.centers_world.double(), truth.centers_world.double()
     axes = ours.cam_from_world[:, :3, :3].double()
@@ -113,7 +113,7 @@ def rolled_cameras(ours: Cameras, truth: Cameras) -> tuple[Float[Tensor, "4 4"],
     outer = _outer(target, source)
 
     def fitted(rows: slice, sign: float) -> tuple[Float[Tensor, "3 3"], float, Tensor]:
-        """Return a correlation, the centres' residual over their spread, and rotations left."""
+        """Return a correlation, the centres' residual over their spread, and residual rotations."""
         pulled = (axes_true[:, rows].mT @ axes[:, rows]).mean(dim=0)
         correlation = outer + sign * length * pulled
         rotation = nearest_rotation(correlation)
@@ -122,29 +122,29 @@ def rolled_cameras(ours: Cameras, truth: Cameras) -> tuple[Float[Tensor, "4 4"],
 
     if not float(length):
         return None
-    _, plain, turned = fitted(slice(0, 3), 1)
+    _, residual_all, turned = fitted(slice(0, 3), 1)
     turned_deg = float(rotation_angles_deg(turned).median())
-    if plain <= _MOST_RESIDUAL and turned_deg <= _MOST_TURNED_DEG:
+    if residual_all <= _MOST_RESIDUAL and turned_deg <= _MOST_TURNED_DEG:
         return None
     for sign in (1, -1):
         correlation, residual, turned = fitted(slice(2, 3), sign)
         off = torch.rad2deg(torch.arccos((sign * turned[:, 2, 2]).clamp(-1, 1))).median()
         rolls = torch.rad2deg(torch.atan2(turned[:, 1, 0], turned[:, 0, 0])).abs().median()
-        clear = residual <= max(_MOST_RESIDUAL, plain / 3) and float(off) <= _MOST_OFF_DEG
+        clear = residual <= max(_MOST_RESIDUAL, residual_all / 3) and float(off) <= _MOST_OFF_DEG
         if clear and (sign < 0 or float(rolls) > _MOST_TURNED_DEG):
-            told = (
+            difference = (
                 f"they are turned about their optical axes by {float(rolls):.0f} degrees "
-                "in the median. Has one photographs as EXIF turns them, and the other as stored?"
+                "in the median. Does one have photographs as EXIF turns them, the other as stored?"
                 if sign > 0
-                else "they look the opposite way. Has one the axes of OpenGL (y up, z backwards)?"
+                else "their axes are opposite. Does one have OpenGL's axes (y up, z backwards)?"
             )
-            found = _similarity(source, target, correlation).to(ours.cam_from_world)
-            return found, f"the cameras of result and truth agree in their places, but {told}"
+            fit = _similarity(source, target, correlation).to(ours.cam_from_world)
+            return fit, f"the positions of the cameras of result and truth agree, but {difference}"
     return None
 
 
 def nearest_rotation(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """Return the rotation ``R`` with the greatest ``trace(R^T matrix)``; never a reflection."""
+    """Return the rotation ``R`` that maximizes ``trace(R^T matrix)``; never a reflection."""
     U, _, Vh = torch.linalg.svd(matrix)
     mirror = torch.ones(3).to(U)
     mirror[2] = torch.linalg.det(U @ Vh).sign()
@@ -161,7 +161,7 @@ def split_similarity(
 
 
 def rotation_angles_deg(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """Return the angle of rotations, accurate for the smallest too."""
+    """Return the angles of rotations, also accurate for small angles."""
     skew = rotation - rotation.mT
     sine = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1).norm(dim=-1)
     cosine = rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1) - 1
@@ -173,18 +173,18 @@ def _similarity(
     target: Float[Tensor, "point 3"],
     correlation: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "4 4"]:
-    """Rotate by the correlation, then fit scale and translation to the points."""
+    """Return the similarity with the correlation's rotation; points give scale and translation."""
     if _spread(source) == 0 or _spread(target) == 0:
         raise InputError(
-            f"the {len(source)} points or camera centres to align by coincide, so that nothing "
-            "tells the scale; needed: two different positions at least."
+            f"all {len(source)} points or camera centres of the alignment coincide, so the scale "
+            "is undetermined; needed: at least two different positions."
         )
     rotation = nearest_rotation(correlation)
     scale = (rotation * _outer(target, source)).sum() / _spread(source)
     if scale <= 0:
         raise InputError(
-            f"the {len(source)} points or camera centres to align by have nothing in common with "
-            "the true ones: no similarity brings them nearer. Check that their names match."
+            f"the {len(source)} points or camera centres of the alignment do not correspond to the "
+            "true ones: no similarity brings them nearer. Check that their names match."
         )
     translation = target.mean(dim=0) - scale * rotation @ source.mean(dim=0)
     return rigid(scale * rotation, translation)
@@ -205,15 +205,15 @@ Method = Literal["auto", "none", "cameras", "icp"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alignment(Record):
-    """A similarity, and how it was found.
+    """A similarity, and its method.
 
     Attributes:
         truth_from_world: Upper left block is scale times rotation.
-        scale: Scene units of the truth in one of the estimate.
-        cameras: Pairs of cameras that were used.
-        trimmed_fraction: Fraction of the samples that ``icp`` left out; ``None`` otherwise.
-        residual: Root mean square distance of the samples ``icp`` kept, scene units.
-        converged: False where the limit of iterations stopped ``icp``; ``None`` otherwise.
+        scale: Scene units of the truth per unit of the estimate.
+        cameras: Number of camera pairs used.
+        trimmed_fraction: Fraction of the samples excluded by ``icp``; ``None`` otherwise.
+        residual: Root mean square distance of the samples kept by ``icp``, scene units.
+        converged: False if ``icp`` reached the maximum of iterations; ``None`` without ``icp``.
     """
 
     method: str
@@ -235,14 +235,14 @@ def align_estimate(
     *,
     generator: torch.Generator,
 ) -> Alignment:
-    """Find the similarity that carries an estimate to the truth.
+    """Return the similarity from an estimate to the truth.
 
     Args:
-        method: ``none`` takes the frames for one and the same. ``cameras`` fits the
+        method: ``none`` assumes that the frames are the same. ``cameras`` fits the
             estimate's cameras to the true ones of the same names. ``icp`` continues from
-            there, or from the identity, by a guess where the surfaces do not meet (see
+            there, or from the identity, or from a guess if the surfaces are apart (see
             :class:`.Frames`), and fits the surfaces, see :func:`trimmed_icp`.
-            ``auto`` is ``cameras`` where there are two pairs of cameras at least, else ``none``.
+            ``auto`` is ``cameras`` if there are at least two pairs of cameras, else ``none``.
         generator: On the CPU; draws the samples of ``icp``.
 
     Raises:
@@ -254,50 +254,50 @@ def align_estimate(
     if method == "cameras" and count < 2:
         raise InputError(
             f"to align by cameras, {count} views have a camera in both the result and the truth; "
-            "needed: two at least. Align by the surfaces (`icp`), or not at all (`none`)."
+            "needed: at least two. Align by the surfaces (`icp`), or not at all (`none`)."
         )
-    found, used = torch.eye(4).double(), 0
+    similarity, used = torch.eye(4).double(), 0
     if pairs is not None and count >= 2:
         rolled = rolled_cameras(*pairs)
         if rolled is not None and method in ("auto", "cameras"):
             raise InputError(
-                f"{rolled[1]} `--alignment icp` begins without their rolls; `none` takes the "
-                "frames for the same."
+                f"{rolled[1]} `--alignment icp` starts without their rolls; `none` assumes that "
+                "the frames are the same."
             )
         if rolled is not None:
-            caution(f"{rolled[1]} Their figures are left out.")
+            caution(f"{rolled[1]} Figures of the cameras are omitted.")
         if method != "none":
             fitted = similarity_between_cameras(*pairs) if rolled is None else rolled[0]
-            found, used = fitted.cpu().double(), count
-    known: dict[str, float | None] = {}
+            similarity, used = fitted.cpu().double(), count
+    icp_figures: dict[str, float | None] = {}
     description = f"similarity on {used} cameras" if used else "identity"
     if method == "icp":
         target = with_surroundings(true_surface(capture), capture.truth)
-        moved = transfer(estimate.mesh, found)
+        moved = transfer(estimate.mesh, similarity)
         guess = Frames(moved, true_surface(capture)).guess()
         if guess is not None:
-            found = guess.truth_from_world @ found
-            description += f", by a guess: {guess.told}"
+            similarity = guess.truth_from_world @ similarity
+            description += f", by a guess: {guess.description}"
         kind = "plane" if len(target.faces) else "point"
         description = (
             f"similarity ICP, point to {kind}, {100 * trimmed_fraction:g} % of the estimate "
             f"trimmed, from {description}"
         )
-        found, known["residual"], known["converged"] = trimmed_icp(
-            estimate.mesh, target, found, trimmed_fraction, generator=generator
+        similarity, icp_figures["residual"], icp_figures["converged"] = trimmed_icp(
+            estimate.mesh, target, similarity, trimmed_fraction, generator=generator
         )
-        known["trimmed_fraction"] = trimmed_fraction
+        icp_figures["trimmed_fraction"] = trimmed_fraction
     elif not used:
-        description = "none: the frames are taken for the same"
-    scale, rotation = split_similarity(found)
+        description = "none: the frames are assumed to be the same"
+    scale, rotation = split_similarity(similarity)
     return Alignment(
         method="icp" if method == "icp" else "cameras" if used else "none",
         description=description,
-        truth_from_world=found,
+        truth_from_world=similarity,
         scale=scale,
         rotation_deg=float(rotation_angles_deg(rotation)),
         cameras=used,
-        **known,  # type: ignore[arg-type]
+        **icp_figures,  # type: ignore[arg-type]
     )
 
 
@@ -312,21 +312,21 @@ def trimmed_icp(
     iterations: int = 60,
     tolerance: float = 1e-7,
 ) -> tuple[Float[Tensor, "4 4"], float, bool]:
-    """Find the similarity that lays an estimate on the truth, beginning near it.
+    """Return the similarity from an estimate to the truth by ICP, starting near it.
 
     Each step pairs every sample of the estimate with the nearest point of the true surface,
     drops the fraction of pairs that are farthest apart, and moves the estimate by the
-    similarity that is best for the rest. It finds the nearest minimum only: an estimate that
-    starts far off may shrink into a corner of the truth, so look at the scale that is reported.
+    similarity that is best for the rest. It finds only the nearest minimum: an estimate that
+    starts far off may shrink into a corner of the truth, so check the reported scale.
 
     Args:
-        truth: Surface or point cloud; with its surroundings, if the estimate may have them.
-        trimmed_fraction: Must cover outliers and what the truth lacks.
+        truth: Surface or point cloud; with its surroundings, if the estimate may include them.
+        trimmed_fraction: Must include outliers and parts that the truth lacks.
         tolerance: Stop when a step moves the samples by less than this fraction of their spread.
 
     Returns:
-        The similarity, the root mean square distance of the samples kept, and False where the
-        limit of iterations stopped it.
+        The similarity, the root mean square distance of the kept samples, and False if the
+        maximum of iterations was reached.
 
     Source: Chetverikov, Stepanov & Krsek, IVC 23(3), 2005, for trimming; Chen & Medioni,
     IVC 10(3), 1992, for the distance to the plane. Scale as a seventh unknown of the
@@ -336,11 +336,11 @@ def trimmed_icp(
     normals = face_normals(truth.vertices_world.cpu().double(), truth.faces.cpu())
     samples = sample_surface(mesh, count, generator).points
     kept = max(3, round((1 - trimmed_fraction) * len(samples)))
-    found = start.cpu().double()
-    spread = _deviation(transform(found, samples))
-    converged, taken = False, 0
-    while taken < iterations and not converged:
-        moved = transform(found, samples)
+    similarity = start.cpu().double()
+    spread = _deviation(transform(similarity, samples))
+    converged, steps = False, 0
+    while steps < iterations and not converged:
+        moved = transform(similarity, samples)
         nearest = target.query(moved)
         chosen = nearest.distance.topk(kept, largest=False).indices
         source, aim = moved[chosen], nearest.points[chosen]
@@ -348,12 +348,12 @@ def trimmed_icp(
             step = _step_to_planes(source, aim, normals[nearest.face[chosen]])
         else:
             step = similarity_between_points(source, aim)
-        found = step @ found
-        taken += 1
+        similarity = step @ similarity
+        steps += 1
         length = (transform(step, moved) - moved).square().sum(dim=1).mean().sqrt()
         converged = float(length) < tolerance * spread
-    near = target.query(transform(found, samples)).distance.topk(kept, largest=False).values
-    return found, float(near.square().mean().sqrt()), converged
+    near = target.query(transform(similarity, samples)).distance.topk(kept, largest=False).values
+    return similarity, float(near.square().mean().sqrt()), converged
 
 
 def _step_to_planes(
@@ -361,10 +361,10 @@ def _step_to_planes(
     target: Float[Tensor, "pair 3"],
     normals: Float[Tensor, "pair 3"],
 ) -> Float[Tensor, "4 4"]:
-    """Solve for the small rotation, translation and change of scale about the mean.
+    """Return the small rotation, translation and change of scale about the mean.
 
     The residual ``n . (p - q)`` changes by ``n . (w x p + t + s p)``, linear in w, t and s.
-    Those of the seven unknowns that the planes leave open stay zero.
+    Unknowns of the seven that the planes leave undetermined stay zero.
     """
     centre = source.mean(dim=0)
     size = _deviation(source)
@@ -374,7 +374,7 @@ def _step_to_planes(
     rotation = torch.linalg.cross(local, unit)
     grow = (local * unit).sum(dim=1, keepdim=True)
     rows = torch.cat([rotation, unit, grow], dim=1)
-    # Turning a ball or sliding a plane is no direction.
+    # Rotating a ball or sliding a plane changes nothing: such directions are cut off.
     solution = torch.linalg.pinv(rows.mT @ rows, rtol=1e-6, hermitian=True) @ (rows.mT @ gap)
     w, t, s = solution[:3], solution[3:6], solution[6]
     zero = torch.zeros_like(s)
@@ -388,7 +388,7 @@ def _deviation(points: Float[Tensor, "point 3"]) -> float:
 
 
 def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Cameras] | None:
-    """Return the cameras of the views that both have; ``None`` if there are none."""
+    """Return the cameras of the common views; ``None`` without any."""
     if estimate.cameras is None or capture.cameras is None:
         return None
     try:
@@ -399,7 +399,7 @@ def paired_cameras(estimate: Estimate, capture: Capture) -> tuple[Cameras, Camer
 
 
 def transfer(mesh: Mesh, truth_from_world: Float[Tensor, "4 4"]) -> Mesh:
-    """Put a mesh in the frame of the truth by a similarity, in float64 on the CPU."""
+    """Transform a mesh to the frame of the truth by a similarity, in float64 on the CPU."""
     mesh = mesh.to("cpu")
     scale, rotation = split_similarity(truth_from_world)
     normals, error = mesh.normals_world, mesh.expected_error

@@ -22,11 +22,12 @@ from pimper_torch.runtime.errors import InputError
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SurfaceSamples(Record):
-    """Points on a surface, each of the same area.
+    """Points on a surface, each representing the same area.
 
     Attributes:
-        normals: Of their faces, unit; ``None`` for a point cloud.
-        corners: Vertices of their faces; the one of a point cloud.
+        normals: Unit face normals; ``None`` for a point cloud.
+        corners: Vertices of the points' faces; the vertex itself for a point cloud.
+        fractions: Barycentric coordinates.
     """
 
     points: Float[Tensor, "sample 3"]
@@ -35,16 +36,16 @@ class SurfaceSamples(Record):
     fractions: Float[Tensor, "sample corner"]
 
     def interpolate(self, per_vertex: Float[Tensor, " vertex"]) -> Float[Tensor, " sample"]:
-        """Blend what is known at the vertices of the surface."""
+        """Interpolate vertex values of the surface."""
         values = per_vertex.detach().to(self.fractions)[self.corners]
         return (self.fractions * values).sum(dim=1)
 
 
 def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> SurfaceSamples:
-    """Draw points uniformly by area; of a point cloud, ``count`` points without repetition.
+    """Sample points uniformly by area; of a point cloud, ``count`` points without repetition.
 
-    Stratified: the faces' areas laid end to end are cut in ``count`` equal pieces, with one point
-    in each.
+    Stratified: the concatenated areas of the faces are cut in ``count`` equal pieces, with one
+    point in each.
     """
     vertices = mesh.vertices_world.detach().cpu().double()
     faces = mesh.faces.cpu()
@@ -65,8 +66,8 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
         raise InputError(
             f"all {len(faces)} faces of the surface are degenerate; needed: triangles with area."
         )
-    face = _drawn(ends, count, generator)
-    # Folding the unit square along its diagonal keeps the density of the triangle even.
+    face = _sampled_faces(ends, count, generator)
+    # Reflecting at the unit square's diagonal keeps the density uniform on the triangle.
     u, v = torch.rand(2, count, generator=generator, dtype=torch.float64)
     fold = u + v > 1
     u, v = torch.where(fold, 1 - u, u), torch.where(fold, 1 - v, v)
@@ -80,7 +81,7 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
     )
 
 
-def _drawn(
+def _sampled_faces(
     ends: Float[Tensor, " face"], count: int, generator: torch.Generator
 ) -> Int[Tensor, " sample"]:
     jitter = torch.rand(count, generator=generator, dtype=torch.float64)
@@ -91,10 +92,10 @@ def _drawn(
 def count_seeing(
     samples: SurfaceSamples, capture: Capture, diagonal: float
 ) -> Int[Tensor, " sample"] | None:
-    """Count the positions of the camera that each true point is seen from.
+    """Count the camera positions that see each true point.
 
-    By ray casting the true mesh with its surroundings, and the face's front towards the camera.
-    Views taken from one position (``capture.position``) count once.
+    By ray casting on the true mesh with its surroundings; the face must face the camera. Views from
+    one position (``capture.position``) count once.
 
     Args:
         diagonal: Of the object's bounding box, scene units.
@@ -105,16 +106,16 @@ def count_seeing(
     mesh, cameras = capture.truth.mesh, capture.cameras
     if cameras is None or mesh is None or not len(mesh.faces):
         return None
-    whole = with_surroundings(mesh, capture.truth)
-    caster = RayCaster(whole.vertices_world, whole.faces)
+    joined = with_surroundings(mesh, capture.truth)
+    caster = RayCaster(joined.vertices_world, joined.faces)
     count = torch.zeros(len(samples.points), dtype=torch.long)
     for position in torch.unique(capture.position):
         view = int((capture.position == position).nonzero()[0])
-        count += _seen(samples, cameras, view, caster, diagonal)
+        count += _visible(samples, cameras, view, caster, diagonal)
     return count
 
 
-def _seen(
+def _visible(
     samples: SurfaceSamples, cameras: Cameras, view: int, caster: RayCaster, diagonal: float
 ) -> Bool[Tensor, " sample"]:
     assert samples.normals is not None  # of a mesh
@@ -123,12 +124,12 @@ def _seen(
         points, cameras.cam_from_world[view].to(points), cameras.intrinsics[view].to(points)
     )
     size = cameras.sizes_px[view].to(points)
-    seen = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
-    seen &= ((center - points) * samples.normals).sum(dim=1) > 0
-    asked = seen.nonzero()[:, 0]
-    # The ray caster's float32 needs a millionth of the diagonal.
-    seen[asked[caster.occluded(points[asked], center, 1e-3 * diagonal)]] = False
-    return seen
+    visible = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    visible &= ((center - points) * samples.normals).sum(dim=1) > 0
+    candidates = visible.nonzero()[:, 0]
+    # The ray caster's single precision needs a margin of more than a millionth of the diagonal.
+    visible[candidates[caster.occluded(points[candidates], center, 1e-3 * diagonal)]] = False
+    return visible
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,8 +138,8 @@ class CalibrationBin(Record):
 
     Attributes:
         expected: Root mean square of the expected errors.
-        robust: Median of the true errors over 0.6745, the standard deviation that Gaussian
-            noise of this median has: blind to outliers.
+        robust: Median of the true errors over 0.6745, the standard deviation of Gaussian
+            noise with this median: insensitive to outliers.
     """
 
     expected: float
@@ -152,11 +153,11 @@ class Calibration(Record):
 
     Attributes:
         ratio: Median of true over expected error, over 0.6745: 1 for Gaussian noise of the
-            expected standard deviation, more where expected errors are too small.
+            expected standard deviation, above 1 if expected errors are too small.
         within_one: Fraction with a true error up to the expected one; 68 % for Gaussian noise.
-        within_two: Fraction with one up to twice the expected one; 95 %.
-        rank_correlation: Spearman's; NaN if all expected errors are the same.
-        bins: Of equal fractions of the surface, by rising expected error.
+        within_two: Fraction with a true error up to twice the expected one; 95 %.
+        rank_correlation: Spearman's; NaN if all expected errors are equal.
+        bins: Equal fractions of the surface, by increasing expected error.
     """
 
     ratio: float
@@ -175,8 +176,8 @@ def calibrate(
     Returns:
         ``None`` if fewer than ten samples have a finite expected error above 0.
     """
-    known = expected.isfinite() & (expected > 0)
-    expected, true = expected[known].double().cpu(), true[known].double().cpu()
+    valid = expected.isfinite() & (expected > 0)
+    expected, true = expected[valid].double().cpu(), true[valid].double().cpu()
     if len(expected) < 10:
         return None
     fraction = true / expected
@@ -190,11 +191,11 @@ def calibrate(
         rank_correlation=float(correlation),
         bins=tuple(
             CalibrationBin(
-                expected=float(expected[one].square().mean().sqrt()),
-                root_mean_square=float(true[one].square().mean().sqrt()),
-                robust=float(true[one].median()) / 0.6745,
+                expected=float(expected[tenth].square().mean().sqrt()),
+                root_mean_square=float(true[tenth].square().mean().sqrt()),
+                robust=float(true[tenth].median()) / 0.6745,
             )
-            for one in torch.tensor_split(order, 10)
+            for tenth in torch.tensor_split(order, 10)
         ),
         samples=len(expected),
     )
@@ -202,7 +203,7 @@ def calibrate(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistanceFigures(Record):
-    """Distances of samples of one surface to the other, scene units.
+    """Distances from samples of one surface to the other, scene units.
 
     Attributes:
         mean_percent: Of the diagonal of the true object's bounding box.
@@ -217,10 +218,10 @@ class DistanceFigures(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThresholdFigures(Record):
-    """Fractions of each surface nearer to the other than a threshold.
+    """Fractions of each surface within a threshold of the other.
 
     Attributes:
-        f_score: Their harmonic mean; 0 if both are 0.
+        f_score: Harmonic mean of precision and recall; 0 if both are 0.
     """
 
     threshold: float
@@ -232,12 +233,12 @@ class ThresholdFigures(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TwoSided(Record):
-    """Figures of both directions, for the whole truth or for a part of it.
+    """Figures of both directions, over the complete truth or a part of it.
 
     Attributes:
         completeness: From the truth to the estimate.
         chamfer_mean: Mean of mean accuracy and mean completeness, scene units.
-        chamfer_sum: Their sum, which other papers call Chamfer distance.
+        chamfer_sum: Their sum, which some papers call Chamfer distance.
     """
 
     completeness: DistanceFigures
@@ -250,15 +251,15 @@ class TwoSided(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurfaceComparison(Record):
-    """Distances of a surface and the true one.
+    """Distances between a surface and the true one.
 
     Attributes:
         diagonal: Of the true object's bounding box along the axes of the truth, scene units.
         accuracy: From the estimate to the truth; ``None`` if all of it belongs to the
             surroundings.
-        surroundings_fraction: Fraction of the estimate that lies nearer to the truth's
-            surroundings than to the object, and is left out of the accuracy.
-        seen: Over the truth seen from at least ``seen_from`` positions of the camera.
+        surroundings_fraction: Fraction of the estimate that is nearer to the truth's
+            surroundings than to the object, and is excluded from the accuracy.
+        seen: Over the part of the truth visible from at least ``seen_from`` camera positions.
         calibration: Of the estimate's expected error, over the samples of the accuracy.
     """
 
@@ -273,14 +274,14 @@ class SurfaceComparison(Record):
 
 
 class TrueSurface:
-    """The true surface prepared for the comparison with any number of estimates.
+    """The true surface, prepared for comparison with any number of estimates.
 
-    Samples are drawn evenly over each surface, and each is compared with the nearest point
-    of the other surface itself, not with its samples or vertices.
+    Samples are uniform over each surface, and each is compared with the nearest point
+    of the other surface, not with its samples or vertices.
 
     Args:
         capture: With the true mesh or points, and its cameras.
-        seen_from: Positions of the camera that must see a true point; see :func:`count_seeing`.
+        seen_from: Camera positions that must see a true point, at least; see :func:`count_seeing`.
     """
 
     def __init__(
@@ -289,9 +290,9 @@ class TrueSurface:
         truth, surroundings = true_surface(capture), capture.truth.surroundings
         self.diagonal = bounding_diagonal(truth)
         self._generator = torch.Generator().manual_seed(seed)
-        drawn = sample_surface(truth, samples, self._generator)
-        count = count_seeing(drawn, capture, self.diagonal)
-        self._points, self._samples = drawn.points, samples
+        samples_true = sample_surface(truth, samples, self._generator)
+        count = count_seeing(samples_true, capture, self.diagonal)
+        self._points, self._samples = samples_true.points, samples
         self._state = self._generator.get_state()
         self._seen, self._seen_from = None if count is None else count >= seen_from, seen_from
         self._object = NearestSurface(truth)
@@ -307,17 +308,17 @@ class TrueSurface:
         Args:
             thresholds_percent: Of the diagonal, for precision, recall and F-score.
         """
-        self._generator.set_state(self._state)  # the order of the estimates changes nothing
+        self._generator.set_state(self._state)  # independent of the order of estimates
         drawn = sample_surface(mesh, self._samples, self._generator)
         ours = drawn.points
         to_truth = self._object.query(ours).distance
-        aside = torch.zeros(len(ours), dtype=torch.bool)
+        off_object = torch.zeros(len(ours), dtype=torch.bool)
         if self._surroundings is not None:
-            aside = self._surroundings.query(ours).distance < to_truth
-        to_truth = to_truth[~aside]
+            off_object = self._surroundings.query(ours).distance < to_truth
+        to_truth = to_truth[~off_object]
         calibration = None
         if mesh.expected_error is not None:
-            calibration = calibrate(drawn.interpolate(mesh.expected_error)[~aside], to_truth)
+            calibration = calibrate(drawn.interpolate(mesh.expected_error)[~off_object], to_truth)
         to_estimate = NearestSurface(mesh).query(self._points).distance
 
         def two_sided(distances: Float[Tensor, " sample"]) -> TwoSided | None:
@@ -329,7 +330,7 @@ class TrueSurface:
         return SurfaceComparison(
             diagonal=self.diagonal,
             accuracy=_figures(to_truth, self.diagonal) if len(to_truth) else None,
-            surroundings_fraction=float(aside.double().mean()),
+            surroundings_fraction=float(off_object.double().mean()),
             whole=two_sided(to_estimate),
             seen=None if seen is None else two_sided(to_estimate[seen]),
             seen_from=self._seen_from,
@@ -339,7 +340,7 @@ class TrueSurface:
 
 
 def with_surroundings(surface: Mesh, truth: Truth) -> Mesh:
-    """Put the true surroundings, if they are known, behind the faces of a surface."""
+    """Append the true surroundings, if known, to the faces of a surface."""
     return join(surface, *([] if truth.surroundings is None else [truth.surroundings]))
 
 
@@ -354,7 +355,7 @@ def true_surface(capture: Capture) -> Mesh:
 
 
 def bounding_diagonal(mesh: Mesh) -> float:
-    """Return the diagonal of the box, along the axes of the world, round the faces of a mesh."""
+    """Return the diagonal of the axis-aligned bounding box of a mesh's faces, or of a cloud."""
     vertices = mesh.vertices_world.double()
     used = vertices[torch.unique(mesh.faces)] if len(mesh.faces) else vertices
     return float((used.amax(dim=0) - used.amin(dim=0)).norm())
@@ -390,13 +391,13 @@ def _at_threshold(
     threshold = percent / 100 * diagonal
     precision = float((to_truth < threshold).double().mean())
     recall = float((to_estimate < threshold).double().mean())
-    both = precision + recall
+    total = precision + recall
     return ThresholdFigures(
         threshold=threshold,
         threshold_percent=percent,
         precision=precision,
         recall=recall,
-        f_score=2 * precision * recall / both if both > 0 else 0.0,
+        f_score=2 * precision * recall / total if total > 0 else 0.0,
     )
 
 

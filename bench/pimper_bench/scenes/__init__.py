@@ -1,6 +1,6 @@
-"""Scenes with known truth.
+"""Rendered scenes with ground truth.
 
-:func:`render_scene` photographs one into a folder, frame by frame; :func:`build_scene` and
+:func:`render_scene` renders one into a folder, frame by frame; :func:`build_scene` and
 :func:`render_frame` are its parts. :func:`render_objects` and :func:`render_shape` keep a small
 scene in memory.
 """

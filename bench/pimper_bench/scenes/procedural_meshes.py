@@ -1,4 +1,4 @@
-"""Procedural triangle meshes for ray-traced scenes; the world's z points up."""
+"""Procedural triangle meshes for ray-traced scenes; the world's z axis is up."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -24,11 +24,11 @@ def icosphere(subdivisions: int) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor,
 
 
 def potato(generator: torch.Generator, *, subdivisions: int = 6, bumps: float = 0.006) -> Mesh:
-    """Grow a closed, bumpy solid about 2.4 long that rests on ``z = 0``.
+    """Return a closed, bumpy solid about 2.4 long that rests on ``z = 0``.
 
     Args:
-        subdivisions: Of the sphere it starts from; 6 gives 81920 faces.
-        bumps: Root mean square of the fine height field, scene units; 0 leaves it smooth.
+        subdivisions: Of the initial sphere; 6 gives 81920 faces.
+        bumps: Root mean square of the fine relief, scene units; 0 for a smooth surface.
     """
     sphere, faces = icosphere(subdivisions)
     body = sphere * sphere.new_tensor([1.2, 0.95, 0.85])
@@ -41,10 +41,10 @@ def potato(generator: torch.Generator, *, subdivisions: int = 6, bumps: float = 
 
 
 def table(half_side: float = 4.0, cells: int = 1) -> Mesh:
-    """Lay a square in the plane ``z = 0``, facing up.
+    """Return a square in the plane ``z = 0``, facing up.
 
     Args:
-        cells: Along each side; light between objects is known at their corners.
+        cells: Along each side; vertex albedo is stored at their corners.
     """
     side = torch.linspace(-half_side, half_side, cells + 1, dtype=torch.float64)
     y, x = torch.meshgrid(side, side, indexing="ij")
@@ -53,11 +53,10 @@ def table(half_side: float = 4.0, cells: int = 1) -> Mesh:
 
 
 def lathe(profile: Float[Tensor, "level 2"], around: int = 192) -> Mesh:
-    """Turn a profile about the z axis to a closed solid.
+    """Rotate a profile about the z axis to a closed solid.
 
     Args:
-        profile: Radius and height of each level, upwards; the first and the last radius are
-            0, no other is.
+        profile: Radius and height of each level, upwards; only the first and the last radius are 0.
     """
     rotation = 2 * torch.pi * torch.arange(around, dtype=profile.dtype) / around
     radius, height = profile[1:-1].unbind(dim=-1)
@@ -71,13 +70,13 @@ def lathe(profile: Float[Tensor, "level 2"], around: int = 192) -> Mesh:
     ).reshape(-1, 3)
     poles = torch.stack([profile.new_tensor([0, 0, profile[end, 1]]) for end in (0, -1)])
     wall = _grid_faces(len(radius), around + 1)
-    wall = wall // (around + 1) * around + wall % (around + 1) % around  # the seam closes
+    wall = wall // (around + 1) * around + wall % (around + 1) % around  # closes the seam
     ring = torch.arange(around)
-    after = (ring + 1) % around
+    following = (ring + 1) % around
     bottom, top = len(rings), len(rings) + 1
     last = len(rings) - around
-    below = torch.stack([torch.full_like(ring, bottom), after, ring], dim=1)
-    above = torch.stack([torch.full_like(ring, top), last + ring, last + after], dim=1)
+    below = torch.stack([torch.full_like(ring, bottom), following, ring], dim=1)
+    above = torch.stack([torch.full_like(ring, top), last + ring, last + following], dim=1)
     return _mesh(torch.cat([rings, poles]), torch.cat([wall, below, above]))
 
 
@@ -88,7 +87,7 @@ def moved(
     rotation_deg: float = 0.0,
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Mesh:
-    """Scale a mesh, turn it about the z axis, then shift it."""
+    """Scale a mesh, rotate it about the z axis, then translate it."""
     cosine, sine = math.cos(math.radians(rotation_deg)), math.sin(math.radians(rotation_deg))
     vertices = mesh.vertices_world
     rotation = vertices.new_tensor([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -100,35 +99,35 @@ def moved(
 
 
 def push_clear(mesh: Mesh, others: Sequence[Mesh], position: tuple[float, float]) -> Mesh:
-    """Shift a closed solid to a position on the table, and outward from there until it is free."""
-    own, rest = _Solid(mesh), [_Solid(one) for one in others]
+    """Move a closed solid to a position on the table, and outward from there until it is free."""
+    solid, rest = _Solid(mesh), [_Solid(other) for other in others]
     x, y = position
-    shift = own.points.new_tensor([x, y, 0.0])
-    onward = 0.02 * shift / shift.norm()
-    while any(one.holds(own.points + shift) or own.holds(one.points - shift) for one in rest):
-        shift = shift + onward
+    shift = solid.points.new_tensor([x, y, 0.0])
+    step = 0.02 * shift / shift.norm()
+    while any(o.contains(solid.points + shift) or solid.contains(o.points - shift) for o in rest):
+        shift = shift + step
     return moved(mesh, shift=(float(shift[0]), float(shift[1]), 0.0))
 
 
 class _Solid:
-    """A closed mesh that can tell what is inside it."""
+    """A closed mesh with a test for points inside."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.points = mesh.vertices_world.float()
         self._caster = RayCaster(mesh.vertices_world, mesh.faces)
         self._upward = face_normals(mesh.vertices_world, mesh.faces)[:, 2] > 0
 
-    def holds(self, points: Float[Tensor, "point 3"]) -> bool:
+    def contains(self, points: Float[Tensor, "point 3"]) -> bool:
         """Return whether any of the points is inside."""
         low, high = self.points.amin(dim=0), self.points.amax(dim=0)
         near = points[((points > low) & (points < high)).all(dim=1)]
         face = self._caster.cast(near, near.new_tensor([0.0, 0.0, 1.0]).expand_as(near)).face
-        # A ray from inside leaves by a face that looks the same way.
+        # A ray from inside leaves through a face that faces its direction.
         return bool(((face >= 0) & self._upward[face]).any())
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """Put meshes in one, their faces in the order given; only vertices and faces are kept."""
+    """Concatenate meshes, faces in the given order; only vertices and faces are kept."""
     offsets, count = [], 0
     for mesh in meshes:
         offsets.append(mesh.faces + count)
@@ -139,7 +138,7 @@ def join(*meshes: Mesh) -> Mesh:
 
 
 def _grid_faces(rows: int, columns: int) -> Int[Tensor, "face 3"]:
-    """Split the cells of a grid of vertices; with x along columns they face +z."""
+    """Triangulate the cells of a grid of vertices; with x along columns they face +z."""
     first = (torch.arange(rows - 1)[:, None] * columns + torch.arange(columns - 1)).reshape(-1)
     lower = torch.stack([first, first + 1, first + columns + 1], dim=1)
     upper = torch.stack([first, first + columns + 1, first + columns], dim=1)
@@ -159,11 +158,11 @@ def mesh_level_set(
     highest: tuple[float, float, float],
     cell: float,
 ) -> Mesh:
-    """Triangulate the zero level of a function by marching cubes, moved on to it exactly; float64.
+    """Triangulate the zero level set of a function by marching cubes and Newton steps; float64.
 
     Args:
         level: Negative inside, differentiable, with a gradient of about 1.
-        lowest: Corner of a box that holds the solid with room to spare.
+        lowest: Corner of a box that contains the solid with a margin.
         cell: Side of the cubes, scene units.
     """
     start = torch.tensor(lowest, dtype=torch.float64)
@@ -174,14 +173,14 @@ def mesh_level_set(
     ]
     grid = torch.cartesian_prod(*axes)
     with torch.no_grad():
-        values = torch.cat([level(part) for part in torch.split(grid, 1 << 20)]).reshape(
+        values = torch.cat([level(block) for block in torch.split(grid, 1 << 20)]).reshape(
             counts.tolist()
         )
-    found, faces, _, _ = marching_cubes(
+    corners, faces, _, _ = marching_cubes(
         values.numpy(), level=0.0, spacing=(cell, cell, cell), gradient_direction="descent"
     )
-    vertices = start + torch.from_numpy(found.astype("float64"))
-    # From within a cell of the surface; each step doubles the digits.
+    vertices = start + torch.from_numpy(corners.astype("float64"))
+    # They are within a cell of the surface; each step doubles the digits.
     for _ in range(4):
         value, gradient = _with_gradient(level, vertices)
         step = value / (gradient * gradient).sum(dim=-1)
@@ -196,7 +195,7 @@ def mesh_level_set(
 def smooth_union(
     first: Float[Tensor, " point"], second: Float[Tensor, " point"], width: float
 ) -> Float[Tensor, " point"]:
-    """Join two solids with a fillet of about this width where they meet.
+    """Return the union of two solids with a fillet of about this width.
 
     The polynomial minimum: once differentiable, and exact where they differ by more.
     """
@@ -207,15 +206,15 @@ def smooth_union(
 def smooth_difference(
     solid: Float[Tensor, " point"], cut: Float[Tensor, " point"], width: float
 ) -> Float[Tensor, " point"]:
-    """Cut one solid out of another, rounding the edges."""
+    """Return the difference of two solids with rounded edges."""
     return -smooth_union(-solid, cut, width)
 
 
 def rounded_cylinder(
     points: Float[Tensor, "point 3"], *, radius: float, low: float, high: float, rounding: float
 ) -> Float[Tensor, " point"]:
-    """Return the signed distance to an upright cylinder about the z axis with round edges."""
-    # Kept off the axis, where the root has no gradient.
+    """Return the signed distance to an upright cylinder about the z axis with rounded edges."""
+    # The root has no gradient on the axis.
     across = (points[:, 0] ** 2 + points[:, 1] ** 2 + 1e-12).sqrt() - (radius - rounding)
     along = (points[:, 2] - (low + high) / 2).abs() - ((high - low) / 2 - rounding)
     outside = (across.clamp_min(0) ** 2 + along.clamp_min(0) ** 2 + 1e-18).sqrt()
@@ -226,7 +225,7 @@ def _with_gradient(
     level: Level, points: Float[Tensor, "point 3"]
 ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
     with torch.enable_grad():
-        at = points.detach().requires_grad_()
-        values = level(at)
-        (gradient,) = torch.autograd.grad(values.sum(), at)
+        leaf = points.detach().requires_grad_()
+        values = level(leaf)
+        (gradient,) = torch.autograd.grad(values.sum(), leaf)
     return values.detach(), gradient

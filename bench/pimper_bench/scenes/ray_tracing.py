@@ -1,4 +1,4 @@
-"""Ray tracing of one photograph of a scene, with the truth about every pixel."""
+"""Ray tracing of one photograph of a scene, with ground truth for every pixel."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from pimper_torch.records import Cameras, Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Spots(Record):
-    """First hits of rays; depth is infinite, normal and albedo zero, index -1 for a miss."""
+    """First hits of rays. For a miss, depth is infinite, normal and albedo zero, the index -1."""
 
     hits: Hits
     points: Float[Tensor, "ray 3"]
@@ -31,11 +31,12 @@ class Spots(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Shaded(Record):
-    """Radiance of spots towards the eye.
+    """Radiance of hit points towards the eye.
 
     Attributes:
+        matte: Radiance of the diffuse part.
         mirrored: Radiance of the highlight.
-        lit: True where the point light reaches.
+        lit: True where the point light is visible.
     """
 
     matte: Float[Tensor, "ray channel"]
@@ -47,31 +48,31 @@ class TracedObjects:
     """Objects in one ray caster; float32.
 
     Args:
-        objects: Their faces, in this order, are those of ``mesh``.
+        objects: Their faces, in this order, are the faces of ``mesh``.
     """
 
     def __init__(self, objects: Sequence[SceneObject]) -> None:
         self.objects = tuple(objects)
-        self.mesh = join(*(one.mesh for one in objects))
+        self.mesh = join(*(item.mesh for item in objects))
         vertices = self.mesh.vertices_world
         self._caster = RayCaster(vertices, self.mesh.faces)
-        self._normals = torch.cat([normals_at_vertices(one) for one in objects])
-        counts = torch.tensor([len(one.mesh.faces) for one in objects])
+        self._normals = torch.cat([normals_at_vertices(item) for item in objects])
+        counts = torch.tensor([len(item.mesh.faces) for item in objects])
         self._ends = torch.cumsum(counts, dim=0)
         self._starts = self._ends - counts
-        self._specular = torch.tensor([one.specular for one in objects])
-        self._roughness = torch.tensor([one.roughness for one in objects])
-        self.outside = torch.tensor([one.surroundings for one in objects])
+        self._specular = torch.tensor([item.specular for item in objects])
+        self._roughness = torch.tensor([item.roughness for item in objects])
+        self.outside = torch.tensor([item.surroundings for item in objects])
         extent = vertices.amax(dim=0) - vertices.amin(dim=0)
-        # Clear of the surface in embree's float32, yet below what a pixel shows.
+        # Clear of the surface in embree's single precision, yet below the size of a pixel.
         self.clearance = 2e-4 * float(extent.norm())
 
     def cast(self, origins: Float[Tensor, "ray 3"], along: Float[Tensor, "ray 3"]) -> Hits:
-        """Find what rays meet first."""
+        """Return the first hits of rays."""
         return self._caster.cast(origins, along)
 
     def trace(self, eye: Float[Tensor, " 3"], rays: Float[Tensor, "ray 3"]) -> Spots:
-        """Look along rays from one position, and see what is there."""
+        """Cast rays from one position, and return the material at their first hits."""
         hits = self._caster.cast(eye, rays)
         hit = hits.face >= 0
         points = eye + torch.where(hit, hits.distance, 1)[:, None] * rays
@@ -90,7 +91,7 @@ class TracedObjects:
         normals: Float[Tensor, "ray 3"],
         position: Float[Tensor, " 3"],
     ) -> Bool[Tensor, " ray"]:
-        """Find where a point light is above a surface's horizon and no object is in between."""
+        """Return where a point light is above a surface's horizon and not occluded."""
         start = points + self.clearance * normals
         toward = position - start
         (facing,) = torch.nonzero((normals * toward).sum(dim=-1) > 0, as_tuple=True)
@@ -100,7 +101,7 @@ class TracedObjects:
         return lit.index_copy(0, facing, met >= distance[:, 0])
 
     def shade(self, spots: Spots, eye: Float[Tensor, " 3"], point_light: PointLight) -> Shaded:
-        """Return the radiance that reaches the eye."""
+        """Return the radiance towards the eye."""
         specular, roughness = (
             self._specular[spots.object_index],
             self._roughness[spots.object_index],
@@ -120,24 +121,24 @@ class TracedObjects:
         self, hits: Hits, points: Float[Tensor, "ray 3"], object_index: Int[Tensor, " ray"]
     ) -> Float[Tensor, "ray channel"]:
         albedo = points.new_zeros(len(points), 3)
-        for index, one in enumerate(self.objects):
-            (own,) = torch.nonzero(object_index == index, as_tuple=True)
-            if len(own) == 0:
+        for index, item in enumerate(self.objects):
+            (rows,) = torch.nonzero(object_index == index, as_tuple=True)
+            if len(rows) == 0:
                 continue
-            if one.texture is not None:
-                found = one.texture(points[own])
+            if item.texture is not None:
+                values = item.texture(points[rows])
             else:
-                assert one.mesh.albedo is not None
-                corners = one.mesh.faces[hits.face[own] - self._starts[index]]
-                weights = hits.barycentric[own][..., None]
-                found = (weights * one.mesh.albedo.float()[corners]).sum(dim=1)
-            albedo = albedo.index_copy(0, own, found.to(albedo).expand(-1, 3))
+                assert item.mesh.albedo is not None
+                corners = item.mesh.faces[hits.face[rows] - self._starts[index]]
+                weights = hits.barycentric[rows][..., None]
+                values = (weights * item.mesh.albedo.float()[corners]).sum(dim=1)
+            albedo = albedo.index_copy(0, rows, values.to(albedo).expand(-1, 3))
         return albedo
 
 
-# Square roots of radiance that differ by more are sampled finely: about 4 levels of 255.
+# Square roots of radiance that differ by more are supersampled: about 4 of 255.
 _UNEVEN = 0.015
-# A highlight is noticeable from a hundredth of saturation, or a twentieth of the matte part.
+# A highlight is noticeable from 0.01 of saturation, if it is also 0.05 of the diffuse part.
 _NOTICEABLE, _NOTICEABLE_FRACTION = 0.01, 0.05
 
 MAP_NAMES = ("depth", "normals_world", "albedo", "foreground", "lit", "highlight")
@@ -148,12 +149,12 @@ class RenderedFrame(Record):
     """A photograph, and the intersections of the rays through its pixels' centres.
 
     Attributes:
-        depth: Along the camera's z; infinite where the ray meets nothing.
-        normals_world: Unit, outward; zero where the ray meets nothing.
-        albedo: Linear; zero where the ray meets nothing.
-        lit: True where the point light reaches the surface.
-        highlight: True where the mirrored part is a hundredth of saturation or more, and a
-            twentieth of the matte part.
+        depth: Along the camera's z; infinite for a miss.
+        normals_world: Unit, outward; zero for a miss.
+        albedo: Linear; zero for a miss.
+        lit: True where the point light is visible from the surface.
+        highlight: True where the highlight is 0.01 of saturation or more, and 0.05 of the
+            diffuse part.
     """
 
     image: Float[Tensor, "channel height width"]
@@ -175,7 +176,7 @@ def render_frame(
 ) -> RenderedFrame:
     """Ray trace one photograph; float32.
 
-    One ray through each pixel's centre; where a pixel differs from its neighbours, a grid of
+    One ray through each pixel's centre; if a pixel differs from its neighbours, a grid of
     rays over its area instead.
     """
     cam_from_world, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
@@ -183,8 +184,8 @@ def render_frame(
     width, height = (int(side) for side in cameras.sizes_px[view])
     centers = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
 
-    def seen_at(pixels: Float[Tensor, "pixel 2"]) -> tuple[Spots, Shaded, Tensor]:
-        """Return the spots, their light and the radiance at positions in the image."""
+    def traced_at(pixels: Float[Tensor, "pixel 2"]) -> tuple[Spots, Shaded, Tensor]:
+        """Return hit points, their radiance, and exposed radiance at positions in the image."""
         rays = rays_through(pixels, cam_from_world, intrinsics).float()
         spots = stage.trace(eye, rays)
         shaded = stage.shade(spots, eye, point_light)
@@ -192,44 +193,44 @@ def render_frame(
         radiance = torch.where(hit, shaded.matte + shaded.mirrored, 0)
         return spots, shaded, sensor.exposure * radiance
 
-    found = [seen_at(pixels) for pixels in torch.split(centers, 1 << 16)]
-    spots, shaded, radiances = zip(*found, strict=True)
+    traced = [traced_at(pixels) for pixels in torch.split(centers, 1 << 16)]
+    spots, shaded, radiances = zip(*traced, strict=True)
     radiance = torch.cat(radiances)
     if sensor.supersample > 1:
         (uneven,) = torch.nonzero(_uneven(radiance.reshape(height, width, -1)), as_tuple=True)
         steps = (torch.arange(sensor.supersample).to(centers) + 0.5) / sensor.supersample - 0.5
         offsets = torch.cartesian_prod(steps, steps)
         fine = [
-            torch.stack([seen_at(centers[rows] + offset)[2] for offset in offsets]).mean(dim=0)
+            torch.stack([traced_at(centers[rows] + offset)[2] for offset in offsets]).mean(dim=0)
             for rows in torch.split(uneven, 1 << 14)
         ]
         if fine:
             radiance = radiance.index_copy(0, uneven, torch.cat(fine))
 
     def raster(parts: Iterable[Tensor]) -> Tensor:
-        whole = torch.cat(list(parts))
-        return whole.reshape(height, width, *whole.shape[1:])
+        pixels = torch.cat(list(parts))
+        return pixels.reshape(height, width, *pixels.shape[1:])
 
-    object_index = raster(one.object_index for one in spots)
-    mirrored = sensor.exposure * raster(one.mirrored for one in shaded).mean(dim=-1)
-    matte = sensor.exposure * raster(one.matte for one in shaded).mean(dim=-1)
+    object_index = raster(item.object_index for item in spots)
+    mirrored = sensor.exposure * raster(item.mirrored for item in shaded).mean(dim=-1)
+    matte = sensor.exposure * raster(item.matte for item in shaded).mean(dim=-1)
     return RenderedFrame(
         image=expose(radiance.reshape(height, width, -1).movedim(-1, 0), generator, sensor),
-        depth=raster(one.hits.distance for one in spots),
-        normals_world=raster(one.normals for one in spots),
-        albedo=raster(one.albedo for one in spots),
+        depth=raster(item.hits.distance for item in spots),
+        normals_world=raster(item.normals for item in spots),
+        albedo=raster(item.albedo for item in spots),
         foreground=(object_index >= 0) & ~stage.outside[object_index],
-        lit=raster(one.lit for one in shaded),
+        lit=raster(item.lit for item in shaded),
         highlight=(mirrored > _NOTICEABLE) & (mirrored > _NOTICEABLE_FRACTION * matte),
     )
 
 
 def _uneven(radiance: Float[Tensor, "height width channel"]) -> Bool[Tensor, " pixel"]:
-    """Find pixels that differ from one beside, above or below them; one row an image."""
-    level = radiance.clamp(0, 1).sqrt()
+    """Return the pixels that differ from one next to them, row by row."""
+    brightness = radiance.clamp(0, 1).sqrt()
     marked = torch.zeros(radiance.shape[:2], dtype=torch.bool)
-    across = (level[:, 1:] - level[:, :-1]).abs().amax(dim=-1) > _UNEVEN
-    down = (level[1:] - level[:-1]).abs().amax(dim=-1) > _UNEVEN
+    across = (brightness[:, 1:] - brightness[:, :-1]).abs().amax(dim=-1) > _UNEVEN
+    down = (brightness[1:] - brightness[:-1]).abs().amax(dim=-1) > _UNEVEN
     marked[:, 1:] |= across
     marked[:, :-1] |= across
     marked[1:] |= down

@@ -1,8 +1,8 @@
-"""Small scenes rendered in memory, with the truth beside the photographs.
+"""Small scenes rendered in memory, with ground truth.
 
-:func:`render_shape` obeys first-order lighting exactly, so that an error of a stage is the stage's
-own. :func:`render_objects` does not: near light, cast and attached shadows, highlights, noise and
-saturation are those of photographs.
+:func:`render_shape` obeys first-order lighting exactly, so that any error is that of the tested
+stage. :func:`render_objects` does not: it has near light, cast and attached shadows, highlights,
+noise and saturation like photographs.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class Shape(Protocol):
     def intersect(
         self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*#batch 3"]
     ) -> Float[Tensor, "*batch"]:
-        """Return the distance to the first hit in lengths of the direction; infinite if none."""
+        """Return the distance to the first hit in lengths of the direction; infinite for a miss."""
 
     def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Return the outward unit normals at points of the surface."""
@@ -41,7 +41,7 @@ class Shape(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sphere:
-    """A ball round a centre."""
+    """A sphere."""
 
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     radius: float = 1.0
@@ -49,7 +49,7 @@ class Sphere:
     def intersect(
         self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*#batch 3"]
     ) -> Float[Tensor, "*batch"]:
-        """Solve the quadratic; the nearer root in front of the origin is the hit."""
+        """Return the distance of the nearer root in front of the origin."""
         offset = origins - origins.new_tensor(self.center)
         a = (directions * directions).sum(-1)
         b = (offset * directions).sum(-1)
@@ -61,13 +61,13 @@ class Sphere:
         return torch.where((discriminant >= 0) & (distance > 0), distance, torch.inf)
 
     def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Point away from the centre."""
+        """Return unit vectors away from the centre."""
         return normalize(points - points.new_tensor(self.center), dim=-1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EndlessPlane:
-    """An endless plane through a point; both sides are seen."""
+    """An endless plane through a point; visible from both sides."""
 
     point: tuple[float, float, float] = (0.0, 0.0, 0.0)
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -75,26 +75,26 @@ class EndlessPlane:
     def intersect(
         self, origins: Float[Tensor, "*#batch 3"], directions: Float[Tensor, "*#batch 3"]
     ) -> Float[Tensor, "*batch"]:
-        """Divide height by descent."""
+        """Return height over descent."""
         normal = origins.new_tensor(self.normal)
         height = ((origins - origins.new_tensor(self.point)) * normal).sum(-1)
         distance = -height / (directions * normal).sum(-1)
         return torch.where((distance > 0) & distance.isfinite(), distance, torch.inf)
 
     def normals(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Repeat the plane's own."""
+        """Return the plane's normal."""
         return normalize(points.new_tensor(self.normal), dim=-1).expand_as(points)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class RenderedScene(Record):
-    """Photographs in memory, and their truth; maps are as of :class:`.RenderedFrame`, one a view.
+    """Photographs in memory, with ground truth; maps are as in :class:`.RenderedFrame`, per view.
 
     Attributes:
         lights_world: First-order light ``l`` at the object: radiance is albedo * l . (1, n). Exact
             for closed-form scenes; for ray-traced ones the light at the target, without
             fall-off, shadows and highlights.
-        mesh: The ray-traced one; ``None`` for closed forms.
+        mesh: The ray-traced mesh; ``None`` for closed forms.
     """
 
     views: Views
@@ -112,7 +112,7 @@ class RenderedScene(Record):
 def render_shape(
     shape: Shape, cameras: Cameras, lights_world: Float[Tensor, "view 4"], texture: Texture
 ) -> RenderedScene:
-    """Photograph a closed form so that ``J = albedo * max(0, l . (1, n))`` holds exactly.
+    """Render a closed form with exactly ``J = albedo * max(0, l . (1, n))``.
 
     One ray through every pixel's centre; no cast shadows, noise, fall-off or saturation.
     Precision is that of the cameras.
@@ -157,7 +157,7 @@ def render_objects(
 ) -> RenderedScene:
     """Ray trace meshes under point lights, all photographs in memory, of one size; float32.
 
-    Light falls off with the square of the distance and is stopped by every object.
+    Light decreases with the square of the distance and is occluded by every object.
     """
     sensor = SensorConfig() if sensor is None else sensor
     stage = TracedObjects(objects)
@@ -196,13 +196,13 @@ def _views(images: Float[Tensor, "view channel height width"], cameras: Cameras)
 def potato_on_table(
     seed: int = 0, *, num_views: int = 12, width: int = 640, height: int = 480
 ) -> RenderedScene:
-    """Photograph a bumpy, textured potato under a point light that moves between photographs.
+    """Render a bumpy, textured potato under a point light that moves between photographs.
 
-    The point light is two to three times the potato's length away, so that its light falls off over
+    The point light is two to three times the potato's length away, so its light varies over
     the object.
 
     Args:
-        seed: Of form, texture, lights and noise.
+        seed: Of shape, texture, lights and noise.
         num_views: On an arc at about 35 degrees over the table.
     """
     generator = torch.Generator().manual_seed(seed)

@@ -1,4 +1,4 @@
-"""A rendered scene as a folder: photographs, and the truth beside them.
+"""A rendered scene as a folder: photographs and ground truth.
 
 ==============================  ====================================================
 file                            content
@@ -10,7 +10,7 @@ file                            content
 `truth/sparse/`                 COLMAP model: exact cameras, true points, their tracks
 `truth/lights.json`             point lights of every photograph, and first-order harmonics
 `truth/mesh.ply`                the object
-`truth/surroundings.ply`        its table, if that turns with the object
+`truth/surroundings.ply`        its table, if that rotates with the object
 `truth/maps/view_000.npz` ...   depth, normals, albedo and masks of every pixel; see
                                 :func:`write_maps`
 ==============================  ====================================================
@@ -49,7 +49,7 @@ def write_maps(frame: RenderedFrame, path: Path) -> None:
     """Write the maps of a frame as a compressed ``.npz``.
 
     Depth is float32 as rendered. Normals and albedo are float16, off by at most 0.03 degrees
-    and 0.0003; masks are packed, eight pixels a byte, row by row.
+    and 0.0003; masks are packed, eight pixels per byte, row by row.
     """
     height, width = frame.depth.shape
     np.savez_compressed(
@@ -66,7 +66,7 @@ def write_maps(frame: RenderedFrame, path: Path) -> None:
 
 
 def unpack_maps(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
-    """Return the maps that :func:`write_maps` wrote, normals unit again, masks as booleans."""
+    """Return the maps that :func:`write_maps` wrote, with unit normals, and masks as booleans."""
     width = int(arrays["size"][0])
     maps = {
         name: torch.from_numpy(
@@ -92,21 +92,21 @@ def render_scene(
     processes: int = 2,
     overwrite: bool = False,
 ) -> Path:
-    """Photograph a scene, and write photographs and truth to a new or empty folder, and return it.
+    """Render photographs and ground truth to a new or empty folder, and return it.
 
-    The folder is written whole or not at all; :mod:`.rendered_folder` lists its contents. The same
-    settings give the same files, whatever their number.
+    The folder is written atomically; :mod:`.rendered_folder` lists its contents. The same
+    settings give the same files, for any number of threads.
 
     Args:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
             file.
-        processes: Threads that render side by side, each a photograph.
+        processes: Number of threads, which render one photograph each.
 
     Raises:
-        InputError: No such scene, or a mesh that cannot be read.
-        OutputError: The folder holds something else, or cannot be written.
+        InputError: The scene does not exist, or its mesh cannot be read.
+        OutputError: The folder contains other files, or cannot be written.
     """
-    require(processes >= 1, "processes", processes, "1 or more")
+    require(processes >= 1, "processes", processes, "at least 1")
     folder = Path(folder)
     if Path(name_or_path).exists():
         require_apart(folder, {"the scene's mesh": Path(name_or_path)})
@@ -114,8 +114,8 @@ def render_scene(
         config = SceneConfig() if config is None else config
         scene = build_scene(name_or_path, config)
         for part in ("photos", "masks", "truth/maps"):
-            for own in {Path(name).parent for name in scene.names}:
-                (staging / part / own).mkdir(parents=True)
+            for subfolder in {Path(name).parent for name in scene.names}:
+                (staging / part / subfolder).mkdir(parents=True)
         _write_truth(scene, staging / "truth")
         _render_all(scene, staging, min(processes, config.num_views))
     return folder
@@ -124,7 +124,7 @@ def render_scene(
 def _render_all(scene: Scene, folder: Path, threads: int) -> None:
     shared = TracedObjects(scene.objects_in(0))
 
-    def take(view: int) -> None:
+    def render(view: int) -> None:
         stage = TracedObjects(scene.objects_in(view)) if scene.fixed else shared
         frame = render_frame(
             stage, scene.cameras, scene.lights, view, scene.noise(view), scene.config.sensor
@@ -138,7 +138,7 @@ def _render_all(scene: Scene, folder: Path, threads: int) -> None:
     former = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        deque(side_by_side(take, range(scene.config.num_views)), maxlen=0)
+        deque(side_by_side(render, range(scene.config.num_views)), maxlen=0)
     finally:
         torch.set_num_threads(former)
 
@@ -152,7 +152,7 @@ def _write_photograph(
         write_deep_png((65535 * encoded).round().numpy().astype(np.uint16), path)
     else:
         samples = (255 * encoded).round().numpy().astype(np.uint8)
-        # Noise does not shrink much further at any level of compression.
+        # Higher compression levels hardly shrink noise further.
         Image.fromarray(samples).save(path, compress_level=1)
 
 

@@ -17,15 +17,15 @@ FRONT, UP = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 def panned(cameras: Cameras, shift_px: Float[Tensor, "view 2"]) -> Cameras:
-    """Turn cameras about their centres, so that what was at the principal point is beside it.
+    """Rotate cameras about their centres, without roll, so that the image shifts.
 
     Args:
-        shift_px: Where that is then, from the principal point. Without roll.
+        shift_px: New position of the former principal point, relative to the principal point.
     """
     focal_px = cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[:, :2]
     toward = normalize(homogeneous(shift_px / focal_px), dim=-1)
     x, y, z = toward.unbind(dim=-1)
-    # Rodrigues' formula of the shortest rotation that takes the z axis to ``toward``.
+    # Rodrigues' formula of the shortest rotation from the z axis to ``toward``.
     rotation = torch.stack(
         [
             torch.stack([1 - x * x / (1 + z), -x * y / (1 + z), x], dim=-1),
@@ -39,7 +39,7 @@ def panned(cameras: Cameras, shift_px: Float[Tensor, "view 2"]) -> Cameras:
 
 
 def cropped(cameras: Cameras, shift_px: Float[Tensor, "view 2"]) -> Cameras:
-    """Cut photographs of the same size out with another centre: all they show shifts."""
+    """Crop photographs of the same size around a shifted centre: the image shifts."""
     intrinsics = cameras.intrinsics.clone()
     intrinsics[:, :2, 2] += shift_px
     return cameras.replace(intrinsics=intrinsics)
@@ -59,15 +59,15 @@ def arc_cameras(
     front: tuple[float, float, float] = (0.0, 0.0, 1.0),
     up: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Cameras:
-    """Place cameras on an arc round a target, looking at it; float64.
+    """Place cameras on an arc around a target, looking at it; float64.
 
     The defaults face flat shapes such as :class:`.EndlessPlane` from above.
 
     Args:
         span_deg: From the first camera to the last, about ``up``.
-        elevation_deg: Mean height of the arc over the plane across ``up``.
+        elevation_deg: Mean height of the arc over the plane perpendicular to ``up``.
         sway_deg: Amplitude of the elevation along the arc.
-        front: Towards the centre of the arc; must be across ``up``.
+        front: Towards the centre of the arc; must be perpendicular to ``up``.
     """
     toward_world = arc_directions(
         num_views,
@@ -100,7 +100,7 @@ def arc_directions(
 
 
 def turntable_directions(num_views: int, *, elevation_deg: float) -> Float[Tensor, "view 3"]:
-    """Go once round the object in even steps, at one height: as if it were turned."""
+    """Return directions once around the object in equal steps at one height, as on a turntable."""
     return arc_directions(
         num_views,
         span_deg=360.0 * (num_views - 1) / num_views,
@@ -112,18 +112,18 @@ def turntable_directions(num_views: int, *, elevation_deg: float) -> Float[Tenso
 def handheld_directions(
     num_views: int, generator: torch.Generator, *, elevation_deg: float
 ) -> Float[Tensor, "view 3"]:
-    """Return directions once round the object at each of three heights, as steady as a hand.
+    """Return directions once around the object at each of three heights, with a hand's shake.
 
     Args:
-        elevation_deg: Of the first third; then 18 degrees higher, then 14 lower, none below 8 and
-            above 75.
+        elevation_deg: Of the first third; then 18 degrees higher, then 14 lower, all limited to
+            between 8 and 75.
     """
     third = torch.arange(num_views) * 3 // num_views
-    within = torch.bincount(third, minlength=3)[third]
+    per_height = torch.bincount(third, minlength=3)[third]
     step = torch.arange(num_views) - torch.searchsorted(third, third)
-    shaken = torch.rand(3, num_views, generator=generator, dtype=torch.float64) - 0.5
-    azimuth = 2 * torch.pi * (step + 0.6 * shaken[0] + third / 3) / within
-    heights = elevation_deg + azimuth.new_tensor([0.0, 18.0, -14.0])[third] + 8 * shaken[1]
+    shake = torch.rand(3, num_views, generator=generator, dtype=torch.float64) - 0.5
+    azimuth = 2 * torch.pi * (step + 0.6 * shake[0] + third / 3) / per_height
+    heights = elevation_deg + azimuth.new_tensor([0.0, 18.0, -14.0])[third] + 8 * shake[1]
     return _directions(azimuth, torch.deg2rad(heights.clamp(8.0, 75.0)), FRONT, UP)
 
 
@@ -137,16 +137,16 @@ def distance_to_fit(
     height: float,
     fill: float,
 ) -> float:
-    """Find how near cameras can come for all points to stay in all their pictures.
+    """Return the minimum distance of cameras at which all points are in all images.
 
     Args:
         toward_world: Unit, from the target to the cameras, which look at it.
-        fill: Fraction of the picture, along its tighter side, that the points may take.
+        fill: Maximum fraction of the image, along its tighter side, covered by the points.
     """
     up_world = points_world.new_tensor(UP)
     rotation = look_at(target_world + toward_world, target_world, up_world)[:, :3, :3]
     x, y, z = ((points_world - target_world) @ rotation.mT).unbind(dim=-1)
-    # At distance d a point appears f x / (d + z) from the centre; that is to be half the side.
+    # At distance d a point is imaged f x / (d + z) from the centre; this has to be half the side.
     wide = focal_px * x.abs() / (fill * width / 2) - z
     high = focal_px * y.abs() / (fill * height / 2) - z
     return float(torch.maximum(wide, high).amax())
@@ -155,10 +155,10 @@ def distance_to_fit(
 def aim_to_fit(
     toward_world: Float[Tensor, "view 3"], points_world: Float[Tensor, "point 3"], **picture: float
 ) -> tuple[Float[Tensor, " 3"], float]:
-    """Find what cameras look at, and from how far, to show all points as large as can be.
+    """Return the target and distance of cameras that show all points as large as possible.
 
     Args:
-        picture: As of :func:`distance_to_fit`.
+        picture: Arguments of :func:`distance_to_fit`.
     """
     hull = points_world[torch.from_numpy(ConvexHull(points_world.numpy()).vertices).long()]
 
@@ -168,15 +168,15 @@ def aim_to_fit(
     def distance(target: Float[Tensor, " 3"]) -> float:
         return distance_to_fit(toward_world, hull, target, **picture)
 
-    def farness(values: np.ndarray) -> float:
-        # How far the cameras are from the object's centre: their distance from the target
-        # alone is less the nearer the target itself is to them. Convex.
+    def cost(values: np.ndarray) -> float:
+        # Distance of the cameras from the object's centre: the distance from the target would
+        # decrease as the target moves towards the cameras. Convex.
         target = torch.from_numpy(values)
         off = target - centre
         return distance(target) + float(off @ mean_toward) + 0.01 * float(off @ off)
 
-    found = minimize(farness, centre.numpy(), method="Nelder-Mead", options={"xatol": 1e-3})
-    target = torch.from_numpy(found.x)
+    result = minimize(cost, centre.numpy(), method="Nelder-Mead", options={"xatol": 1e-3})
+    target = torch.from_numpy(result.x)
     return target, distance(target)
 
 
@@ -186,7 +186,7 @@ def _directions(
     front: tuple[float, float, float],
     up: tuple[float, float, float],
 ) -> Float[Tensor, "view 3"]:
-    up_world, ahead = azimuth.new_tensor(up), azimuth.new_tensor(front)
-    aside = torch.linalg.cross(up_world, ahead)
-    level = torch.cos(azimuth)[:, None] * ahead + torch.sin(azimuth)[:, None] * aside
-    return torch.cos(elevation)[:, None] * level + torch.sin(elevation)[:, None] * up_world
+    up_world, front_world = azimuth.new_tensor(up), azimuth.new_tensor(front)
+    side = torch.linalg.cross(up_world, front_world)
+    horizontal = torch.cos(azimuth)[:, None] * front_world + torch.sin(azimuth)[:, None] * side
+    return torch.cos(elevation)[:, None] * horizontal + torch.sin(elevation)[:, None] * up_world

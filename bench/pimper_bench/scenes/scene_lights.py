@@ -22,7 +22,7 @@ class PointLight(Record):
     colour: Float[Tensor, " 3"] | None = None
 
     def from_window(self, normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"] | float:
-        """Return the irradiance of the window's soft light; see :class:`Lights`."""
+        """Return the irradiance of the window's soft light, for normals; see :class:`Lights`."""
         if self.window is None:
             return 0.0
         strength = self.window.norm()
@@ -31,7 +31,7 @@ class PointLight(Record):
     def arriving(
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
-        """Return the direction to the light, and the irradiance across it, at points."""
+        """Return the direction to the light, and the irradiance perpendicular to it, at points."""
         toward = self.position - points
         distance = toward.norm(dim=-1)
         falloff = ((self.position - self.target).norm() / distance) ** 2
@@ -40,15 +40,15 @@ class PointLight(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Lights(Record):
-    """A point light and an even ambient light for each view.
+    """A point light and a uniform ambient light for each view.
 
     A point of albedo 1 facing the point light at ``target_world`` has radiance
-    ``irradiance + ambient``; elsewhere the former falls off with the square of the distance.
+    ``irradiance + ambient``; elsewhere the former decreases with the square of the distance.
 
     Attributes:
         ambient: Radiance of a white point in shadow.
-        window: Direction to the middle of soft light times the irradiance ``w`` of what faces it;
-            a surface turned by ``a`` gets ``w (1 + cos a)**2 / 4``, without cast shadows.
+        window: Direction to a soft light's centre times the irradiance ``w`` of surfaces facing it;
+            a surface rotated by ``a`` gets ``w (1 + cos a)**2 / 4``, without cast shadows.
     """
 
     positions_world: Float[Tensor, "view 3"]
@@ -59,7 +59,7 @@ class Lights(Record):
     colour: Float[Tensor, "view 3"] | None = None
 
     def point_light(self, view: int) -> PointLight:
-        """Pick the light of one photograph."""
+        """Return the light of one photograph."""
         return PointLight(
             position=self.positions_world[view].float(),
             target=self.target_world.float(),
@@ -92,7 +92,7 @@ def wandering_lights(
     target: tuple[float, float, float] = (0.0, 0.0, 0.0),
     toward: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Lights:
-    """Draw another position of a point light in a cone for every photograph; float64.
+    """Draw a position of a point light in a cone for every photograph; float64.
 
     Args:
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
@@ -122,14 +122,14 @@ def lights_round(
     ambient: float,
     far: bool = False,
 ) -> Lights:
-    """Draw positions of a point light round an object, on the photographed side; float64.
+    """Draw positions of a point light around an object, on the photographed side; float64.
 
     Args:
         azimuths: Radians about the world's z, counter-clockwise from -y: the centre of the
-            point light's sweep in each photograph.
+            point light's range in each photograph.
         distance: From the target, scene units; drawn up to a quarter nearer or farther.
         irradiance: Mean over the views; drawn up to a quarter less or more.
-        far: Whether light comes from one direction and does not fall off.
+        far: Whether light comes from one direction, without fall-off.
     """
     count = len(azimuths)
     square = _even_square(count, generator)
@@ -138,7 +138,7 @@ def lights_round(
     sine = lowest + (highest - lowest) * square[:, 1]  # uniform over the solid angle
     cosine = (1 - sine**2).sqrt()
     direction = torch.stack([cosine * rotation.sin(), -cosine * rotation.cos(), sine], dim=-1)
-    # So far away, falloff over an object is below what float32 tells.
+    # At this distance, the fall-off over an object is below single precision.
     farther = 1e5 if far else 1.0
     return _placed(direction, target, generator, distance, irradiance, ambient, farther)
 
@@ -168,9 +168,9 @@ def _about_one(count: int, generator: torch.Generator) -> Float[Tensor, " view"]
 
 
 def _even_square(count: int, generator: torch.Generator) -> Float[Tensor, "view 2"]:
-    """Spread points over the unit square.
+    """Distribute points over the unit square.
 
-    The plastic number's sequence fills it evenly however few its points are, so that a dozen
+    The plastic number's sequence fills it evenly for any number of points, so a dozen
     photographs already have lights from all sides (Roberts, 2018).
     """
     steps = torch.arange(count, dtype=torch.float64)[:, None]

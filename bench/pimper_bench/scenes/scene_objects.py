@@ -1,7 +1,7 @@
 """The objects of the four published sequences, and others, generated from a seed.
 
-Each stands on ``z = 0`` round the z axis, is about 2.4 scene units large, and is seen from
--y. Surfaces, not brands: they are similar in reflectance and in how much texture they have.
+Each is on ``z = 0`` around the z axis, about 2.4 scene units large, and is photographed from -y.
+Surfaces are similar to the published ones in reflectance and amount of texture.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ from pimper_torch.records import Mesh
 Recipe = Callable[[torch.Generator], tuple[SceneObject, ...]]
 
 _MUG_RADIUS, _MUG_HEIGHT, _MUG_WALL = 0.85, 1.95, 0.09
-# Of the jar: foot, belly, shoulder, neck, the lid's rim, its dome and knob.
+# Radius and height of the jar's foot, belly, shoulder, neck, the lid's rim, its dome and knob.
 _JAR_PROFILE = (
     (0.52, 0.0),
     (0.575, 0.02),
@@ -70,7 +70,7 @@ _BALL_TINTS = (
     (0.9, 0.75, 1.0),
     (1.0, 0.85, 0.8),
 )
-_POTATOES = (  # position before they are pushed apart, size, turn
+_POTATOES = (  # position before they are pushed apart, size, rotation
     ((-0.50, -0.05), 0.62, 25.0),
     ((0.50, -0.15), 0.52, -50.0),
     ((0.12, 0.55), 0.66, 80.0),
@@ -81,7 +81,7 @@ _PAIR = (((-0.15, 0.85), 0.75), ((0.0, -0.6), 0.6))  # position and size, behind
 
 
 def mug(generator: torch.Generator) -> tuple[SceneObject, ...]:
-    """Throw a glazed mug with a handle and a bold pattern outside."""
+    """Return a glazed mug with a handle and a pattern of strong contrast outside."""
     decor = random_speckle(
         generator,
         cells=(0.33, 0.15, 0.067, 0.03),
@@ -100,18 +100,18 @@ def mug(generator: torch.Generator) -> tuple[SceneObject, ...]:
 
 
 def mug_mesh(cell: float = 0.016) -> Mesh:
-    """Make a mug, its handle along +x; watertight."""
-    room = 0.06
+    """Return the mesh of a mug with its handle along +x; watertight."""
+    margin = 0.06
     return mesh_level_set(
         _mug_level,
-        (-_MUG_RADIUS - room, -_MUG_RADIUS - room, -room),
-        (_MUG_RADIUS + 0.75, _MUG_RADIUS + room, _MUG_HEIGHT + room),
+        (-_MUG_RADIUS - margin, -_MUG_RADIUS - margin, -margin),
+        (_MUG_RADIUS + 0.75, _MUG_RADIUS + margin, _MUG_HEIGHT + margin),
         cell,
     )
 
 
 def jar(generator: torch.Generator) -> tuple[SceneObject, ...]:
-    """Turn a glazed jar with a lid, nearly of one colour, a pale label and few blemishes."""
+    """Return a glazed jar with a lid, nearly of one colour, with a pale label and few blemishes."""
     glaze = random_speckle(
         generator,
         cells=(0.9, 0.4),
@@ -147,22 +147,22 @@ def jar(generator: torch.Generator) -> tuple[SceneObject, ...]:
 
 
 def jar_mesh(levels: int = 280, around: int = 224) -> Mesh:
-    """Make the jar's surface of revolution; closed."""
+    """Return the jar's surface of revolution; closed."""
     corners = torch.tensor(_JAR_PROFILE, dtype=torch.float64)
     along = torch.cat([corners.new_zeros(1), corners.diff(dim=0).norm(dim=1).cumsum(dim=0)])
-    # Highlights show where curvature jumps, so the curve is twice differentiable.
+    # Jumps of curvature are visible in highlights, so the curve is twice differentiable.
     smooth = CubicSpline(along.numpy(), corners.numpy())
     steps = torch.linspace(0, float(along[-1]), levels - 1, dtype=torch.float64)
     wall = torch.from_numpy(smooth(steps.numpy()))
-    wall[:, 1].clamp_(min=0)  # between its first corners the curve dips by a hair
+    wall[:, 1].clamp_(min=0)  # the spline overshoots slightly between its first corners
     centre_of_foot, top = corners.new_tensor([[0.0, 0.0]]), corners[-1:]
     return lathe(torch.cat([centre_of_foot, wall[:-1], top]), around)
 
 
 def balls(generator: torch.Generator) -> tuple[SceneObject, ...]:
-    """Pile up matte, textured balls that shadow one another."""
+    """Return a pile of matte, textured balls that shadow one another."""
     vertices, faces = icosphere(6)
-    made = []
+    objects = []
     for (center, radius), tint in zip(_BALLS, _BALL_TINTS, strict=True):
         texture = random_speckle(
             generator,
@@ -177,13 +177,13 @@ def balls(generator: torch.Generator) -> tuple[SceneObject, ...]:
             faces=faces,
             normals_world=vertices,
         )
-        made.append(SceneObject(mesh=moved(placed, shift=(-0.1, -0.4, 0.0)), texture=texture))
-    return tuple(made)
+        objects.append(SceneObject(mesh=moved(placed, shift=(-0.1, -0.4, 0.0)), texture=texture))
+    return tuple(objects)
 
 
 def potatoes(generator: torch.Generator) -> tuple[SceneObject, ...]:
-    """Heap matte, bumpy potatoes with weak texture and a few eyes."""
-    made: list[SceneObject] = []
+    """Return a heap of matte, bumpy potatoes with weak texture and a few eyes."""
+    objects: list[SceneObject] = []
     for (x, y), size, rotation_deg in _POTATOES:
         grown = potato(generator, bumps=0.009)
         skin = random_speckle(
@@ -205,13 +205,13 @@ def potatoes(generator: torch.Generator) -> tuple[SceneObject, ...]:
             colour=0.0,
         )
         mesh = moved(grown, scale=size, rotation_deg=rotation_deg)
-        mesh = push_clear(mesh, [one.mesh for one in made], (x, y))
-        made.append(SceneObject(mesh=mesh, texture=marked(skin, eyes)))
-    return tuple(made)
+        mesh = push_clear(mesh, [item.mesh for item in objects], (x, y))
+        objects.append(SceneObject(mesh=mesh, texture=marked(skin, eyes)))
+    return tuple(objects)
 
 
 def pair(generator: torch.Generator) -> tuple[SceneObject, ...]:
-    """Stand two objects apart, one in front of the other, which it hides in part."""
+    """Return two objects, one of which partly occludes the other."""
     clay = random_speckle(
         generator,
         cells=(0.31, 0.13, 0.055, 0.024),
@@ -231,11 +231,11 @@ def pair(generator: torch.Generator) -> tuple[SceneObject, ...]:
 
 
 def _cloth(texture: Texture) -> SceneObject:
-    """Lay a matte cloth on the table."""
+    """Return a matte cloth on the table."""
     return SceneObject(mesh=table(4.0, cells=64), texture=texture, surroundings=True)
 
 
-# Cloths of modest texture, of strong contrast with features of every size, and without texture.
+# Cloths of modest texture, of strong contrast with features of all sizes, and without texture.
 TABLES: dict[str, Callable[[torch.Generator], SceneObject]] = {
     "cloth": lambda generator: _cloth(
         random_speckle(
@@ -282,7 +282,7 @@ def _mug_level(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
 
 
 def _handle(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-    """An upright ring, higher than wide, its tube broader than thick."""
+    """Signed function of an upright ring, higher than wide, with an elliptic cross section."""
     outward = points[:, 0] - (_MUG_RADIUS - 0.02)
     upward = (points[:, 2] - 0.52 * _MUG_HEIGHT) / 1.25
     ring = (outward**2 + upward**2 + 1e-12).sqrt() - 0.46

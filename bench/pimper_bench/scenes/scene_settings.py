@@ -13,14 +13,14 @@ from pimper_torch.runtime.config import Range, require, require_ranges
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorConfig:
-    """A sensor's faults.
+    """Imperfections of a sensor.
 
     Attributes:
-        supersample: Rays a pixel, along each side, where neighbouring pixels differ; one ray
-            where they do not.
+        supersample: Rays per pixel, along each side, where neighbouring pixels differ; one ray
+            elsewhere.
         read_noise: Standard deviation in the dark; 1 is saturation.
-        shot_noise: Variance that light adds, as a fraction of its radiance.
-        exposure: Radiance is multiplied by it before it saturates at 1.
+        shot_noise: Additional variance due to light, as a fraction of its radiance.
+        exposure: Factor on radiance before saturation at 1.
     """
 
     supersample: Annotated[int, Range(least=1, most=16)] = 2
@@ -29,7 +29,7 @@ class SensorConfig:
     exposure: Annotated[float, Range(above=0, most=1000)] = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse what no sensor does."""
+        """Refuse values out of range."""
         require_ranges(self)
 
 
@@ -41,7 +41,7 @@ def expose(
     """Add noise and saturate.
 
     Args:
-        radiance: Already multiplied by the exposure; without limit.
+        radiance: Already multiplied by the exposure, unbounded.
     """
     spread = (sensor.read_noise**2 + sensor.shot_noise * radiance).sqrt()
     noise = torch.randn(radiance.shape, generator=generator, dtype=radiance.dtype)
@@ -53,57 +53,58 @@ class SceneConfig:
     """Settings of a rendered scene.
 
     Attributes:
-        num_views: Photographs.
-        lights_per_pose: Photographs that the camera takes of every pose, each under another
-            light; they are in a folder a pose then.
+        num_views: Number of photographs.
+        lights_per_pose: Number of photographs from every camera pose, each under a different
+            light; poses are then folders.
         width: Pixels.
         height: Pixels.
-        seed: Of everything random: form, texture, point light, hand and noise.
-        path: Of the camera: along an arc, once round at one height (the object turned), or
-            carried all round at three heights.
+        seed: Of everything random: shape, texture, point light, camera shake and noise.
+        path: Of the camera: along an arc, once around at one height (the object is rotated), or
+            handheld around the object at three heights.
         span_deg: Of the arc.
         elevation_deg: Mean height of the camera over the table's plane.
-        sway_deg: How far the camera goes up and down along the arc.
-        fill: Fraction of the picture that the object takes, along the tighter side.
-        fixed_point_light: The point light stands still beside the camera, as where the object
-            turns; only with the turntable. Else it goes to another position for every photograph.
-        constant_light: All photographs have the light of the first, as where a lamp stays with the
-            object and the camera alone moves.
-        fixed_room: A patterned floor and wall behind the object, which stand still before the
-            camera; only with the turntable. Else there is nothing beyond the table.
-        fixed_table: The table stands still before the camera, too, and the object alone turns;
-            only with the turntable. Else it turns with the object.
-        turned_over: For the second half of the photographs the object lies upside down on its
-            table, so that they show its underside. The world is the object's frame in both halves;
-            not where something else stands still before the camera.
-        pan_jitter_px: The camera pans and tilts on its tripod between photographs, so that the
-            picture of what stands still shifts by up to so many pixels from where it is meant to
-            be; the object stays in the picture, smaller.
-        crop_jitter_px: The picture is cut out with its centre off by up to so many pixels.
-        light: A near point light, whose light falls off over the object, or one far away.
+        sway_deg: Amplitude of the camera's elevation along the arc.
+        fill: Fraction of the image filled by the object, along the tighter side.
+        fixed_point_light: The point light is fixed relative to the camera, as when the object
+            rotates; only with the turntable. Otherwise, it moves between photographs.
+        constant_light: All photographs have the light of the first, as when the lamp is fixed
+            relative to the object and only the camera moves.
+        fixed_room: A patterned floor and wall behind the object, fixed relative to the camera;
+            only with the turntable. Otherwise, there is nothing beyond the table.
+        fixed_table: The table is also fixed relative to the camera, and only the object rotates;
+            only with the turntable. Otherwise, it rotates with the object.
+        turned_over: In the second half of the photographs, the object is upside down on its table,
+            so that its underside is visible. The world is the object's frame in both halves; not
+            if anything else is fixed relative to the camera.
+        pan_jitter_px: The camera pans and tilts on its tripod between photographs, so the image
+            of static things shifts by up to this many pixels from its intended
+            position; the object stays in the image, smaller.
+        crop_jitter_px: The image is cropped with its centre off by up to this many pixels.
+        light: A near point light, with fall-off over the object, or a distant one.
         point_light_distance: Of the near point light, in object sizes; up to a quarter nearer or
             farther.
-        irradiance: Of the point light, as the radiance of white facing it; a quarter more or less.
-        ambient: Light from everywhere, as the radiance of white; a quarter more or less.
-        window: Of soft light from one side of the room, at rest in the world, as the radiance of
-            white facing it; 0 is none.
-        lamp_colour: How much the point light's colour differs between photographs: the standard
+        irradiance: Of the point light, as the radiance of a white surface facing it; up to a
+            quarter more or less.
+        ambient: Uniform light, as the radiance of a white surface; up to a quarter more or less.
+        window: Soft light from one side, static in the world, as the radiance of a white surface
+            facing it; 0 for none.
+        lamp_colour: Variation of the point light's colour between photographs: the standard
             deviation of the logarithm of each channel; 0 is white.
-        exposure: Radiance is multiplied by it; what exceeds 1 saturates.
+        exposure: Factor on radiance; values above 1 saturate.
         read_noise: Standard deviation of the sensor in the dark; 1 is saturation.
-        shot_noise: Variance that light adds, as a fraction of its radiance.
-        supersample: Rays a pixel, along each side, where pixels differ from their neighbours.
+        shot_noise: Additional variance due to light, as a fraction of its radiance.
+        supersample: Rays per pixel, along each side, where pixels differ from their neighbours.
         bits: Of a sample in the photographs.
-        encoding: sRGB as cameras write it, or samples proportional to radiance.
-        table: Its texture: cloth is modest, patterned has plenty of features all over, plain
+        encoding: sRGB, as written by cameras, or samples proportional to radiance.
+        table: Its texture: cloth is modest, patterned has many features everywhere, plain
             has none.
-        up: Which axis of a mesh file points up.
-        rotation_deg: Of the object about the upright axis, counter-clockwise seen from above.
+        up: The axis of a mesh file that points up.
+        rotation_deg: Of the object about the vertical axis, counter-clockwise seen from above.
         albedo: Linear red, green and blue, uniform over the object; by default its texture.
-        specular: Fraction of light that the object mirrors head on, 0 is matte; by default the
-            scene's own, for a mesh file 0.
-        roughness: Of the highlight, 0.1 polished to 0.5 satin; by default the scene's own, for
-            a mesh file 0.3.
+        specular: Reflectance of the surface at normal incidence, 0 is matte; by default the
+            scene's, and 0 for a mesh file.
+        roughness: Of the highlight, 0.1 polished to 0.5 satin; by default the scene's, and
+            0.3 for a mesh file.
     """
 
     num_views: Annotated[int, Range(least=1, most=100_000)] = 30
@@ -143,25 +144,23 @@ class SceneConfig:
     roughness: Annotated[float | None, Range(least=0, most=1)] = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be photographed."""
+        """Refuse settings that give no photographs."""
         require_ranges(self)
-        _ = self.sensor  # refuses its own
+        _ = self.sensor  # checks its own settings
         # Rays of a photograph take 100 bytes each: 64 GB.
         rays = int((640_000_000 / (self.width * self.height)) ** 0.5)
         moving = self.turned_over or self.fixed_point_light or self.jitter_px > 0
         shared = self.num_views % self.lights_per_pose == 0
         lowest, highest = self.elevation_deg - self.sway_deg, self.elevation_deg + self.sway_deg
         on_axis = self.path == "turntable"
-        before = f"path turntable instead of {self.path}, for what stands still before the camera"
+        turning = f"path turntable instead of {self.path}, for anything fixed to the camera"
         widest = 0.3 * min(self.width, self.height)
-        jitter = (
-            f"0 or more, and both jitters together at most {widest:.0f}, 0.3 of the tighter side"
-        )
-        for holds, name, needed in (
+        jitter = f"0 or more, and together at most {widest:.0f}, 0.3 of the tighter side"
+        for valid, name, needed in (
             (
                 self.supersample <= rays,
                 "supersample",
-                f"{rays} at most with {self.width} x {self.height} pixels; or fewer of these",
+                f"at most {rays} with {self.width} x {self.height} pixels; or fewer of these",
             ),
             (
                 shared and not (self.lights_per_pose > 1 and moving),
@@ -173,27 +172,27 @@ class SceneConfig:
             (
                 self.sway_deg >= 0 and lowest >= 2 and highest <= 85,
                 "elevation_deg",
-                f"between 2 and 85 with {self.sway_deg} (sway_deg) taken from it or added",
+                f"between 2 and 85 after adding or subtracting sway_deg, {self.sway_deg}",
             ),
-            (on_axis or not self.fixed_point_light, "fixed_point_light", before),
-            (on_axis or not self.fixed_room, "fixed_room", before),
-            (on_axis or not self.fixed_table, "fixed_table", before),
+            (on_axis or not self.fixed_point_light, "fixed_point_light", turning),
+            (on_axis or not self.fixed_room, "fixed_room", turning),
+            (on_axis or not self.fixed_table, "fixed_table", turning),
             (
-                not self.turned_over or (self.num_views >= 2 and not self._at_rest),
+                not self.turned_over or (self.num_views >= 2 and not self._has_fixed),
                 "turned_over",
-                "2 views or more, and no window, or anything fixed before the camera",
+                "at least 2 views, no window, and nothing fixed to the camera",
             ),
             (0 <= self.crop_jitter_px <= widest, "crop_jitter_px", jitter),
             (self.pan_jitter_px >= 0 and self.jitter_px <= widest, "pan_jitter_px", jitter),
             (
                 not (self.constant_light and self.fixed_point_light),
                 "constant_light",
-                "no fixed_point_light, under which the light goes round the object",
+                "no fixed_point_light, with which the light moves around the object",
             ),
             (
                 self.irradiance + self.ambient + self.window > 0,
                 "irradiance",
-                "some light: irradiance, ambient or window",
+                "light from irradiance, ambient or window",
             ),
             (
                 all(0 <= channel <= 1 for channel in self.albedo or ()),
@@ -201,22 +200,22 @@ class SceneConfig:
                 "between 0 and 1 in every channel",
             ),
         ):
-            require(holds, name, getattr(self, name), needed)
+            require(valid, name, getattr(self, name), needed)
 
     @property
-    def _at_rest(self) -> bool:
-        """Whether something stands still in the room while the object does not."""
+    def _has_fixed(self) -> bool:
+        """Whether anything is fixed in the room while the object moves."""
         fixed = self.fixed_point_light or self.fixed_room or self.fixed_table
         return fixed or self.window > 0
 
     @property
     def jitter_px(self) -> float:
-        """Return the largest error of a picture's place, of all causes together."""
+        """Maximum displacement of the image, pan and crop together."""
         return self.pan_jitter_px + self.crop_jitter_px
 
     @property
     def sensor(self) -> SensorConfig:
-        """The part that is the sensor's."""
+        """Settings of the sensor."""
         return SensorConfig(
             supersample=self.supersample,
             read_noise=self.read_noise,

@@ -1,4 +1,4 @@
-"""Smooth random functions of space, and textures put together from them."""
+"""Smooth random functions of space, and textures made from them."""
 
 from dataclasses import dataclass
 
@@ -12,14 +12,14 @@ from pimper_bench.scenes.scene_object import Texture
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waves:
-    """A sum of sines: smooth to every order."""
+    """A sum of sines, smooth to every order."""
 
     wave_vectors: Float[Tensor, "wave axis"]
     phases: Float[Tensor, " wave"]
     amplitudes: Float[Tensor, " wave"]
 
     def __call__(self, points: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch"]:
-        """Evaluate at points."""
+        """Return the values at points."""
         angle = points @ self.wave_vectors.to(points).mT + self.phases.to(points)
         return torch.sin(angle) @ self.amplitudes.to(points)
 
@@ -32,12 +32,12 @@ def random_waves(
     axes: int = 3,
     num_waves: int = 24,
 ) -> Waves:
-    """Draw waves of about one length in random directions.
+    """Return random waves of similar wavelength in random directions.
 
     Args:
         wavelength: Scene units; drawn between 0.7 and 1.4 of this.
         axes: 3 in space, 2 over a plane.
-        num_waves: More look more random and take longer.
+        num_waves: More waves look more random and take longer.
     """
     direction = torch.randn(num_waves, axes, generator=generator, dtype=torch.float64)
     direction = direction / direction.norm(dim=1, keepdim=True)
@@ -55,14 +55,14 @@ def random_waves(
 class Speckle:
     """A solid texture: an albedo for every point of space.
 
-    Grids of random values, each finer than the one before, are interpolated linearly, added and
-    pushed towards light and dark, so that features of many sizes have edges.
+    Grids of random values, each finer than the previous one, are interpolated linearly, added and
+    passed through a sigmoid, so that features of many sizes have edges.
 
     Attributes:
-        subdivisions: One an octave, periodic: along each axis the last value repeats the first.
-        cells: Scene units between grid points, one an octave.
-        contrast: Steepness of the push.
-        offset: Added before the push: far from 0, only rare spots are dark (or light).
+        subdivisions: One per octave, periodic: along each axis the last value repeats the first.
+        cells: Scene units between grid points, one per octave.
+        contrast: Steepness of the sigmoid.
+        offset: Added before the sigmoid: far from 0, only rare spots are dark (or light).
     """
 
     subdivisions: Float[Tensor, "octave channel side side side"]
@@ -104,21 +104,21 @@ def random_speckle(
     offset: float = 0.0,
     tint: tuple[float, ...] = (1.0,),
 ) -> Speckle:
-    """Draw a texture.
+    """Return a random texture.
 
     Args:
         cells: Sizes of its features in scene units.
-        contrast: 0 is uniform; 2.5 gives plenty of features to structure from motion.
-        colour: 0 is gray; 1 gives the channels nothing in common.
-        offset: Positive leaves rare dark spots, negative rare light ones.
-        tint: Multiplies the channels; one number, or one for each.
+        contrast: 0 is uniform; 2.5 gives many features to structure from motion.
+        colour: 0 is gray; 1 makes the channels independent.
+        offset: Positive for rare dark spots, negative for rare light ones.
+        tint: Factor on the channels; one number, or one for each.
     """
-    side = 64  # repeats after 64 cells; no two octaves repeat together
+    side = 64  # the period in cells; periods of the octaves differ
     shape = (len(cells), 1, side, side, side)
     shared = torch.randn(shape, generator=generator)
-    own = torch.randn((len(cells), 3, side, side, side), generator=generator)
+    rgb = torch.randn((len(cells), 3, side, side, side), generator=generator)
     return Speckle(
-        subdivisions=pad((1 - colour) * shared + colour * own, (0, 1, 0, 1, 0, 1), mode="circular"),
+        subdivisions=pad((1 - colour) * shared + colour * rgb, (0, 1, 0, 1, 0, 1), mode="circular"),
         cells=cells,
         weights=tuple(1.0 for _ in cells),
         darkest=darkest,
@@ -131,7 +131,7 @@ def random_speckle(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Uniform:
-    """One albedo everywhere."""
+    """A uniform albedo."""
 
     albedo: tuple[float, ...]
 
@@ -148,10 +148,10 @@ def painted(
     heights: tuple[float, float] = (-float("inf"), float("inf")),
     azimuths_deg: tuple[float, float] = (-180.0, 180.0),
 ) -> Texture:
-    """Return a texture with another on top, between two radii, heights and azimuths about z.
+    """Return a texture covered by a second one between two radii, heights and azimuths about z.
 
     Args:
-        azimuths_deg: Counter-clockwise from -y, where photographs are taken from.
+        azimuths_deg: Counter-clockwise from -y, where the cameras are.
     """
 
     def albedo(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch channel"]:
@@ -168,5 +168,5 @@ def painted(
 
 
 def marked(base: Texture, marks: Texture) -> Texture:
-    """Return a texture darkened by another, such as by blemishes."""
+    """Return a texture darkened by a second one, such as by blemishes."""
     return lambda points: base(points) * marks(points)

@@ -1,4 +1,4 @@
-"""Sparse clouds with tracks from the truth, as if structure from motion had run."""
+"""Sparse clouds with tracks from ground truth, in the form of structure from motion's."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,9 +22,9 @@ def sparse_scene(
     noise_px: float = 0.0,
     dtype: torch.dtype = torch.float32,
 ) -> SparseScene:
-    """Sample visible surface points, follow them through the views and triangulate them.
+    """Sample visible surface points, track them through the views and triangulate them.
 
-    Noise is put on the observations, and the points are triangulated from those again, so that
+    Noise is added to the observations, and the points are triangulated from these, so that
     their errors are along the rays as in real clouds.
 
     Args:
@@ -32,8 +32,8 @@ def sparse_scene(
         dtype: Of photographs, cameras and points.
     """
     cameras = scene.cameras
-    points = _pick(scene, 4 * num_points, generator)
-    pixels, seen = _follow(scene, points)
+    points = _draw(scene, 4 * num_points, generator)
+    pixels, seen = _tracked(scene, points)
     (kept,) = torch.nonzero(seen.sum(dim=1) >= 3, as_tuple=True)
     kept = kept[:num_points]
     points, pixels, seen = points[kept], pixels[kept], seen[kept]
@@ -41,8 +41,8 @@ def sparse_scene(
         spread = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         pixels = pixels + noise_px * spread.to(pixels)
         points = triangulate_rays(cameras, pixels, seen)
-    where = project(points, cameras.cam_from_world, cameras.intrinsics)[0].movedim(0, 1)
-    errors = (where - pixels).norm(dim=-1)
+    projected = project(points, cameras.cam_from_world, cameras.intrinsics)[0].movedim(0, 1)
+    errors = (projected - pixels).norm(dim=-1)
     point_index, view_index = torch.nonzero(seen, as_tuple=True)
     return SparseScene(
         views=scene.views.replace(images=scene.views.images.to(dtype)),
@@ -58,29 +58,29 @@ def sparse_scene(
     )
 
 
-def _pick(scene: RenderedScene, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
-    """Unproject pixels drawn at random from the depth maps."""
-    cameras, found = scene.cameras, []
-    fraction = -(-count // cameras.num_views)
+def _draw(scene: RenderedScene, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
+    """Unproject random pixels of the depth maps."""
+    cameras, points_of = scene.cameras, []
+    per_view = -(-count // cameras.num_views)
     for view in range(cameras.num_views):
         width, height = (int(side) for side in cameras.sizes_px[view])
         depth = scene.depth[view].to(cameras.intrinsics).reshape(-1)
         (hit,) = torch.nonzero(depth.isfinite(), as_tuple=True)
-        hit = hit[torch.randperm(len(hit), generator=generator)[:fraction]]
+        hit = hit[torch.randperm(len(hit), generator=generator)[:per_view]]
         pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)[hit]
         rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
-        found.append(cameras.centers_world[view] + depth[hit, None] * rays)
-    points = torch.cat(found)
+        points_of.append(cameras.centers_world[view] + depth[hit, None] * rays)
+    points = torch.cat(points_of)
     return points[torch.randperm(len(points), generator=generator)]
 
 
-def _follow(
+def _tracked(
     scene: RenderedScene, points: Float[Tensor, "point 3"]
 ) -> tuple[Float[Tensor, "point view 2"], Bool[Tensor, "point view"]]:
-    """Project points to all views, and compare their depth with what is seen there.
+    """Project points to all views, and return where the depth maps confirm their depth.
 
-    A point counts as seen when the depths of the 3x3 pixels round it bracket its own and
-    lie on one surface. The rim of an object, and the image's border, are left out.
+    A point is seen if the depths of the 3x3 pixels around it bracket its depth and
+    are on one surface. The rim of an object, and the image's border, are excluded.
     """
     cameras = scene.cameras
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
@@ -97,10 +97,10 @@ def _follow(
                 for du in (-1, 0, 1)
             ]
         ).to(depth)
-        own = depth[view, inside]
-        slack = 1e-4 * own
-        smooth = patch.amax(dim=0) - patch.amin(dim=0) < 0.05 * own
-        bracketed = (own > patch.amin(dim=0) - slack) & (own < patch.amax(dim=0) + slack)
+        z = depth[view, inside]
+        slack = 1e-4 * z
+        smooth = patch.amax(dim=0) - patch.amin(dim=0) < 0.05 * z
+        bracketed = (z > patch.amin(dim=0) - slack) & (z < patch.amax(dim=0) + slack)
         seen[view, inside] = smooth & bracketed
     return pixels.movedim(0, 1), seen.mT
 
@@ -112,17 +112,17 @@ def true_model(
     names: tuple[str, ...],
     generator: torch.Generator,
 ) -> tuple[SparseModel, Float[Tensor, "point channel"]]:
-    """Draw points evenly over a surface and follow them through the photographs.
+    """Sample points uniformly on a surface and track them through the photographs.
 
     Args:
-        blockers: Everything that may stand in front of it.
+        blockers: All surfaces that may occlude it.
 
     Returns:
         Cameras, at most 1,500 points with exact observations, and the points' albedo.
     """
-    points, normals, albedo = _scatter(surface, 6 * 1500, generator)
+    points, normals, albedo = _sampled_surface(surface, 6 * 1500, generator)
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
-    seen = _seen(points, normals, pixels, depth, blockers, cameras)
+    seen = _visible(points, normals, pixels, depth, blockers, cameras)
     fewest = min(3, cameras.num_views)
     (kept,) = torch.nonzero(seen.sum(dim=0) >= fewest, as_tuple=True)
     kept = kept[:1500]
@@ -139,10 +139,10 @@ def true_model(
     return model, albedo[kept]
 
 
-def _scatter(
+def _sampled_surface(
     mesh: Mesh, count: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"], Float[Tensor, "point channel"]]:
-    """Draw points, their faces' normals and their albedo, evenly by area."""
+    """Return points uniform by area, the normals of their faces, and their albedo."""
     assert mesh.albedo is not None
     normals = face_normals(mesh.vertices_world, mesh.faces)
     area = normals.norm(dim=-1).cumsum(dim=0)
@@ -156,7 +156,7 @@ def _scatter(
     return points, normals[face] / normals[face].norm(dim=-1, keepdim=True), albedo
 
 
-def _seen(
+def _visible(
     points: Float[Tensor, "point 3"],
     normals: Float[Tensor, "point 3"],
     pixels: Float[Tensor, "view point 2"],
@@ -165,15 +165,15 @@ def _seen(
     cameras: Cameras,
 ) -> Bool[Tensor, "view point"]:
     caster = RayCaster(blockers.vertices_world, blockers.faces)
-    found = []
+    visible = []
     for view in range(cameras.num_views):
         eye = cameras.centers_world[view]
         toward = eye - points
         distance = toward.norm(dim=-1)
-        # More slanted, features of a surface are not found.
+        # Features are not detected on more slanted surface.
         facing = (normals * toward).sum(dim=-1) > 0.2 * distance
         size = cameras.sizes_px[view].to(pixels)
         framed = (depth[view] > 0) & ((pixels[view] > 1) & (pixels[view] < size - 1)).all(dim=-1)
         hidden = caster.occluded(points, eye, 1e-3 * distance)
-        found.append(facing & framed & ~hidden)
-    return torch.stack(found)
+        visible.append(facing & framed & ~hidden)
+    return torch.stack(visible)

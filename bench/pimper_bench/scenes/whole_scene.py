@@ -1,4 +1,4 @@
-"""A whole scene, ready to be photographed: objects, surroundings, cameras and point lights."""
+"""A complete scene: objects, surroundings, cameras and point lights."""
 
 import math
 from dataclasses import dataclass, replace
@@ -37,18 +37,18 @@ from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.runtime.errors import InputError
 
-# Scene units; an object is about 2.4 large. The wall stands where cameras that look down by 30
-# degrees still see it over the floor.
+# Scene units; an object is about 2.4 large. The wall is visible over the floor for cameras that
+# look down by 30 degrees.
 _THICKNESS, _HALF_SIDE, _BEHIND = 0.12, 9.0, 4.5
 
 
 def rotated_about(
     axis_world: Float[Tensor, " 3"], azimuths: Float[Tensor, " view"]
 ) -> Float[Tensor, "view 4 4"]:
-    """Return ``world_from_room``, where the object and not the camera turns.
+    """Return ``world_from_room`` of a turntable: the object rotates and not the camera.
 
     Args:
-        axis_world: A point of the turntable's axis, which is upright.
+        axis_world: A point of the turntable's axis, which is vertical.
         azimuths: Of the cameras; radians about the world's z, counter-clockwise from -y.
     """
     cosine, sine = azimuths.cos(), azimuths.sin()
@@ -63,8 +63,8 @@ def upside_down(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "4 4"]:
     """Return ``room_from_world`` that turns an object over about the x axis, onto the same table.
 
     Args:
-        points_world: Of the object, which stands on z = 0. The centre of their box stays, when the
-            lowest of them is at 0.
+        points_world: Of the object on z = 0. The centre of their bounding box does not move
+            if the lowest of them is at 0.
     """
     lowest, highest = points_world.aminmax(dim=0)
     shift = (lowest + highest) * points_world.new_tensor([0.0, 1.0, 1.0])
@@ -73,7 +73,7 @@ def upside_down(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "4 4"]:
 
 
 def fixed_light(light_room: Lights, world_from_room: Float[Tensor, "view 4 4"]) -> Lights:
-    """Leave one light at its place in the room.
+    """Fix one light in the room.
 
     Args:
         light_room: One point light; its target is on the axis.
@@ -96,7 +96,7 @@ def turntable(cloth: SceneObject, radius: float) -> SceneObject:
 
 
 def room(generator: torch.Generator) -> tuple[SceneObject, ...]:
-    """Build a patterned floor below the turntable and a patterned wall behind it, both matte."""
+    """Return a patterned floor below the turntable and a patterned wall behind it, both matte."""
     floor = moved(table(_HALF_SIDE, cells=64), shift=(0.0, 0.0, -_THICKNESS))
     upright = floor.vertices_world.new_tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     flat = table(_HALF_SIDE, cells=64)
@@ -119,19 +119,19 @@ def room(generator: torch.Generator) -> tuple[SceneObject, ...]:
     )
 
 
-_PAN, _CROP = 1 << 21, (1 << 21) + 1  # numbers of what shifts photographs; those of noise are less
-_COLOUR = (1 << 21) + 2  # number of the point lights' colours
+_PAN, _CROP = 1 << 21, (1 << 21) + 1  # random streams of the jitter; those of noise are smaller
+_COLOUR = (1 << 21) + 2  # random stream of the point lights' colours
 _WINDOW = (-0.74, -0.47, 0.48)  # direction: left of the cameras, and above
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Everything that photographs are computed from.
+    """All inputs of the rendering.
 
     Attributes:
         name: Of the object, or the path of its mesh.
-        objects: At rest in the world: the object's first, then its table, if that turns along.
-        fixed: Objects that are at rest while the object turns or is turned over, in the room's
+        objects: Static in the world: the object's first, then its table, if that moves with it.
+        fixed: Objects that are static while the object is rotated or turned over, in the room's
             frame: z up from the table's plane, origin on the turntable's axis, camera at -y.
     """
 
@@ -144,7 +144,7 @@ class Scene:
     world_from_room: Float[Tensor, "view 4 4"]
 
     def objects_in(self, view: int) -> tuple[SceneObject, ...]:
-        """Return all objects where one photograph has them."""
+        """Return all objects at their positions in one photograph."""
         return (
             *self.objects,
             *(transferred(item, self.world_from_room[view]) for item in self.fixed),
@@ -153,43 +153,43 @@ class Scene:
     @property
     def names(self) -> tuple[str, ...]:
         """File names of the photographs."""
-        each = self.config.lights_per_pose
-        if each == 1:
+        lights = self.config.lights_per_pose
+        if lights == 1:
             return tuple(f"view_{view:03d}.png" for view in range(self.config.num_views))
-        ends = (divmod(view, each) for view in range(self.config.num_views))
-        return tuple(f"pose_{pose:02d}/light_{light:02d}.png" for pose, light in ends)
+        ends = (divmod(view, lights) for view in range(self.config.num_views))
+        return tuple(f"pose_{pose:02d}/light_{index:02d}.png" for pose, index in ends)
 
     @property
     def object_mesh(self) -> Mesh:
-        """The object alone, with albedo and normals at the vertices."""
+        """The object alone, with vertex albedo and normals."""
         return _dressed([item for item in self.objects if not item.surroundings])
 
     @property
     def surroundings_mesh(self) -> Mesh | None:
-        """The table, if it turns with the object."""
+        """The table, if it moves with the object."""
         around = [item for item in self.objects if item.surroundings]
         return _dressed(around) if around else None
 
     def noise(self, view: int) -> torch.Generator:
-        """Return the random numbers of one photograph, whoever renders it."""
+        """Return the random generator of a photograph, independent of the thread."""
         return _generator(self.config.seed, view)
 
 
 def _generator(seed: int, number: int) -> torch.Generator:
-    """Assign random numbers of their own to each part of a scene."""
+    """Return a separate random generator for each part of a scene."""
     state = np.random.SeedSequence((seed, number)).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 
 
 def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
-    """Put an object on a table, and place cameras and point lights round it.
+    """Place an object on a table, and cameras and point lights around it.
 
     Args:
         name_or_path: ``mug``, ``jar``, ``balls``, ``potatoes``, ``pair``, or the path of a mesh
             file, which is scaled to the size of the others. Its vertex colours are its texture.
 
     Raises:
-        InputError: No such scene and no such file, or a mesh that has no surface.
+        InputError: Neither the scene nor the file exists, or the mesh has no surface.
     """
     generator = torch.Generator().manual_seed(config.seed)
     recipe = RECIPES.get(str(name_or_path))
@@ -198,7 +198,7 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     points = join(*(item.mesh for item in objects)).vertices_world
     if config.turned_over:
         return _turned_over(str(name_or_path), objects, points, config, generator)
-    cameras, lights, target, azimuths = _taken(points, config, generator)
+    cameras, lights, target, azimuths = _views_of(points, config, generator)
     world_from_room = rotated_about(target, azimuths)
     reach = float((points - target)[:, :2].norm(dim=-1).amax())
     turning, fixed = _surroundings(config, generator, target, 1.15 * reach)
@@ -213,17 +213,17 @@ def build_scene(name_or_path: str | Path, config: SceneConfig) -> Scene:
     )
 
 
-_Taken = tuple[Cameras, Lights, Float[Tensor, " 3"], Float[Tensor, " view"]]
-"""Cameras and lights round an object, their target, and the cameras' azimuths."""
+_Placement = tuple[Cameras, Lights, Float[Tensor, " 3"], Float[Tensor, " view"]]
+"""Cameras and lights around an object, their target, and the cameras' azimuths."""
 
 
-def _taken(
+def _views_of(
     points: Float[Tensor, "point 3"], config: SceneConfig, generator: torch.Generator
-) -> _Taken:
-    """Place cameras and lights round an object on the table."""
+) -> _Placement:
+    """Place cameras and lights around an object on the table."""
     lowest, highest = points.amin(dim=0), points.amax(dim=0)
     toward = _toward(config, generator)
-    # A normal to short telephoto lens.
+    # A normal to short telephoto focal length.
     focal_px = 1.6 * config.width
     target, distance = aim_to_fit(
         toward,
@@ -247,27 +247,27 @@ def _turned_over(
     config: SceneConfig,
     generator: torch.Generator,
 ) -> Scene:
-    """Photograph an object on its table, and as often when it was turned over there."""
+    """Place cameras and lights around an object, and again after it was turned over."""
     second = config.num_views // 2
     counts = config.num_views - second, second
     over = upside_down(points)
     rooms = torch.stack([torch.eye(4).to(over), over])
     sessions = [
-        _taken(
+        _views_of(
             transform(room, points), replace(config, num_views=count, turned_over=False), generator
         )
         for room, count in zip(rooms, counts, strict=True)
     ]
     room_from_world = rooms.repeat_interleave(torch.tensor(counts), dim=0)
     world_from_room = invert_rigid(room_from_world)
-    cameras = Cameras.cat([taken[0] for taken in sessions])
-    lights = [taken[1] for taken in sessions]
-    positions = torch.cat([one.positions_world for one in lights])
+    cameras = Cameras.cat([session[0] for session in sessions])
+    lights = [session[1] for session in sessions]
+    positions = torch.cat([light.positions_world for light in lights])
     turned = Lights(
         positions_world=transform(world_from_room, positions[:, None])[:, 0],
-        irradiance=torch.cat([one.irradiance for one in lights]),
-        ambient=torch.cat([one.ambient for one in lights]),
-        target_world=lights[0].target_world,  # the box's centre, which stays where it is
+        irradiance=torch.cat([light.irradiance for light in lights]),
+        ambient=torch.cat([light.ambient for light in lights]),
+        target_world=lights[0].target_world,  # the box's centre, which does not move
     )
     return Scene(
         name=name,
@@ -281,16 +281,16 @@ def _turned_over(
 
 
 def _shifted(cameras: Cameras, config: SceneConfig) -> Cameras:
-    """Pan the cameras and crop their photographs, as the settings say."""
+    """Pan the cameras and crop their photographs by the configured jitter."""
     cameras = panned(cameras, config.pan_jitter_px * _in_disc(config, _PAN))
     return cropped(cameras, config.crop_jitter_px * _in_disc(config, _CROP))
 
 
 def _in_disc(config: SceneConfig, number: int) -> Float[Tensor, "view 2"]:
-    """Draw a point of the unit disc for every photograph, evenly over its area."""
+    """Return a point of the unit disc for every photograph, uniform over its area."""
     generator = _generator(config.seed, number)
-    drawn = torch.rand(config.num_views, 2, generator=generator, dtype=torch.float64)
-    radius, angle = drawn[:, :1].sqrt(), 2 * torch.pi * drawn[:, 1:]
+    samples = torch.rand(config.num_views, 2, generator=generator, dtype=torch.float64)
+    radius, angle = samples[:, :1].sqrt(), 2 * torch.pi * samples[:, 1:]
     return radius * torch.cat([angle.cos(), angle.sin()], dim=1)
 
 
@@ -303,9 +303,9 @@ def _lights(
 ) -> Lights:
     lowest, highest = box
     target = aim * aim.new_tensor(UP) if config.fixed_point_light else (lowest + highest) / 2
-    ahead = torch.zeros_like(azimuths) if config.path == "arc" else azimuths
+    centres = torch.zeros_like(azimuths) if config.path == "arc" else azimuths
     lights = lights_round(
-        torch.zeros_like(azimuths[:1]) if config.fixed_point_light else ahead,
+        torch.zeros_like(azimuths[:1]) if config.fixed_point_light else centres,
         generator,
         distance=config.point_light_distance * float((highest - lowest).amax()),
         target=target,
@@ -319,11 +319,11 @@ def _lights(
 
 
 def _coloured(lights: Lights, config: SceneConfig) -> Lights:
-    """Add the window, and colours whose mean over the channels is 1."""
+    """Add the window, and colours with a mean of 1 over the channels."""
     window = config.window * normalize(torch.tensor(_WINDOW, dtype=torch.float64), dim=0)
     generator = _generator(config.seed, _COLOUR)
-    drawn = torch.randn(len(lights.irradiance), 3, generator=generator, dtype=torch.float64)
-    colour = (config.lamp_colour * drawn).exp()
+    samples = torch.randn(len(lights.irradiance), 3, generator=generator, dtype=torch.float64)
+    colour = (config.lamp_colour * samples).exp()
     return lights.replace(
         window=window if config.window > 0 else None,
         colour=colour / colour.mean(dim=1, keepdim=True) if config.lamp_colour > 0 else None,
@@ -333,7 +333,7 @@ def _coloured(lights: Lights, config: SceneConfig) -> Lights:
 def _surroundings(
     config: SceneConfig, generator: torch.Generator, axis: Float[Tensor, " 3"], radius: float
 ) -> tuple[tuple[SceneObject, ...], tuple[SceneObject, ...]]:
-    """Return what turns with the object, in the world, and what is fixed, in the room."""
+    """Return the surroundings that rotate with the object, in the world, and those in the room."""
     table = TABLES[config.table](generator)
     if not (config.fixed_room or config.fixed_table):
         return (table,), ()
@@ -363,7 +363,7 @@ def _toward(config: SceneConfig, generator: torch.Generator) -> Float[Tensor, "v
 def _finished(item: SceneObject, config: SceneConfig) -> SceneObject:
     specular = item.specular if config.specular is None else config.specular
     roughness = item.roughness if config.roughness is None else config.roughness
-    made = SceneObject(
+    done = SceneObject(
         mesh=item.mesh,
         texture=item.texture if config.albedo is None else Uniform(albedo=config.albedo),
         specular=specular,
@@ -371,18 +371,18 @@ def _finished(item: SceneObject, config: SceneConfig) -> SceneObject:
     )
     origin = item.mesh.vertices_world.new_zeros(3)
     rotation = torch.deg2rad(origin.new_tensor([config.rotation_deg]))
-    return transferred(made, rotated_about(origin, rotation)[0]) if config.rotation_deg else made
+    return transferred(done, rotated_about(origin, rotation)[0]) if config.rotation_deg else done
 
 
 def _read_object(path: str | Path, config: SceneConfig, generator: torch.Generator) -> SceneObject:
     if not Path(path).exists() and isinstance(path, str) and Path(path).suffix == "":
         raise InputError(
-            f"there is no scene {path!r} and no such file. Scenes: {', '.join(RECIPES)}; or give "
+            f"{path!r} is neither a scene nor a file. Use one of {', '.join(RECIPES)}, or "
             "the path of a mesh, such as bunny.ply."
         )
     mesh = read_mesh(path)
     if len(mesh.faces) == 0:
-        raise InputError(f"{path}: holds points without faces; needed: a triangle mesh.")
+        raise InputError(f"{path}: contains points without faces; needed: a triangle mesh.")
     mesh = _placed(mesh, config.up, path)
     if mesh.albedo is not None:
         return SceneObject(mesh=mesh, roughness=0.3)
@@ -390,20 +390,20 @@ def _read_object(path: str | Path, config: SceneConfig, generator: torch.Generat
 
 
 def _placed(mesh: Mesh, up: str, path: str | Path) -> Mesh:
-    """Turn the axis ``up`` to z, scale to the usual size and stand on the table's centre."""
-    first = {"x": 1, "y": 2, "z": 0}[up]  # a cyclic change of axes keeps it right-handed
+    """Rotate the axis ``up`` to z, scale to the usual size and centre the mesh on the table."""
+    first = {"x": 1, "y": 2, "z": 0}[up]  # cyclic permutations keep it right-handed
     order = [first, (first + 1) % 3, (first + 2) % 3]
     vertices = mesh.vertices_world[:, order]
     lowest, highest = vertices.amin(dim=0), vertices.amax(dim=0)
     longest = float((highest - lowest).amax())
     if longest <= 0 or not math.isfinite(longest):
-        raise InputError(f"{path}: all its vertices are at one point; needed: a surface.")
+        raise InputError(f"{path}: all vertices are at one point; needed: a surface.")
     foot = torch.stack([*((lowest + highest) / 2)[:2], lowest[2]])
     vertices = (vertices - foot) * (2.4 / longest)
-    # OBJ knows normals of corners; read one a vertex, those of flat faces contradict the shape.
-    # Averaged from the faces instead, over vertices that a seam of the texture doubles, too.
-    positions, own = torch.unique(vertices, dim=0, return_inverse=True)
-    normals = vertex_normals(positions, own[mesh.faces])[own]
+    # OBJ has normals per corner; reduced to one per vertex, those of flat faces contradict the
+    # shape. They are computed from the faces instead, also across duplicated vertices of seams.
+    positions, index = torch.unique(vertices, dim=0, return_inverse=True)
+    normals = vertex_normals(positions, index[mesh.faces])[index]
     return mesh.replace(vertices_world=vertices, normals_world=normals)
 
 

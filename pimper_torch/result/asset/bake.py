@@ -65,7 +65,7 @@ def textured(
     values = torch.cat([carried_normals(full), colors, uncertainty[:, None]], dim=1)
     caster, texel_faces = RayCaster(full.vertices_world, full.faces), _texel_faces(atlas)
     face_normals = surfaces.unit_face_normals(full.vertices_world, full.faces)
-    # The simplified mesh is off by far less than its sides; a surface farther away is another part.
+    # The simplified mesh is off by far less than its sides; a surface farther away is unrelated.
     reach = surfaces.side_lengths(few.vertices_world[few.faces]).median()
     carried = mesh.vertices_world[:, :0] if reflectance is None else reflectance[atlas.vertex]
 

@@ -44,7 +44,7 @@ def plot_patch(
             largest residual.
 
     Raises:
-        InputError: The record does not have exactly one patch; the views are of another patch; the
+        InputError: The record does not have exactly one patch; the views are of a different patch; the
             sample is not valid in any view.
     """
     if len(patch) != 1:
@@ -97,7 +97,9 @@ def _draw_light(
     difference = residual[:, row, column].cpu()
     (valid_views,) = torch.nonzero(difference.isfinite(), as_tuple=True)
     if not len(valid_views):
-        raise InputError(f"plot_patch: sample {sample} is not valid in any view; choose another.")
+        raise InputError(
+            f"plot_patch: sample {sample} is not valid in any view; choose a different one."
+        )
     observed = views.gray[0, valid_views.to(views.valid.device), row, column].detach().cpu()
     numbers = templates.rows(len(difference)).cpu()[valid_views].numpy()
     axes.plot(numbers, observed.numpy(), "k.", label="observed")

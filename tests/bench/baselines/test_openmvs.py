@@ -132,11 +132,13 @@ def test_every_missing_program_is_named_before_anything_runs(reconstruction, tri
 
 def test_a_step_that_leaves_nothing_is_named(reconstruction, triangle, tmp_path):
     install(tmp_path, triangle, finds=False)
-    with pytest.raises(ReconstructionError, match=r"ReconstructMesh ended .* left no scene_dense"):
+    with pytest.raises(ReconstructionError, match=r"ReconstructMesh .* did not write scene_dense"):
         OpenMvs()(reconstruction.scene, reconstruction.coarse)
     (tmp_path / "bin" / "DensifyPointCloud").write_text(f"#!{sys.executable}\nprint('too dark')")
     (tmp_path / "seen").rename(tmp_path / "before")
-    with pytest.raises(ReconstructionError, match=r"(?s)DensifyPointCloud ended.*too dark"):
+    with pytest.raises(
+        ReconstructionError, match=r"(?s)DensifyPointCloud .* did not write.*too dark"
+    ):
         OpenMvs()(reconstruction.scene, reconstruction.coarse)
 
 

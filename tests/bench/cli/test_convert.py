@@ -66,7 +66,7 @@ def test_a_set_goes_to_every_layout_and_comes_back_the_same(
     assert_close(after.cameras.cam_from_world, before.cameras.cam_from_world)
     printed = capsys.readouterr().out
     assert "3 photographs of 12 x 9 from 3 positions" in printed
-    assert f"as {target}" in printed
+    assert f"in the layout {target}" in printed
 
 
 def test_options_reach_the_reader_and_the_writer(converted, tmp_path):
@@ -83,8 +83,8 @@ def test_options_reach_the_reader_and_the_writer(converted, tmp_path):
 @pytest.mark.parametrize(
     ("source", "options", "told"),
     [
-        ("transforms", ["--light-seed", 0], "--light-seed: the reader of transforms does not know"),
-        ("rendered", ["--photographs.black", 2], "--photographs.black: the reader of rendered"),
+        ("transforms", ["--light-seed", 0], "--light-seed: not supported for --source transforms"),
+        ("rendered", ["--photographs.black", 2], "--photographs.black: not supported for --source"),
         ("dtu-mvs", [], "--scan with a number"),
         ("llff", [], r"not the layout of an LLFF set"),
     ],

@@ -34,7 +34,7 @@ def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
     larger = write_ball(tmp_path / "larger.ply", 1.1)
     assert run(larger, ball, "--samples", 3000) == 0
     told = capsys.readouterr().out
-    assert "none: the frames are taken for the same" in told
+    assert "none: the frames are assumed to be the same" in told
     # Facets of a ball of 1280 faces lie a little under it.
     (line,) = [line for line in told.splitlines() if line.split()[:1] == ["accuracy"]]
     assert float(line.split()[1]) == pytest.approx(0.1, rel=0.03)
@@ -180,13 +180,13 @@ def test_views_of_a_set_are_paired_by_position_whatever_their_light(ball):
 @pytest.mark.parametrize(
     ("result", "truth", "options", "words"),
     [
-        ("ball.ply", "ball.ply", ["--alignment", "cameras"], "needed: two at least"),
+        ("ball.ply", "ball.ply", ["--alignment", "cameras"], "needed: at least two"),
         ("ball.ply", "ball.ply", ["--trimmed-fraction", "1.5"], "trimmed_fraction is 1.5"),
         ("ball.ply", "ball.ply", ["-o", "."], "is no ordinary file"),
         ("ball.ply", "ball.ply", ["-o", "nowhere/report.json"], "its folder is not there"),
         ("ball.ply", "empty", [], "is a folder without truth/;"),
         ("empty", "ball.ply", [], "holds no mesh.ply"),
-        ("ball.ply", "away.ply", [], "found nothing"),
+        ("ball.ply", "away.ply", [], "does not exist"),
         ("ball.ply", "empty", ["--truth-layout", "dtu-mvs"], "--scan with the number of one"),
     ],
 )

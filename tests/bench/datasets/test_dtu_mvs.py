@@ -95,7 +95,7 @@ def _camera_of(text):
             lambda folder: (folder / "Calibration" / "cal18").rename(folder / "Cameras"),
             read_dtu_mvs,
             9,
-            r"cal18/pos_001\.txt and so on",
+            r"cal18/pos_001\.txt and others",
         ),
         (lambda folder: None, read_dtu_mvs, 2, r"Rectified/scan2.*Found: Calibration"),
         (

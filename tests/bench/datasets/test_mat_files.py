@@ -45,10 +45,10 @@ def test_what_says_too_much_is_refused_before_memory_is_taken(tmp_path, monkeypa
     data = path.read_bytes()
     at = data.index(struct.pack("<2I2i", 5, 8, 3, 5))
     wrong = [
-        (data[:at] + struct.pack("<2I2i", 5, 8, 2**30, 2**30) + data[at + 16 :], "its shape is"),
-        (data[:132] + struct.pack("<I", 2**32 - 1) + data[136:], "cut short"),
-        (data[:-8], "cut short"),
-        (b"", "no MATLAB file"),
+        (data[:at] + struct.pack("<2I2i", 5, 8, 2**30, 2**30) + data[at + 16 :], "has the shape"),
+        (data[:132] + struct.pack("<I", 2**32 - 1) + data[136:], "truncated"),
+        (data[:-8], "truncated"),
+        (b"", "not a MATLAB file"),
         (data[:124] + b"\0\2IM" + data[128:], "7.3"),
     ]
     tracemalloc.start()

@@ -125,7 +125,7 @@ def test_distortions_are_read(save, lens_of, kind, params, x, y):
         ({"intrinsic": NEW | NO_PINHOLE}, "leaves no pinhole"),
         ({"intrinsic": {"principalPoint": ["1", "1"]}}, "focalLength of an intrinsic"),
         ({"view": {"rigId": "1", "isPoseIndependant": "false"}}, "a pose in a rig"),
-        ({"view": {"path": "/x/d.png"}}, r"one photograph called d\.png"),
+        ({"view": {"path": "/x/d.png"}}, r"one photograph named d\.png"),
         ({"poses": [{"poseId": "7"}]}, "pose.transform for a.png"),
         ({"poses": [{"poseId": "1", "pose": POSE}]}, "views with a pose"),
         ({"poses": []}, "a list of objects as poses"),

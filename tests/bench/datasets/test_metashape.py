@@ -140,7 +140,7 @@ def test_of_several_components_the_largest_is_read(save):
 def test_a_label_without_a_photograph_is_refused(save):
     folder = save()
     (folder / "images" / "a.png").unlink()
-    with pytest.raises(InputError, match=r"one photograph called a.*b\.png"):
+    with pytest.raises(InputError, match=r"one photograph named a.*b\.png"):
         read_camera_file(folder)
 
 

@@ -179,10 +179,10 @@ def _black(path):
         (
             [{}],
             {"names": ["d.png"]},
-            r"asked for d\.png; needed: some of its 1 photographs.*a\.png",
+            r"d\.png requested; needed: any of its 1 photographs.*a\.png",
         ),
-        ([{}], {"names": []}, r"asked for no photographs; needed: some of its 1 photographs"),
-        ([{}], {"names": ["a.png", "a.png"]}, r"asked for a\.png, a\.png; needed.*each once"),
+        ([{}], {"names": []}, r"no photographs requested; needed: any of its 1 photographs"),
+        ([{}], {"names": ["a.png", "a.png"]}, r"a\.png, a\.png requested; needed.*each once"),
         ([{}], {"max_size_px": -1}, "max_size_px is -1"),
         ([{}, {}], {}, r"several a\.png"),
         ([{"width": 12, "height": 16}], {}, "12 x 16, but its camera is for 16 x 12"),

@@ -35,7 +35,7 @@ DIFFERENCES = [
     (by(Y_UP.mT), ["They fit if x, y, z of the truth are x, z, -y of the result."]),
     (
         by(0.01 * Y_UP.mT, (3.0, 0.0, 0.0)),
-        ["100 times larger (metres and centimetres?)", "x, z, -y of the result", "moved by (-300"],
+        ["by a factor of 100 (metres and centi", "x, z, -y of the result", "moved by (-300"],
     ),
 ]
 
@@ -47,7 +47,7 @@ def test_other_units_axes_and_places_are_refused_with_the_guess(
     estimate = Estimate(mesh=make.moved(truth, result_from_truth))
     with pytest.raises(InputError) as refused:
         evaluate(estimate, make.capture_of(truth), EvaluateConfig(**FEW))
-    for part in (*told, "`--alignment icp` begins with that"):
+    for part in (*told, "`--alignment icp` starts from that"):
         assert part in str(refused.value)
 
 
@@ -65,7 +65,7 @@ def test_icp_begins_with_the_guess_and_finds_the_truth(make, truth, result_from_
 
 def test_what_is_apart_without_a_guess_is_refused_and_does_not_keep_searching(make, truth):
     elsewhere = make.moved(make.half_sphere(level=6), by(IDENTITY, (1e5, 1e5, 0.0)))
-    with pytest.raises(InputError, match=r"centres are 1\.414e\+05 apart\. Move the result"):
+    with pytest.raises(InputError, match=r"centres are 1\.414e\+05 apart\. Transform the result"):
         evaluate(Estimate(mesh=elsewhere), make.capture_of(truth), EvaluateConfig())
 
 
@@ -99,9 +99,9 @@ QUARTER = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64
 @pytest.mark.parametrize(
     ("turns", "told"),
     [
-        (QUARTER, "turned about their optical axes by 90 degrees in the median. Has one photo"),
+        (QUARTER, "turned about their optical axes by 90 degrees in the median. Does one have"),
         (QUARTER @ QUARTER, "turned about their optical axes by 180 degrees"),
-        (AROUND, "they look the opposite way. Has one the axes of OpenGL"),
+        (AROUND, "their axes are opposite. Does one have OpenGL's axes"),
     ],
 )
 def test_cameras_that_disagree_by_their_rolls_are_refused(make, truth, turns, told):
@@ -114,7 +114,9 @@ def test_cameras_that_disagree_by_their_rolls_are_refused(make, truth, turns, to
     assert told in str(refused.value)
     assert "`--alignment icp` begins without their rolls" in str(refused.value)
     for method in ("icp", "none"):
-        with pytest.warns(PimperWarning, match="agree in their places"):
+        with pytest.warns(
+            PimperWarning, match="positions of the cameras of result and truth agree"
+        ):
             found = evaluate(estimate, capture, EvaluateConfig(alignment=method, **FEW))
         assert found.surface.whole.chamfer_mean_percent < 0.01
         assert found.cameras is None

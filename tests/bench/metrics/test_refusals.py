@@ -50,7 +50,7 @@ def _aligned(make, capture, method):
         (lambda make: TrueSurface(make.capture(Truth())), "neither a mesh nor points"),
         (lambda make: _aligned(make, make.capture(Truth()), "icp"), "neither a mesh nor points"),
         (lambda make: sample_surface(FLAT, 10, torch.Generator()), "degenerate"),
-        (_table_alone, "lies on the surroundings"),
+        (_table_alone, "on the surroundings"),
         (_elsewhere, "Check the frame"),
         (
             lambda make: dtu_figures(ball(), LARGE + 1e3, PROTOCOL, torch.Generator()),

@@ -71,8 +71,8 @@ def _mirrored(cameras):
 @pytest.mark.parametrize(
     ("cameras", "told"),
     [
-        (lambda: (_arc(2).take([0, 0]), _arc(2)), "nothing tells the scale"),
-        (lambda: _mirrored(_arc(5)), "nothing in common"),
+        (lambda: (_arc(2).take([0, 0]), _arc(2)), "scale is undetermined"),
+        (lambda: _mirrored(_arc(5)), "do not correspond"),
         (lambda: (_arc(2), _arc(3)), "2 cameras and 3 true ones"),
     ],
 )

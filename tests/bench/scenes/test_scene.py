@@ -195,7 +195,7 @@ BEFORE = ("fixed_point_light", "fixed_room", "fixed_table")
         ({"num_views": 8, "lights_per_pose": 3}, "lights_per_pose is 3"),
         ({"num_views": 8, "lights_per_pose": 2, "crop_jitter_px": 1.0}, "lights_per_pose is 2"),
         ({"elevation_deg": 3.0}, "elevation_deg is 3.0"),
-        ({"irradiance": 0.0, "ambient": 0.0}, "some light"),
+        ({"irradiance": 0.0, "ambient": 0.0}, "light from irradiance"),
         ({"point_light_distance": 0.5}, "point_light_distance is 0.5"),
         ({"exposure": 0.0}, "exposure is 0.0"),
         ({"supersample": 0}, "supersample is 0"),
@@ -207,7 +207,7 @@ BEFORE = ("fixed_point_light", "fixed_room", "fixed_table")
         ),
         (
             {"path": "turntable", "turned_over": True, "fixed_room": True},
-            "turned_over is True; needed: 2 views or more",
+            "turned_over is True; needed: at least 2 views",
         ),
         (
             {"width": 80, "height": 60, "pan_jitter_px": 9.0, "crop_jitter_px": 10.0},
