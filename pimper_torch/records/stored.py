@@ -85,7 +85,7 @@ def load_record(cls: type[AnyRecord], path: str | Path) -> AnyRecord:
         The record, on the CPU.
 
     Raises:
-        InputError: The file does not exist, is damaged, has a different format, or contains a record
+        InputError: The file does not exist, is damaged, has a wrong format, or contains a record
             other than ``cls`` as its fields are annotated.
     """
     return load_with_metadata(cls, path)[0]

@@ -151,7 +151,7 @@ def image_files(folder: DataSetPath) -> list[Path]:
 def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path | None]:
     """Return a function that finds the mask of a photograph in a folder.
 
-    A mask has the photograph's name with a different suffix, or with ``.png`` appended as for COLMAP
+    A mask has the photograph's name with any suffix, or with ``.png`` appended as for COLMAP
     (``17.jpg.png``), or its name continues with ``-``, ``_`` or a dot (``17-mask.png``).
 
     Raises:
@@ -169,8 +169,8 @@ def mask_finder(folder: Path | str | None, kind: str) -> Callable[[Path], Path |
         longer = [path for path in paths if path.name.startswith((f"{stem}-", f"{stem}_"))]
         matches = exact or longer
         listed = some([path.name for path in matches or paths])
-        one = len(matches) == 1
-        directory.expect(one, f"one mask for {photograph.name}, such as {stem}.png", listed)
+        unique = len(matches) == 1
+        directory.expect(unique, f"one mask for {photograph.name}, such as {stem}.png", listed)
         return matches[0]
 
     return find

@@ -280,7 +280,7 @@ def meet_truth(mesh: Mesh, capture: Capture, view: int) -> Meeting | None:
     met = without_surroundings(met, capture.truth)
     if not met.both.any():
         raise InputError(
-            f"view {capture.views.names[view]}: all rays through the object meet the mesh on the "
+            f"view {capture.views.names[view]}: rays through the object meet the mesh only on the "
             "surroundings. Check that the mesh contains the object."
         )
     return met

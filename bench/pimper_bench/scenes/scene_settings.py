@@ -155,7 +155,7 @@ class SceneConfig:
         on_axis = self.path == "turntable"
         turning = f"path turntable instead of {self.path}, for anything fixed to the camera"
         widest = 0.3 * min(self.width, self.height)
-        jitter = f"0 or more, and together at most {widest:.0f}, 0.3 of the tighter side"
+        jitter = f"0 or more, both jitters together at most {widest:.0f}, 0.3 of the tighter side"
         for valid, name, needed in (
             (
                 self.supersample <= rays,

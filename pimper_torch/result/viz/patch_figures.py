@@ -44,7 +44,7 @@ def plot_patch(
             largest residual.
 
     Raises:
-        InputError: The record does not have exactly one patch; the views are of a different patch; the
+        InputError: The record has several patches or none; the views are of a different patch; the
             sample is not valid in any view.
     """
     if len(patch) != 1:

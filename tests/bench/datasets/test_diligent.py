@@ -109,7 +109,7 @@ def _saying(name, text):
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
-        (lambda folder: (folder / "view_02" / "mask.png").unlink(), r"mask\.png: there is no"),
+        (lambda folder: (folder / "view_02" / "mask.png").unlink(), r"mask\.png: does not exist"),
         (_saying("view_02/light_directions.txt", "1 0 0\n"), r"view_02: .*Found: 1, 1 and 3"),
         (_saying("view_01/filenames.txt", "../a 002.png 003.png"), r"'\.\./a', which leads out"),
         (lambda folder: (folder / "Calib_Results.mat").unlink(), r"Calib_Results\.mat"),

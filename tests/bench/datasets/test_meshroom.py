@@ -122,7 +122,7 @@ def test_distortions_are_read(save, lens_of, kind, params, x, y):
         ({"intrinsic": NEW | {"focalLength": "-1"}}, "a positive focal length"),
         ({"intrinsic": NEW | {"focalLength": "1e308"}}, "a positive focal length"),
         ({"intrinsic": NEW | {"sensorWidth": "0"}}, "a positive focal length"),
-        ({"intrinsic": NEW | NO_PINHOLE}, "leaves no pinhole"),
+        ({"intrinsic": NEW | NO_PINHOLE}, "gives no pinhole"),
         ({"intrinsic": {"principalPoint": ["1", "1"]}}, "focalLength of an intrinsic"),
         ({"view": {"rigId": "1", "isPoseIndependant": "false"}}, "a pose in a rig"),
         ({"view": {"path": "/x/d.png"}}, r"one photograph named d\.png"),

@@ -115,8 +115,8 @@ def _saying(name, **changes):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (_without("photos/view_001.png"), r"photos/view_001\.png: there is no such file"),
-        (_without("masks/view_001.png"), r"masks/view_001\.png: there is no such file"),
+        (_without("photos/view_001.png"), r"photos/view_001\.png: does not exist"),
+        (_without("masks/view_001.png"), r"masks/view_001\.png: does not exist"),
         (_without("truth/maps/view_001.npz"), r"a file view_001\.npz"),
         (_without("truth/lights.json"), r"truth: .*a file lights\.json"),
         (_without("truth/scene.json"), r"truth: .*a file scene\.json"),

@@ -27,9 +27,9 @@ def truth(make):
 
 
 DIFFERENCES = [
-    (by(0.001 * IDENTITY), ["made 1000 times larger (metres and millimetres?)."]),
-    (by(1000 * IDENTITY), ["made 1000 times smaller (metres and millimetres?)."]),
-    (by(25.4 * IDENTITY), ["made 25.4 times smaller (inches and millimetres?)."]),
+    (by(0.001 * IDENTITY), ["enlarged by a factor of 1000 (metres and millimetres?)."]),
+    (by(1000 * IDENTITY), ["reduced by a factor of 1000 (metres and millimetres?)."]),
+    (by(25.4 * IDENTITY), ["reduced by a factor of 25.4 (inches and millimetres?)."]),
     (by(IDENTITY, (40.0, 0.0, -5.0)), ["They fit if the result is moved by (-40, ", ", 5"]),
     (by(IDENTITY, (1e5, 0.0, 0.0)), ["moved by (-1e+05, "]),
     (by(Y_UP.mT), ["They fit if x, y, z of the truth are x, z, -y of the result."]),
@@ -112,7 +112,7 @@ def test_cameras_that_disagree_by_their_rolls_are_refused(make, truth, turns, to
     with pytest.raises(InputError) as refused:
         evaluate(estimate, capture, EvaluateConfig(**FEW))
     assert told in str(refused.value)
-    assert "`--alignment icp` begins without their rolls" in str(refused.value)
+    assert "`--alignment icp` starts without their rolls" in str(refused.value)
     for method in ("icp", "none"):
         with pytest.warns(
             PimperWarning, match="positions of the cameras of result and truth agree"

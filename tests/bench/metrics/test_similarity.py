@@ -85,7 +85,7 @@ def test_views_are_paired_by_name():
     ours, truth = pair_views(["c", "a", "x"], ["a", "b", "c"])
     assert ours.tolist() == [0, 1]
     assert truth.tolist() == [2, 0]
-    with pytest.raises(InputError, match="the same names in both"):
+    with pytest.raises(InputError, match="Use the same names for the photographs"):
         pair_views(["p"], ["q"])
 
 
