@@ -121,7 +121,7 @@ class OverPatches(Record):
 
     @property
     def _templates(self) -> "PatchSet":
-        return self.patches  # type: ignore[attr-defined, no-any-return]
+        return self.patches  # type: ignore[attr-defined]
 
     def of_facets(self: AnyPatches, facets: Bool[Tensor, " facet"]) -> AnyPatches:
         """Return the patches of some facets; patches keep their facet numbers."""

@@ -174,9 +174,9 @@ def columns(rows: Sequence[BenchRow]) -> dict[str, list[Column]]:
     fields = dataclasses.fields(BenchRow)
     listed = [column(field.name, **field.metadata) for field in fields if field.metadata]
     listed += map(f_score, sorted({threshold for row in rows for threshold, _ in row.f_scores}))
-    known = [column for column in listed if any(_is_known(column.value(row)) for row in rows)]
+    filled = [column for column in listed if any(_is_known(column.value(row)) for row in rows)]
     parts = (_COST, _RAYS, _COMMON, _SURFACE)
-    return {part: [column for column in known if column.part == part] for part in parts}
+    return {part: [column for column in filled if column.part == part] for part in parts}
 
 
 def cell(value: int | float | None, decimals: int) -> str:

@@ -147,8 +147,8 @@ def facing_us(normals: Float[Tensor, "height width 3"]) -> Float[Tensor, "height
     Zero where unknown: not finite, or shorter than 0.5, as on a background.
     """
     rotated = normals.nan_to_num(0) * FLIP.float()
-    known = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > 0.5
-    return torch.where(known, normalize(rotated, dim=-1), 0)
+    valid = normals.nan_to_num(0).norm(dim=-1, keepdim=True) > 0.5
+    return torch.where(valid, normalize(rotated, dim=-1), 0)
 
 
 def _rows_of_three(file: DataSetPath) -> Float[Tensor, "row 3"]:

@@ -160,9 +160,9 @@ def read_toolbox_projections(
     def shaped(name: str, *shape: int) -> Float[Tensor, "..."]:
         array = arrays[name]
         fits = array.shape == shape or (1 in shape and array.size == max(shape))
-        expected, found = (" x ".join(map(str, sides)) for sides in (shape, array.shape))
+        expected, actual = (" x ".join(map(str, sides)) for sides in (shape, array.shape))
         needed = f"{name} as finite numbers of shape {expected}"
-        file.expect(fits and bool(np.isfinite(array).all()), needed, f"shape {found}")
+        file.expect(fits and bool(np.isfinite(array).all()), needed, f"shape {actual}")
         return torch.from_numpy(array.astype(np.float64).reshape(shape))
 
     if "KK" in arrays:

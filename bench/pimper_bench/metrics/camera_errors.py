@@ -55,11 +55,11 @@ def compare_lights(
     """
     ours = lights[:, 1:].cpu().double() @ rotation.cpu().double().mT
     truth = lights_true[:, 1:].cpu().double()
-    known = (ours.norm(dim=1) > 0) & (truth.norm(dim=1) > 0)
-    known &= ours.isfinite().all(dim=1) & truth.isfinite().all(dim=1)
-    if not bool(known.any()):
+    valid = (ours.norm(dim=1) > 0) & (truth.norm(dim=1) > 0)
+    valid &= ours.isfinite().all(dim=1) & truth.isfinite().all(dim=1)
+    if not bool(valid.any()):
         return None
-    ours, truth = normalize(ours[known], dim=1), normalize(truth[known], dim=1)
+    ours, truth = normalize(ours[valid], dim=1), normalize(truth[valid], dim=1)
     joint = similarity.nearest_rotation(truth.mT @ ours)
     plain, rotated = angles_deg(ours, truth), angles_deg(ours @ joint.mT, truth)
     return LightFigures(
@@ -68,7 +68,7 @@ def compare_lights(
         mean_rotated_deg=float(rotated.mean()),
         median_rotated_deg=float(rotated.median()),
         rotation_deg=float(similarity.rotation_angles_deg(joint)),
-        lights=int(known.sum()),
+        lights=int(valid.sum()),
     )
 
 

@@ -101,11 +101,11 @@ def compare_albedo(
     ours, truth = albedo.cpu().double(), albedo_true.cpu().double()
     if ours.shape[1] != truth.shape[1]:
         ours, truth = ours.mean(dim=1, keepdim=True), truth.mean(dim=1, keepdim=True)
-    known = ours.isfinite().all(dim=1) & truth.isfinite().all(dim=1)
-    known &= (ours.sum(dim=1) > 0) & (truth.sum(dim=1) > 0)
-    if not bool(known.any()):
+    valid = ours.isfinite().all(dim=1) & truth.isfinite().all(dim=1)
+    valid &= (ours.sum(dim=1) > 0) & (truth.sum(dim=1) > 0)
+    if not bool(valid.any()):
         return None
-    ours, truth = ours[known], truth[known]
+    ours, truth = ours[valid], truth[valid]
     scale = (ours * truth).sum() / ours.square().sum()
     channel_scales = (ours * truth).sum(dim=0) / ours.square().sum(dim=0).clamp_min(1e-300)
     positive = (ours > 0) & (truth > 0)
@@ -330,12 +330,12 @@ def _angles(met: Meeting, normals: Float[Tensor, "vertex 3"] | None) -> AngleFig
     if normals is None or met.normals_true is None:
         return None
     ours, truth = met.interpolate(normals).double(), met.normals_true.double()
-    known = (truth.norm(dim=1) > 0) & (ours.norm(dim=1) > 0)
-    if not bool(known.any()):
+    valid = (truth.norm(dim=1) > 0) & (ours.norm(dim=1) > 0)
+    if not bool(valid.any()):
         return None
-    angles = angles_deg(normalize(ours[known], dim=1), normalize(truth[known], dim=1))
+    angles = angles_deg(normalize(ours[valid], dim=1), normalize(truth[valid], dim=1))
     where = met.both.clone()
-    where[met.both] = known
+    where[met.both] = valid
     error = torch.zeros(where.shape, dtype=angles.dtype, device=angles.device)
     error[where] = angles
     return AngleFigures(

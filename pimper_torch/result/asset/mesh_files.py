@@ -31,8 +31,8 @@ class MeshFiles:
     cameras: bool = False
 
     def __post_init__(self) -> None:
-        few = self.faces is not None and self.faces != "all" and self.faces < 4
-        require(not few, "faces", self.faces, "all, or at least 4, a tetrahedron's")
+        too_few = self.faces is not None and self.faces != "all" and self.faces < 4
+        require(not too_few, "faces", self.faces, "all, or at least 4, a tetrahedron's")
         if "usdz" in self.formats and find_spec("pxr") is None:
             raise ConfigError(
                 "USDZ needs usd-core, which is not installed: pip install 'pimper_torch[usd]'."
