@@ -33,8 +33,8 @@ STOPPED: set[Path] = set()
 # What a child runs: it ends when its parent does, and then is `pimper`.
 _CHILD = """
 import faulthandler, sys
-from pimper_torch.cli.supervise import die_with
-die_with(int(sys.argv[1]))
+from pimper_torch.cli.supervise import exit_with_parent
+exit_with_parent(int(sys.argv[1]))
 del sys.argv[1]
 faulthandler.enable()
 from pimper_torch.cli.main import main
