@@ -400,7 +400,7 @@ def costs_of(found: Mapping[str, Any]) -> list[Cost]:
     return [Cost(**cost) for cost in found["costs"]]
 
 
-def gather_samples(found: Mapping[str, Any], scales: bool = False) -> list[Cost]:
+def cost_rows(found: Mapping[str, Any], scales: bool = False) -> list[Cost]:
     """Return the stages, all of them, and all after structure from motion."""
     costs = costs_of(found)
     names = [cost.stage for cost in costs]
@@ -424,7 +424,7 @@ def print_table(found: Mapping[str, Any], scales: bool) -> None:
         f"{found['machine']['cpu']}, {cores} cores; copies {floors['copy_gb_per_s']:.1f} GB/s, "
         f"batched products {floors['batched_product_gflop_per_s']:.1f} GFLOP/s.\n"
     )
-    rows = gather_samples(found, scales)
+    rows = cost_rows(found, scales)
     table(("stage", *COLUMNS), [[row.stage, *row.cells(cores)] for row in rows])
     left = found["clock_seconds"] - rows[-1].seconds
     aside = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found["aside"].items())
@@ -436,10 +436,10 @@ def print_table(found: Mapping[str, Any], scales: bool) -> None:
 
 def print_ratios(found: Mapping[str, Any], earlier: Mapping[str, Any]) -> None:
     """Print each stage's figures over those of an earlier run."""
-    before = {row.stage: row for row in gather_samples(earlier)}
+    before = {row.stage: row for row in cost_rows(earlier)}
     names = ("seconds", "cpu_seconds", "page_faults", "peak_mb")
     rows = []
-    for row in gather_samples(found):
+    for row in cost_rows(found):
         was = before.get(row.stage)
         pairs = [(getattr(row, name), getattr(was, name)) for name in names] if was else []
         rows.append([row.stage, *(number(now / old if old else math.nan) for now, old in pairs)])
@@ -454,7 +454,7 @@ def print_scaling(runs: Sequence[Mapping[str, Any]]) -> None:
     cores = runs[0]["machine"]["cores"]
     say(f"\nSamples in views: {', '.join(f'{count:,.0f}' for count in samples)}; most patches: ")
     say(f"{', '.join(f'{count:,.0f}' for count in patches)}; {cores} cores.\n")
-    tables = [{row.stage: row for row in gather_samples(run)} for run in runs]
+    tables = [{row.stage: row for row in cost_rows(run)} for run in runs]
     rows = []
     for stage in tables[-1]:
         row = [rows_of_run[stage] for rows_of_run in tables if stage in rows_of_run]
