@@ -18,9 +18,9 @@ PACKAGE = Path(pimper_torch.__file__).parent
 BENCH = Path(pimper_bench.__file__).parent
 ROOT = Path(__file__).parents[1]
 
-# A room imports from rooms above it in this list: the core never from the wing, which comes last
-# (the command line names its verbs there, and imports one when it is called). viz stands above io,
-# which draws the contact sheet of a result with it.
+# A subpackage imports from those above it in this list. The last line has the optional ones: the
+# command line names their verbs, and imports one when it is called. viz is above io, which draws
+# the contact sheet of a result with it.
 ROOMS = [
     *("journal", "errors", "renamed", "mapped", "config", "progress", "cores", "file_names"),
     *("user_cache", "scratch"),
@@ -34,7 +34,7 @@ ROOMS = [
 
 FLOORS = {"runtime", "ground", "method", "priors", "result", "doors", "cli"}
 
-# The method: no step imports another one's room.
+# The method: no step imports from another step.
 STEPS = {"sfm", "silhouettes", "coarse", "patches", "photometry", "sweep", "fusion", "meshing"}
 
 SOLE_IMPORTERS = {
@@ -61,7 +61,7 @@ SOLE_IMPORTERS = {
     "submitit": {"cli/batches/engines.py"},
 }
 
-# Where a distribution's module has another name.
+# Modules with a different name than their distribution.
 MODULES = {
     "pyyaml": "yaml",
     "pillow": "PIL",
@@ -84,14 +84,14 @@ def files_of_both() -> list[Path]:
 
 
 def named(path: Path) -> str:
-    """Name a file of the package by its room, one of the other by the package, too."""
+    """Return a file's path within this package, or with its package for the other one."""
     inside = path.is_relative_to(PACKAGE)
     return path.relative_to(PACKAGE if inside else BENCH.parent).as_posix()
 
 
 @cache
 def imports(path: Path) -> frozenset[str]:
-    """Every module a file imports, inside functions too."""
+    """Return all modules that a file imports, including imports inside functions."""
     return frozenset(_imports(path))
 
 
@@ -105,7 +105,7 @@ def _imports(path: Path) -> Iterator[str]:
 
 
 def room(parts: Sequence[str]) -> str:
-    """Name the room that a file or module is in: on a floor, or by itself."""
+    """Return the subpackage of a file or module, inside a layer or at the top."""
     first, second, *_ = (*parts, "")
     return second if first in FLOORS and second in ROOMS else first
 
@@ -130,7 +130,7 @@ def test_imports_point_only_upward(path):
             assert not {other, room_of(path)} <= STEPS or other == room_of(path), module
 
 
-def test_few_entries_stand_at_the_top():
+def test_the_top_folder_has_few_entries():
     sources = (path for path in PACKAGE.rglob("*") if path.is_file() and path.suffix != ".pyc")
     found = {path.relative_to(PACKAGE).parts[0] for path in sources} - {"__pycache__", "configs"}
     assert len(found) <= 16, sorted(found)
@@ -148,7 +148,7 @@ def test_a_boundary_is_crossed_in_one_place(package):
     assert all(any(path.startswith(owner) for owner in owners) for path in found), found
 
 
-def test_least_squares_repeat_bit_for_bit():
+def test_least_squares_are_reproducible_bit_for_bit():
     """LAPACK's gelsy, the default, gives other bits at every call."""
     calls = [
         (path, ast.unparse(node))
@@ -165,7 +165,7 @@ def project(folder: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("package", [PACKAGE, BENCH], ids=lambda package: package.name)
-def test_whatever_is_imported_is_declared(package):
+def test_every_imported_package_is_declared(package):
     declaring = project(ROOT if package == PACKAGE else ROOT / "bench")
     extras = declaring.get("optional-dependencies", {})
     needed = [entry for name in extras for entry in extras[name] if name not in ("test", "docs")]
@@ -177,7 +177,7 @@ def test_whatever_is_imported_is_declared(package):
     assert used - set(sys.stdlib_module_names) - {package.name} <= declared
 
 
-def test_one_version_stands_in_both_distributions_the_changelog_and_the_citation():
+def test_distributions_changelog_and_citation_have_one_version():
     version = project(ROOT)["version"]
     headings = re.findall(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
     assert next(one for one in headings if one != "Unreleased").startswith(f"[{version}] - ")
@@ -186,7 +186,7 @@ def test_one_version_stands_in_both_distributions_the_changelog_and_the_citation
     assert f"pimper_torch=={version}" in project(ROOT / "bench")["dependencies"]
 
 
-def test_commands_found_without_being_installed_are_those_that_are_installed():
+def test_commands_without_installation_match_the_installed_ones():
     assert project(ROOT / "bench")["entry-points"]["pimper.commands"] == OF_BENCH
 
 
@@ -198,5 +198,5 @@ def loaded_by(statement: str) -> set[str]:
 
 def test_importing_the_package_loads_neither_colmap_nor_matplotlib():
     loaded = loaded_by("import pimper_torch; pimper_torch.load_chain, pimper_torch.load_views")
-    assert "torch" in loaded  # or this test saw nothing
+    assert "torch" in loaded  # or the test is void
     assert not loaded & {"pycolmap", "matplotlib", "tyro", "rich"}

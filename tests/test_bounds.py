@@ -1,4 +1,4 @@
-"""No number of a setting ends in a killed process, an endless run or a silent NaN."""
+"""No value of a numeric setting leads to a killed process, an endless run or a silent NaN."""
 
 import dataclasses
 import importlib
@@ -14,9 +14,9 @@ from pimper_torch.runtime.config import Range, require_ranges
 from pimper_torch.runtime.errors import ConfigError
 
 ABSURD = (10**11, -1, 0, math.nan, math.inf)
-# A whole number above this is no count: an array of as many numbers does not fit a machine.
+# An integer above this is not a count: an array of that size does not fit into memory.
 LARGEST_COUNT = 2**32
-# Thresholds and limits that may be infinite: then nothing exceeds them, which is sound.
+# Thresholds and limits that may be infinite, which disables them.
 MAY_BE_INFINITE = {
     "AlignConfig.scale_limit",
     "DecomposeConfig.max_samples",
@@ -29,7 +29,7 @@ MAY_BE_INFINITE = {
 
 
 def fields():
-    """List the settings of both packages: the dataclass, the field's name and its type."""
+    """Yield the settings of both packages: dataclass, name and type of the field."""
     for package in (pimper_torch, pimper_bench):
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             for kind in vars(importlib.import_module(found.name)).values():
@@ -40,7 +40,7 @@ def fields():
 
 
 def values(kind, name, hint):
-    """Give absurd numbers the form of a field: whole, one a place of a tuple, or none of it."""
+    """Convert absurd numbers to the type of a field: int, float or tuple; else an empty list."""
     parts, default = typing.get_args(hint), getattr(kind(), name)
     tuples = [one for one in (hint, *parts) if typing.get_origin(one) is tuple]
     if tuples and {*typing.get_args(tuples[0])} & {int, float}:
@@ -54,8 +54,8 @@ def values(kind, name, hint):
 def refusal(kind, name, value):
     try:
         dataclasses.replace(kind(), **{name: value})
-    except ConfigError as told:
-        return str(told)
+    except ConfigError as error:
+        return str(error)
     return ""
 
 
@@ -64,9 +64,9 @@ def refusal(kind, name, value):
 )
 def test_an_absurd_number_is_refused_by_name_or_harmless(kind, name, hint):
     for value in values(kind, name, hint):
-        if told := refusal(kind, name, value):
-            assert name in told
-            assert "needed" in told
+        if message := refusal(kind, name, value):
+            assert name in message
+            assert "needed" in message
             continue
         for one in value if isinstance(value, tuple) else (value,):
             assert not math.isnan(one)
@@ -92,7 +92,7 @@ class Ranged:
         ({"prior": math.nan}, "some.prior is nan; needed: above 0."),
     ],
 )
-def test_a_value_outside_the_range_of_its_field_is_refused_with_the_bound(values, needed):
+def test_a_value_out_of_range_is_refused_with_the_bound(values, needed):
     with pytest.raises(ConfigError, match=needed):
         require_ranges(Ranged(**values), "some")
 
@@ -100,5 +100,5 @@ def test_a_value_outside_the_range_of_its_field_is_refused_with_the_bound(values
 @pytest.mark.parametrize(
     "values", [{"steps": 1}, {"steps": 1000}, {"steps": None}, {"tilt": 89.9}, {"prior": math.inf}]
 )
-def test_a_value_inside_the_range_of_its_field_is_taken(values):
+def test_a_value_in_range_is_accepted(values):
     require_ranges(Ranged(**values))

@@ -1,4 +1,4 @@
-"""What every round would warn of is said once, as the last round has it."""
+"""Passes of a chain warn once, with the figures of the last pass."""
 
 import warnings
 
@@ -15,7 +15,7 @@ from pimper_torch.runtime.stage import Given, Then
 
 
 class Warner(nn.Module):
-    """Gives what it is handed, and warns of something else in every round."""
+    """Returns its input, and emits other warnings in every pass."""
 
     def __init__(self, messages):
         super().__init__()
@@ -28,7 +28,7 @@ class Warner(nn.Module):
 
 
 def iterations(messages):
-    """Say what a stage warns of in three rounds; return these of its warnings that are told."""
+    """Emit given warnings in each of three passes; return those that are shown."""
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=4, width=32))
     chain = load_chain(
         "default",
@@ -43,12 +43,12 @@ def iterations(messages):
     return [str(one.message) for one in caught if str(one.message) in ours]
 
 
-def test_the_last_rounds_figures_are_said_once():
+def test_passes_warn_once_with_the_last_figures():
     assert iterations([["9 of 10", "no contours"], ["5 of 10"], ["3 of 10"]]) == ["3 of 10"]
 
 
-def test_outside_of_rounds_a_caution_comes_at_once(pytestconfig):
+def test_outside_passes_a_caution_is_emitted_immediately(pytestconfig):
     with pytest.warns(PimperWarning, match="now") as caught:
         caution("now")
-    if not pytestconfig.getoption("jaxtyping_packages"):  # which puts calls of its own between
+    if not pytestconfig.getoption("jaxtyping_packages"):  # which adds frames to the stack
         assert caught[0].filename == __file__

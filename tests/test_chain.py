@@ -1,4 +1,4 @@
-"""From one end of the chain to the other."""
+"""Complete chains, from photographs to mesh."""
 
 import logging
 import warnings
@@ -43,18 +43,18 @@ log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figur
 
 PRESETS = ("paper", "default")
 REFERENCES = {"fast": "coarse_surface", "paper": "triangulate"}
-# Pictures of 80 x 60 pixels are too small to be matched densely: facets span the cloud.
+# Images of 80 x 60 pixels are too small for dense matching: facets span the cloud.
 SMALL = {
     "paper": {"triangulate": {"num_points": 20}},
     "default": {
         "scales": [0.5, 1.0],
-        "extract": {"max_hole": 0.2},  # beyond the cloud's hull facets lie where they may
+        "extract": {"max_hole": 0.2},  # facets beyond the cloud's hull are arbitrary
     },
 }
 
 
 class OneSide(pt.Stage):
-    """Facets of the cloud as one view sees it, in the place of a closed surface."""
+    """Triangulates the cloud in one view, as coarse surface instead of a closed one."""
 
     def __init__(self, num_points: int) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ def photographed(shape: Shape, seed: int, **settings: object) -> RenderedScene:
     generator = torch.Generator().manual_seed(seed)
     options = {"width": 80, "height": 60, "focal_px": 235.0, "distance": 3.0, "span_deg": 40.0}
     cameras = arc_cameras(9, **(options | settings))
-    # At most 35 degrees off: no shadow anywhere on what is seen, so first order is exact.
+    # At most 35 degrees off: visible surface has no shadows, so first order is exact.
     point_lights = wandering_lights(
         9, generator, distance=5.0, spread_deg=35.0, min_tilt_deg=5.0, irradiance=0.6
     )
@@ -93,10 +93,10 @@ def sample_spacing(result: Reconstruction) -> float:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_tilted_plane_stays_a_plane_through_the_whole_chain(preset):
+def test_a_tilted_plane_is_reconstructed_as_a_plane(preset):
     plane = EndlessPlane(normal=(0.3, -0.2, 1.0))
     with warnings.catch_warnings():
-        # One normal everywhere leaves the light open, which may rightly be said.
+        # A single normal does not determine the light, so a warning is legitimate.
         warnings.simplefilter("ignore", PimperWarning)
         result = surface_of(photographed(plane, 161), preset)
     vertices = result.mesh.vertices_world.double()
@@ -111,20 +111,20 @@ def test_a_tilted_plane_stays_a_plane_through_the_whole_chain(preset):
 
 
 def height_over_sphere(mesh: Mesh) -> torch.Tensor:
-    """Distances of points spread evenly over a mesh, corners of small facets or not."""
+    """Signed distances to the unit sphere of points inside each face, not only at its corners."""
     corners = mesh.vertices_world.double()[mesh.faces]
     weights = torch.tensor([[2, 1, 1], [1, 2, 1], [1, 1, 2], [4 / 3, 4 / 3, 4 / 3]]).double() / 4
     inner = torch.einsum("pk,fkc->fpc", weights, corners).reshape(-1, 3)
     return inner.norm(dim=1) - 1
 
 
-# Facets of a cap are given, whose sides are flat, and silhouettes show the whole sphere.
+# The facets cover only a cap, with flat sides, and silhouettes show the complete sphere.
 PART_OF_SPHERE = pytest.mark.filterwarnings("ignore:.*the surface (lacks|sticks)")
 
 
 @PART_OF_SPHERE
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_cap_of_a_sphere_is_rounder_after_the_chain_than_its_facets_are(preset):
+def test_a_spherical_cap_is_reconstructed_better_than_its_facets(preset):
     scene = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
     result = surface_of(scene, preset)
     facets = OneSide(num_points=20)(result.scene)
@@ -136,7 +136,7 @@ def test_a_cap_of_a_sphere_is_rounder_after_the_chain_than_its_facets_are(preset
 
 @PART_OF_SPHERE
 @pytest.mark.parametrize("preset", PRESETS)
-def test_one_light_for_all_views_is_told_and_geometry_delivered(preset):
+def test_identical_lights_give_a_warning_and_a_surface(preset):
     scene = photographed(Sphere(), 163, target=(0.0, 0.0, 1.0))
     same = scene.lights_world[:1].expand(9, 4).contiguous()
     generator = torch.Generator().manual_seed(164)
@@ -151,7 +151,7 @@ def test_one_light_for_all_views_is_told_and_geometry_delivered(preset):
 
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
-def test_held_out_photographs_leave_the_surface_to_the_others():
+def test_held_out_photographs_do_not_affect_the_surface():
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=48))
     used, held = split_held_out(scene, 3)
 
@@ -169,7 +169,7 @@ def test_held_out_photographs_leave_the_surface_to_the_others():
 
 
 class Dragging(nn.Module):
-    """A fusion that drags the vertex nearest to the view's axis over its neighbours."""
+    """A fusion that folds the surface: it moves the vertex nearest to the view's axis."""
 
     def __init__(self, fuse: nn.Module) -> None:
         super().__init__()
@@ -189,7 +189,7 @@ class Dragging(nn.Module):
 
 
 class Spy(nn.Module):
-    """Keeps the surface that a stage is handed."""
+    """Records the surface that a stage receives."""
 
     def __init__(self, stage: nn.Module) -> None:
         super().__init__()
@@ -203,7 +203,7 @@ class Spy(nn.Module):
 
 
 @PART_OF_SPHERE
-def test_a_fold_is_mended_before_a_round_or_the_mesh_builds_on_it():
+def test_folds_are_repaired_before_remeshing_and_extraction():
     scene = photographed(Sphere(), 165, target=(0.0, 0.0, 1.0))
     pimper = small_chain("default", sparse_scene(scene, 150, torch.Generator().manual_seed(17)))
     pimper.fuse, pimper.remesh = Dragging(pimper.fuse), Spy(pimper.remesh)
@@ -217,7 +217,7 @@ def test_a_fold_is_mended_before_a_round_or_the_mesh_builds_on_it():
 
 
 def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene):
-    """Compare along the rays of the reference view, on the object without its table."""
+    """Compare depths in the reference view, on the object without its table."""
     ours, theirs = pair_views(result.scene.views.names, truth.views.names)
     truth_from_world = similarity_between_cameras(
         result.cameras.take(ours.tolist()), truth.cameras.take(theirs.tolist())
@@ -237,8 +237,8 @@ def compared(mesh: Mesh, result: Reconstruction, truth: RenderedScene):
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")  # few views
 @pytest.mark.parametrize("masked", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
-    """With the coarse surface's own details for small photographs."""
+def test_default_improves_on_a_closed_coarse_surface(masked):
+    """With a coarse surface configured for small photographs."""
     scene = ball.photographed(ball.all_round())
     if masked:
         masks = ball.silhouettes_of(scene.cameras).masks
@@ -250,7 +250,7 @@ def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
     mesh, coarse = result.mesh, result.coarse.mesh
     off = mesh.vertices_world.norm(dim=1) - 1
     chords = coarse.vertices_world[coarse.faces].mean(dim=1).norm(dim=1) - 1
-    # Measured: 0.0012 and 0.0016, the facets of the last pass 0.009; 0.93 degrees in the median.
+    # Measured: 0.0012 and 0.0016, the facets of the last pass 0.009; median angle 0.93 degrees.
     assert off.abs().mean() < 0.0025
     assert off.abs().max() < 0.02
     assert off.abs().mean() < 0.25 * chords.abs().mean()
@@ -260,7 +260,7 @@ def test_default_builds_a_coarse_surface_all_round_and_betters_it(masked):
 
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")  # few views
-def test_fast_is_closed_all_round_in_one_pass():
+def test_fast_gives_a_closed_surface_in_one_pass():
     scene = ball.photographed(ball.all_round())
     views = scene.views.replace(masks=ball.silhouettes_of(scene.cameras).masks)
     result = pt.load_chain("fast", coarse_surface=CoarseSurface(ball.SETTINGS))(
@@ -277,7 +277,7 @@ def test_fast_is_closed_all_round_in_one_pass():
 @pytest.mark.filterwarnings(
     "default::pimper_torch.runtime.errors.PimperWarning"
 )  # facets at the contour
-def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
+def test_default_reaches_the_stated_accuracy_on_small_photographs(tmp_path):
     truth = potato_on_table(num_views=9, width=160, height=120)
     save_photographs(truth.views, tmp_path / "photos")
     save_masks(truth.foreground, truth.views.names, tmp_path / "masks")
@@ -290,8 +290,8 @@ def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
     surface = compared(result.mesh.replace(normals_world=None), result, truth)
     for name, figures in (("facets", facets), ("surface", surface)):
         log.info("small photographs: %s %s", name, figures)
-    # Measured: 99.7 % covered, 1.60 % off (the facets 2.27), normals 3.5 degrees off (7.5), their
-    # median 2.9. Before it was 1.65 % (the facets 2.36).
+    # Measured: 99.7 % covered, depth error 1.60 % (facets 2.27), mean angle 3.5 degrees (7.5),
+    # median 2.9. An earlier version had 1.65 % (facets 2.36).
     assert surface.coverage > 0.98
     assert surface.relative_error < 1.64
     assert surface.mean_angle_deg < 4.1
@@ -302,7 +302,7 @@ def test_default_makes_of_small_photographs_what_is_stated(tmp_path):
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 @pytest.mark.parametrize("preset", ["fast", "paper"])
-def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(preset):
+def test_views_of_one_pose_share_a_silhouette_and_have_own_lights(preset):
     cameras = ball.all_round().take(torch.arange(24) // 2)
     scene = ball.photographed(cameras)
     vertices, faces = icosphere(2)
@@ -321,7 +321,7 @@ def test_of_equal_cameras_one_photograph_tells_the_outline_and_all_tell_light(pr
 
 
 class Mine(nn.Module):
-    """Another structure from motion: it knows a scene's cameras, and keeps what it is asked."""
+    """A custom structure from motion: returns known cameras, and records its arguments."""
 
     def __init__(self, scene: SparseScene) -> None:
         super().__init__()
@@ -337,19 +337,17 @@ class MineWithPoints(Mine):
         return scene.replace(points_world=scene.points_world + 1)
 
 
-# Hardly any points, and depth maps that agree by chance.
+# Very few points, and depth maps that agree by chance.
 @pytest.mark.filterwarnings("ignore:No points:pimper_torch.runtime.errors.PimperWarning")
 @pytest.mark.parametrize("preset", PRESETS)
-def test_another_structure_from_motion_places_photographs_and_may_add_points(
-    reconstruction, preset
-):
+def test_a_custom_structure_from_motion_gives_poses_and_optionally_points(reconstruction, preset):
     scene, points = reconstruction.scene, reconstruction.scene.points_world
     for mine, added in ((Mine(scene), 0), (MineWithPoints(scene), 1)):
         chain = pt.load_chain(preset, reconstruct=mine)
         placed = chain.placed(chain.running(), scene.views, "model")
         assert mine.asked == [(scene.views.names, "model")]
         assert torch.equal(placed.points_world, points)
-        # A scene has its cameras: only points may be asked for.
+        # A scene has cameras: only points may be requested.
         given = chain.placed(chain.running(), scene, None)
         assert torch.equal(given.points_world, points + added)
         assert len(mine.asked) == 1

@@ -52,12 +52,12 @@ CHANGED = Outer(
 
 
 @pytest.mark.parametrize("config", [Outer(), CHANGED])
-def test_a_config_survives_the_way_through_yaml(config):
+def test_a_config_survives_a_round_trip_through_yaml(config):
     assert build(Outer, yaml.safe_load(to_yaml(config)), "round trip") == config
     assert build(Outer, to_mapping(config), "round trip") == config
 
 
-def test_only_what_is_named_changes_and_a_whole_number_becomes_a_number():
+def test_only_named_settings_change_and_integers_become_floats():
     built = build(Outer, {"inner": {"steps": 3}, "limit": None}, "w")
     assert built == Outer(inner=Inner(steps=3))
     assert build(Outer, {"inner": None}, "an empty section in YAML") == Outer()
@@ -86,7 +86,7 @@ def test_only_what_is_named_changes_and_a_whole_number_becomes_a_number():
         ({"cache": 3}, "cache", "a path"),
     ],
 )
-def test_a_wrong_type_is_refused_with_place_and_need(mapping, field, needed):
+def test_a_wrong_type_is_refused_with_its_field_and_the_needed_type(mapping, field, needed):
     with pytest.raises(ConfigError) as refusal:
         build(Outer, mapping, "mine.yaml")
     message = str(refusal.value)
@@ -95,19 +95,19 @@ def test_a_wrong_type_is_refused_with_place_and_need(mapping, field, needed):
 
 
 @pytest.mark.parametrize(
-    ("mapping", "told"),
+    ("mapping", "message"),
     [
         ({"inner": {"step": 3}}, "section `inner` .*`step`.*mean `steps`.*: steps, tol.*, solver"),
         ({"solver": "balm"}, r"top level has no setting `solver`.*`inner\.solver`"),
         ({"inner": {"steps": 0}}, "inner: steps is 0; needed: at least one"),
     ],
 )
-def test_an_unknown_key_or_an_impossible_value_is_refused_by_file_and_section(mapping, told):
-    with pytest.raises(ConfigError, match=rf"mine\.yaml: .*{told}"):
+def test_unknown_keys_and_invalid_values_are_refused_with_file_and_section(mapping, message):
+    with pytest.raises(ConfigError, match=rf"mine\.yaml: .*{message}"):
         build(Outer, mapping, "mine.yaml")
 
 
-def test_overlay_merges_sections_and_replaces_values_without_touching_its_inputs():
+def test_overlay_merges_sections_and_leaves_its_inputs_unchanged():
     base = {"a": {"x": 1, "y": [1, 2]}, "b": 1}
     other = {"a": {"y": [3]}, "c": None}
     assert overlay(base, other) == {"a": {"x": 1, "y": [3]}, "b": 1, "c": None}
@@ -115,12 +115,12 @@ def test_overlay_merges_sections_and_replaces_values_without_touching_its_inputs
     assert overlay(base, {"a": None, "b": None}) == {"a": {"x": 1, "y": [1, 2]}, "b": None}
 
 
-def test_a_misspelt_preset_names_the_nearest():
+def test_a_misspelt_preset_suggests_the_nearest():
     with pytest.raises(ConfigError, match=r"'papre'.*`paper`.*default, fast, paper"):
         find_config("papre")
 
 
-def test_a_file_is_taken_as_it_is_and_a_missing_one_refused(tmp_path):
+def test_a_config_file_is_read_unchanged_and_a_missing_one_refused(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("# only a remark\n")
     assert find_config(str(path)) == find_config(path) == path
@@ -129,7 +129,7 @@ def test_a_file_is_taken_as_it_is_and_a_missing_one_refused(tmp_path):
         find_config(tmp_path / "other.yaml")
 
 
-def test_presets_of_an_installed_package_come_before_a_checkout(tmp_path, monkeypatch):
+def test_installed_presets_take_precedence_over_a_checkout(tmp_path, monkeypatch):
     package = tmp_path / "package"
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs" / "a.yaml").write_text("")
@@ -142,7 +142,7 @@ def test_presets_of_an_installed_package_come_before_a_checkout(tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (b"a: 1\nb: 2\na: 3\n", "`a` is given twice"),
         (b"a: {b: 1, b: 2}\n", "`b` is given twice"),
@@ -158,10 +158,10 @@ def test_presets_of_an_installed_package_come_before_a_checkout(tmp_path, monkey
         (b"# " + b"x" * 1_000_000, "1000002 bytes; needed: a file of settings"),
     ],
 )
-def test_a_file_that_holds_no_settings_is_refused_by_name(tmp_path, text, told):
+def test_a_file_without_settings_is_refused_by_name(tmp_path, text, message):
     path = tmp_path / "mine.yaml"
     path.write_bytes(text)
-    with pytest.raises(ConfigError, match=told) as refusal:
+    with pytest.raises(ConfigError, match=message) as refusal:
         read_mapping(path)
     assert str(path) in str(refusal.value)
 
@@ -178,7 +178,7 @@ ABLATIONS = sorted((Path(__file__).parents[1] / "configs" / "ablation").glob("*.
 
 
 @pytest.mark.parametrize("name", [*presets(), *ABLATIONS], ids=lambda name: Path(name).stem)
-def test_a_preset_holds_only_what_differs_from_the_stages_defaults(name):
+def test_a_preset_contains_only_non_default_settings(name):
     mapping = read_mapping(find_config(name))
     config = load_config(name)
     assert build(type(config), mapping, str(name)) == config
@@ -187,7 +187,7 @@ def test_a_preset_holds_only_what_differs_from_the_stages_defaults(name):
     assert same == (["chain"] if "chain" in mapping else [])
 
 
-def test_settings_say_which_chain_they_are_for():
+def test_settings_name_their_chain():
     assert load_config("default").chain == "coarse-to-fine"
     assert load_config("paper").chain == "published"
     assert load_config("default", {"chain": "published"}) == PublishedConfig()
@@ -197,15 +197,15 @@ def test_settings_say_which_chain_they_are_for():
         load_config("paper", {"sweep": {"steps": 9}})
 
 
-def test_changes_are_laid_over_a_preset():
+def test_changes_override_a_preset():
     changed = load_config("fast", {"reconstruct": {"seed": 12}})
     assert changed.reconstruct.seed == 12
     assert changed.decompose == load_config("fast").decompose
 
 
-def test_a_number_beyond_the_range_of_floats_and_a_long_text_are_refused_shortly(tmp_path):
+def test_huge_numbers_and_long_texts_are_refused_with_a_short_message(tmp_path):
     for value in ("1" + "0" * 400, "x" * 9000):
         (tmp_path / "a.yaml").write_text(f"tolerance: {value}\n")
-        with pytest.raises(ConfigError, match="needed: a number") as told:
+        with pytest.raises(ConfigError, match="needed: a number") as message:
             build(Inner, read_mapping(tmp_path / "a.yaml"), "a.yaml")
-        assert len(str(told.value)) < 400
+        assert len(str(message.value)) < 400

@@ -1,4 +1,4 @@
-"""Cores that a process may use, in containers and under an affinity."""
+"""Number of cores that a process may use, in containers and with an affinity mask."""
 
 import os
 
@@ -38,7 +38,7 @@ def test_affinity_and_quota_limit_cores(files, cores, monkeypatch, tmp_path):
     assert ReconstructConfig(threads=5).num_threads == 5
 
 
-def test_a_system_without_affinity_has_all_its_cores(monkeypatch, tmp_path):
+def test_without_affinity_all_cores_are_used(monkeypatch, tmp_path):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr("pimper_torch.runtime.cores._CGROUP", tmp_path)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
@@ -47,11 +47,11 @@ def test_a_system_without_affinity_has_all_its_cores(monkeypatch, tmp_path):
         assert usable_cores() == cores
 
 
-@pytest.mark.parametrize(("told", "cores"), [("3", 3), ("99", 8), ("0", 1), ("4,2", 8), ("", 8)])
-def test_the_number_of_threads_limits_cores(told, cores, monkeypatch, tmp_path):
+@pytest.mark.parametrize(("value", "cores"), [("3", 3), ("99", 8), ("0", 1), ("4,2", 8), ("", 8)])
+def test_a_given_number_of_threads_limits_cores(value, cores, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     monkeypatch.setattr("pimper_torch.runtime.cores._CGROUP", tmp_path)
-    monkeypatch.setenv("OMP_NUM_THREADS", told)
+    monkeypatch.setenv("OMP_NUM_THREADS", value)
     assert usable_cores() == cores
 
 

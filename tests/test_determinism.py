@@ -1,4 +1,4 @@
-"""Same input, settings and seed: same bits, in one process and two, on one thread and several."""
+"""Same input, settings and seed give the same bits, in any process and on any number of threads."""
 
 import os
 import subprocess
@@ -17,10 +17,9 @@ from tests.threads import on_threads
 
 
 def of_every_stage(preset):
-    """Run a chain with known cameras; give the bits of what each stage returned.
+    """Run a chain with known cameras; return the digests of each stage's records.
 
-    Stages that work on parts are called in the order in which threads come to them: what they
-    gave is sorted.
+    They are sorted: threads call stages that process parts in any order.
     """
     scene = photographed(Sphere(), 162, target=(0.0, 0.0, 1.0))
     chain = small_chain(preset, sparse_scene(scene, 150, torch.Generator().manual_seed(17)))
@@ -39,7 +38,7 @@ def of_every_stage(preset):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "paper"])
-def test_every_stage_gives_the_same_bits_again_and_on_any_number_of_threads(preset):
+def test_stages_are_reproducible_bit_for_bit_on_any_number_of_threads(preset):
     first, *others = on_threads(lambda: of_every_stage(preset), 1, 2, 2)
     assert None not in (one for records in first.values() for one in records)
     assert {name for name, records in first.items() if records} >= {"warp", "decompose", "extract"}
@@ -47,15 +46,15 @@ def test_every_stage_gives_the_same_bits_again_and_on_any_number_of_threads(pres
 
 
 @pytest.mark.slow
-def test_what_two_processes_give_has_the_same_bits():
-    """As is shown for one process, of hashes of objects and addresses nothing may depend."""
+def test_two_processes_give_the_same_bits():
+    """Results must not depend on hashes and addresses of objects, which differ by process."""
     code = (
         "import hashlib, torch; torch.set_num_threads(2)\n"
         "from tests.test_determinism import of_every_stage\n"
         "print(hashlib.sha256(repr(of_every_stage('paper')).encode()).hexdigest())"
     )
     path = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    told = {
+    printed = {
         subprocess.run(
             [sys.executable, "-c", code],
             capture_output=True,
@@ -65,4 +64,4 @@ def test_what_two_processes_give_has_the_same_bits():
         ).stdout
         for _ in range(2)
     }
-    assert len(told) == 1
+    assert len(printed) == 1

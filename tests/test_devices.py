@@ -1,4 +1,4 @@
-"""A stage computes on the device of its records, and its record is there."""
+"""A stage computes on the device of its records, and returns its record on it."""
 
 import functools
 
@@ -24,7 +24,7 @@ SLOW = pytest.mark.slow
 
 @functools.cache
 def given():
-    """Photographs of one side of a ball, and what each stage of both chains makes of them."""
+    """Photographs of one side of a ball, and the records of each stage of both chains."""
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=4, width=32))
     contours = stages.TraceContours()(pt.Silhouettes.everything(scene.views), scene.cameras)
     patches = stages.Decompose()(coarse, scene.cameras)
@@ -88,7 +88,7 @@ def leaves(record):
 
 def elsewhere(call, *inputs):
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # others know nothing of the device
+    torch.set_num_threads(1)  # other threads do not have the device
     try:
         with torch.no_grad(), Elsewhere():
             return call(*sent(inputs))
@@ -96,7 +96,7 @@ def elsewhere(call, *inputs):
         torch.set_num_threads(threads)
 
 
-def test_the_device_refuses_what_a_gpu_refuses():
+def test_the_fake_device_refuses_mixed_devices_like_a_gpu():
     far = Far(torch.arange(6.0).reshape(2, 3))
     with Elsewhere():
         assert torch.equal((2 * far + torch.tensor(1.0)).cpu(), 2 * far.near + 1)
@@ -122,7 +122,7 @@ def test_a_stage_runs_where_its_records_are(stage, make, names):
 
 
 @pytest.mark.parametrize("preset", [pytest.param("default", marks=SLOW), "paper"])
-def test_a_chain_gives_there_what_it_gives_here(preset):
+def test_a_chain_gives_the_same_result_on_either_device(preset):
     scene, coarse = given()["scene"], given()["coarse"]
     settings = {"silhouettes": {"object": "everything"}}
     if preset == "default":
@@ -133,4 +133,4 @@ def test_a_chain_gives_there_what_it_gives_here(preset):
     assert all(isinstance(leaf, Far) for leaf in leaves(found))
     off = found.mesh.vertices_world.near - here.mesh.vertices_world
     size = here.mesh.vertices_world.std()
-    assert off.abs().max() < 1e-3 * size  # torch rounds otherwise than compiled kernels
+    assert off.abs().max() < 1e-3 * size  # torch and compiled kernels round differently

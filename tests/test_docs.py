@@ -1,4 +1,4 @@
-"""What the documentation shows runs: examples of docstrings, and Python of its pages."""
+"""Examples of docstrings and Python blocks of documentation pages run."""
 
 import doctest
 import json
@@ -48,12 +48,12 @@ PAGES = {
     for path in (*sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md")
 }
 
-# Thousands of facets take a third of a minute, and silhouettes as long as all else.
+# Thousands of facets take 20 seconds, and silhouettes as long as everything else.
 FEW = {"coarse_surface": {"num_facets": 100}, "silhouettes": {"object": "everything"}}
 
 
 def modules_with_examples() -> list[str]:
-    """List the modules that have an example which is meant to run."""
+    """List the modules with examples that are not marked as skipped."""
     return [
         ".".join(path.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__")
         for package in PACKAGES
@@ -63,20 +63,20 @@ def modules_with_examples() -> list[str]:
 
 
 @pytest.mark.parametrize("name", modules_with_examples())
-def test_examples_of_docstrings_give_what_they_show(name):
+def test_examples_of_docstrings_give_the_shown_output(name):
     ran = doctest.testmod(import_module(name))
     assert ran.attempted > 0
     assert ran.failed == 0
 
 
 def photographed() -> tuple[RenderedScene, SparseScene]:
-    """Nine small photographs of a ball, and what structure from motion would make of them."""
+    """Nine small photographs of a ball, and a scene like that of structure from motion."""
     generator = torch.Generator().manual_seed(18)
     cameras = arc_cameras(9, width=56, height=42, focal_px=70.0, distance=4.0, span_deg=40.0)
     point_lights = wandering_lights(9, generator, distance=5.0, spread_deg=35.0)
     texture = random_speckle(generator, cells=(0.3, 0.1), contrast=1.0)
     scene = render_shape(Sphere(), cameras, point_lights.harmonics_world(), texture)
-    return scene, sparse_scene(scene, 120, generator)  # depth maps are searched for fewer
+    return scene, sparse_scene(scene, 120, generator)  # fewer points would trigger depth maps
 
 
 def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
@@ -87,7 +87,7 @@ def a_folder_of_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
         assert views.names == found.views.names
         return found.replace(views=views)
 
-    monkeypatch.setattr(Reconstruct, "forward", place)  # the longest stage
+    monkeypatch.setattr(Reconstruct, "forward", place)  # the slowest stage
     few = FEW | {"scales": [1.0]}
     monkeypatch.setattr(presets, "load_config", lambda name, _: load_config(name, few))
     return {}
@@ -229,7 +229,7 @@ def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
 
 
 class Found(SimpleNamespace):
-    """What a chain's finish asks of a result."""
+    """Stand-in for a result, with the methods that a chain's finish calls."""
 
     def to(self, _: str) -> "Found":
         return self
@@ -252,11 +252,11 @@ def two_objects(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     scene, _ = photographed()
     for name in ("cup", "jar"):
         save_photographs(scene.views, Path("scans") / name)
-    monkeypatch.setattr(task, "_CHILD", CHILD)  # tests/cli/test_options.py runs it in earnest
+    monkeypatch.setattr(task, "_CHILD", CHILD)  # tests/cli/test_options.py runs the real one
     return {}
 
 
-# What each block of a page takes for granted, by page and number.
+# The names that each block of a page requires, by page and number.
 GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]]] = {
     ("docs/index.md", 0): a_glance_at_photographs,
     ("docs/python.md", 0): a_folder_of_photographs,
@@ -303,7 +303,7 @@ def test_the_reader_of_the_pages_reads_the_cameras(tmp_path, monkeypatch):
     assert_close(read.intrinsics, found.cameras.intrinsics.to(read.intrinsics))
 
 
-def test_the_camera_format_of_the_pages_is_read_and_offered(tmp_path, monkeypatch):
+def test_the_camera_format_of_the_pages_is_registered_and_read(tmp_path, monkeypatch):
     run_block("docs/extending.md", 4, monkeypatch)
     path = tmp_path / "mine.csv"
     path.write_text("a.png,64,48,90,1,0,0,0.5,0,1,0,0,0,0,1,2\n")

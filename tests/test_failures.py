@@ -1,4 +1,4 @@
-"""A patch, a view or a solver that fails is left out, and told; what remains is as without it."""
+"""A failed patch, view or solver is skipped with a warning and does not affect the others."""
 
 import warnings
 from contextlib import contextmanager
@@ -29,21 +29,21 @@ from pimper_torch.runtime.failures import collecting as collecting_entries
 from pimper_torch.runtime.failures import distinct, skipped, solved_or, warn_of
 from pimper_torch.runtime.stage import Given
 
-# As torch words it on the CPU.
+# torch's message on the CPU.
 NO_MEMORY = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 123456789 bytes."
 FAILURE = Failure(stage="fuse", what="solver", name="it", reason="NaN", done="Kept")
 
 
 @contextmanager
 def collecting(*arguments):
-    """Collect failures, without what guards left out."""
+    """Collect failures, without removals by guards."""
     failures = []
     with collecting_entries(*arguments) as entries:
         yield failures
     failures += [entry for entry in entries if isinstance(entry, Failure)]
 
 
-def test_a_kind_of_failure_is_warned_of_once_with_its_count():
+def test_each_kind_of_failure_gives_one_warning_with_its_count():
     failures = [
         Failure(stage="sweep", what="patch", name=str(name), reason="NaN", done="Kept")
         for name in (11, 2, 2, *range(20, 27))
@@ -55,12 +55,12 @@ def test_a_kind_of_failure_is_warned_of_once_with_its_count():
     assert [each.name for each in distinct(failures)][:3] == ["2", "11", "20"]
 
 
-def test_outside_of_a_chain_a_failure_is_warned_of_at_once():
+def test_outside_a_chain_a_failure_warns_immediately():
     with pytest.warns(PimperWarning, match="fuse: 1 failed"):
         skipped(FAILURE)
 
 
-def test_an_error_that_ends_a_run_comes_after_what_had_failed_before():
+def test_earlier_failures_are_warned_of_before_a_fatal_error():
     def broken(error):
         with collecting():
             skipped(FAILURE)
@@ -76,7 +76,7 @@ def test_an_error_that_ends_a_run_comes_after_what_had_failed_before():
             broken(error)
 
 
-def test_something_stands_in_for_equations_without_a_solution():
+def test_a_fallback_replaces_singular_equations():
     def singular():
         raise SingularSystemError("singular")
 
@@ -86,7 +86,7 @@ def test_something_stands_in_for_equations_without_a_solution():
     assert failures[0].reason == "SingularSystemError: singular"
     with pytest.raises(ReconstructionError, match="solver the fusion"), collecting("fail"):
         solved_or(singular, lambda: 3, **given)
-    with pytest.raises(ZeroDivisionError), collecting():  # a mistake in a program
+    with pytest.raises(ZeroDivisionError), collecting():  # a programming error
         solved_or(lambda: 1 / 0, lambda: 3, **given)
 
 
@@ -138,7 +138,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("reason", FAULTS)
-def test_a_view_that_cannot_be_used_is_left_out_and_the_others_are_as_they_were(scene, reason):
+def test_an_unusable_view_is_removed_and_the_others_are_unchanged(scene, reason):
     with collecting() as failures:
         found = sound(FAULTS[reason](scene, 2))
     others = [0, 1, 3, 4, 5]
@@ -160,7 +160,7 @@ def test_a_scene_without_faults_stays_the_same(scene):
     assert sound(scene) is scene
 
 
-def test_points_that_are_nowhere_are_left_out(scene):
+def test_points_that_are_not_finite_are_removed(scene):
     points = scene.points_world.clone()
     points[[3, 5]] = torch.nan
     kept = torch.ones(len(points), dtype=torch.bool)
@@ -202,7 +202,7 @@ def given():
 
 def streamed(given):
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PimperWarning)  # of patches under too little light
+        warnings.simplefilter("ignore", PimperWarning)  # patches with too little light
         light = FitLight()(Warp()(*given))
         return Photometric(Warp(), Factorize(), Sweep())(*given, light)
 
@@ -220,7 +220,7 @@ def by_bucket(swept):
         )
 
 
-def test_a_solution_that_is_not_finite_changes_no_other_patch(given, expected, monkeypatch):
+def test_a_solution_that_is_not_finite_affects_only_its_patch(given, expected, monkeypatch):
     name = "variable-projection"
     solve = factorization.SOLVERS[name]
 
@@ -251,12 +251,12 @@ def test_a_solution_that_is_not_finite_changes_no_other_patch(given, expected, m
         kept = [int(facet) not in lost for facet in given[2].buckets[index].facet]
         assert all(part.isfinite().all() for part in one)
         rows = torch.tensor(kept).nonzero()[:, 0]
-        # Albedo's scale is that of all patches together.
+        # All patches together determine the scale of albedo.
         for place in (0, 3, 4):
             assert torch.equal(one[place][rows], other[place][rows])
 
 
-def test_heights_that_are_not_finite_are_none(given, expected, monkeypatch):
+def test_heights_that_are_not_finite_become_invalid(given, expected, monkeypatch):
     sweep = Sweep._sweep
 
     def spoiled(self, *handed):
@@ -275,7 +275,7 @@ def test_heights_that_are_not_finite_are_none(given, expected, monkeypatch):
         assert torch.equal(one.offset[1:], other.offset[1:])
 
 
-# --- whole runs --------------------------------------------------------------------------------
+# --- complete runs --------------------------------------------------------------------------------
 
 
 def chain_of(scene, coarse, on_failure="skip"):
@@ -287,16 +287,18 @@ def chain_of(scene, coarse, on_failure="skip"):
 
 
 @pytest.mark.filterwarnings("always::pimper_torch.runtime.errors.PimperWarning")
-def test_a_run_with_a_bad_view_ends_with_a_warning_and_a_line_in_the_summary(recwarn):
+def test_a_bad_view_gives_a_warning_and_a_line_in_the_summary(recwarn):
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
     name = scene.views.names[2]
     bad = with_image(scene, 2, torch.nan)
     chain = chain_of(bad, coarse)
     chain.silhouettes = FindSilhouettes(SilhouetteConfig(object="everything"))
     result = chain(bad.views)
-    told = [str(each.message) for each in recwarn.list if "cameras: 1 failed" in str(each.message)]
-    assert len(told) == 1
-    assert name in told[0]
+    messages = [
+        str(each.message) for each in recwarn.list if "cameras: 1 failed" in str(each.message)
+    ]
+    assert len(messages) == 1
+    assert name in messages[0]
     (line,) = summary_report(result, {})["failures"]
     assert (line["stage"], line["what"], line["names"]) == ("cameras", "view", [name])
     assert name in result.scene.unregistered
@@ -307,7 +309,7 @@ def test_a_run_with_a_bad_view_ends_with_a_warning_and_a_line_in_the_summary(rec
 
 @pytest.mark.filterwarnings("always::pimper_torch.runtime.errors.PimperWarning")
 @pytest.mark.parametrize("broken", [1, 3])
-def test_a_fusion_without_a_solution_keeps_the_surface_before(monkeypatch, broken):
+def test_a_failed_fusion_keeps_the_previous_surface(monkeypatch, broken):
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
     solve, calls = estimate.solve_compressed, []
 
@@ -327,7 +329,7 @@ def test_a_fusion_without_a_solution_keeps_the_surface_before(monkeypatch, broke
 
 
 @pytest.mark.filterwarnings("always::pimper_torch.runtime.errors.PimperWarning")
-def test_a_facet_without_area_is_left_out_and_the_others_are_as_they_were(given):
+def test_a_facet_without_area_is_skipped_and_the_others_are_unchanged(given):
     _, cameras, patches = given
     coarse = patches.coarse
     faces = coarse.mesh.faces

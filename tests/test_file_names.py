@@ -34,7 +34,7 @@ def matched(wanted, present, folder=""):
         ("a.v2.jpg", "a.v2.tiff"),
     ],
 )
-def test_a_name_that_a_program_rewrote_is_found(wanted, present):
+def test_rewritten_file_names_match(wanted, present):
     assert matched([wanted], ["other.jpg", present]) == [1]
     assert matched([present.rpartition("/")[2]], ["x/y.jpg", wanted]) == [1]
 
@@ -49,11 +49,11 @@ def test_a_name_that_a_program_rewrote_is_found(wanted, present):
         ("ab.jpg", "a b.jpg"),
     ],
 )
-def test_a_name_that_is_another_is_not_found(wanted, present):
+def test_different_file_names_do_not_match(wanted, present):
     assert matched([wanted], [present]) == [None]
 
 
-def test_names_that_are_the_same_byte_for_byte_come_first():
+def test_exact_names_take_precedence():
     present = ["a b.jpg", "a_b.jpg", "A_B.jpg", "a_b.png"]
     assert matched(["a_b.jpg", "a b.jpg", "a_b.png", "A_B.jpg"], present) == [1, 0, 3, 2]
 
@@ -70,12 +70,12 @@ CAMS = ["cam1/000.png", "cam2/000.png", "cam1/001.png", "cam2/001.png"]
         (["cam2/001.png", "cam1/001.png"], CAMS, "/data/photos", [3, 2]),
         (["0.png"], ["left/cam1/0.png", "right/cam1/0.png"], "/left/right/cam1", [1]),
         (["0.png"], ["cam1/0.png", "0.png"], "/data/photos", [1]),
-        # Of another folder, where some are of the photographs' own.
+        # Files of a different folder are ignored if any are in the photographs' folder.
         (["000.png", "001.png"], ["cam1/000.png", *CAMS[1::2]], "/data/cam1", [0, None]),
         (["001.png"], ["cam1/000.png", *CAMS[1::2]], "/data/photos", [2]),
     ],
 )
-def test_folders_that_agree_from_the_end_of_the_path_on_decide(wanted, present, folder, places):
+def test_trailing_folders_resolve_ambiguous_names(wanted, present, folder, places):
     assert matched(wanted, present, folder) == places
 
 
@@ -88,18 +88,18 @@ def test_folders_that_agree_from_the_end_of_the_path_on_decide(wanted, present, 
         (["a b.jpg"], ["a_b.jpg", "a%20b.jpg"]),
     ],
 )
-def test_a_name_that_fits_several_is_refused_with_all_of_them(wanted, present):
+def test_an_ambiguous_name_is_refused_with_all_candidates(wanted, present):
     with pytest.raises(InputError, match=rf"^model: {wanted[0]} may be any of ") as caught:
         matched(wanted, present, "/data/photos")
     assert all(name in str(caught.value) for name in present)
 
 
-def test_two_photographs_that_fit_one_image_are_refused_with_both():
+def test_two_photographs_that_match_one_image_are_refused_with_both():
     with pytest.raises(InputError, match=r"A\.jpg may be any of a\.jpg, a\.JPG"):
         matched(["a.jpg", "a.JPG"], ["A.jpg"])
 
 
-def test_an_image_that_is_taken_exactly_is_no_other_photograph_s():
+def test_an_exactly_matched_image_is_assigned_only_once():
     assert matched(["a.jpg", "A.jpg"], ["a.jpg"]) == [0, None]
 
 
@@ -112,16 +112,19 @@ PHOTOGRAPHS = ["p1/a.jpg", "p1/b.jpg", "p2/a.jpg", "p2/b.jpg"]
         (["p1/b.jpg", "p2/a.jpg"], [0, 0, 1, 1]),
         (["p2.png", "p1.png"], [1, 1, 0, 0]),
         (["x/p2/mean.png", "x/p1/mean.png"], [1, 1, 0, 0]),
-        (["p1/b.jpg", "p1.png", "p1/a.jpg"], [2, 0, None, None]),  # its own goes before
+        (["p1/b.jpg", "p1.png", "p1/a.jpg"], [2, 0, None, None]),  # its own file takes precedence
         (["p1/b.jpg", "p1.png"], [0, 0, None, None]),
-        (["p1/c.jpg", "p1/d.jpg", "P2.JPG"], [None, None, 2, 2]),  # which of two is not known
+        (
+            ["p1/c.jpg", "p1/d.jpg", "P2.JPG"],
+            [None, None, 2, 2],
+        ),  # two files of one pose
         (["p2/a.jpg"], [None, None, 0, 0]),
         (["p3/a.jpg", "p1/a.jpg", "p3/b.jpg"], [1, 1, None, None]),
     ],
 )
-def test_what_a_photograph_lacks_is_that_of_its_pose(present, places):
+def test_a_missing_file_is_replaced_by_that_of_the_same_pose(present, places):
     assert match_poses(PHOTOGRAPHS, present, where="model", what="image") == places
 
 
-def test_photographs_without_folders_are_of_no_pose():
+def test_photographs_without_folders_have_no_pose():
     assert match_poses(["a.jpg", "b.jpg"], ["a.jpg"], where="model", what="image") == [0, None]

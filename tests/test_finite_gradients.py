@@ -1,4 +1,4 @@
-"""Every gradient is finite where the value is: of whole scenes, by stage and through the chain."""
+"""Gradients are finite if values are: for complete scenes, by stage and through the chain."""
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:Converting a tensor with requires_grad",
 )
 
-# What no view lights is in the mug.
+# The mug has surface that is unlit in all views.
 SCENES = {
     "potatoes": {},
     "balls": {"specular": 0.3},
@@ -29,7 +29,7 @@ SCENES = {
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """Photographs of 240x180 from eight places with true cameras, masks, and guessed normals."""
+    """Eight photographs of 240x180 pixels with true cameras, masks and normal priors."""
 
     def make(name):
         kind = name if name in ("potatoes", "balls", "mug") else "potatoes"
@@ -60,7 +60,7 @@ def assert_finite(slopes, where):
 
 
 def assert_stages_finite(chain, scene):
-    """Check every stage on what the chain hands it; return what the factorization is handed."""
+    """Check every stage with its arguments in the chain; return the arguments by stage."""
     given = calls(chain, lambda: chain(scene))
     for stage in [stage for stage in STAGES if stage in given]:
         arguments, inputs = tracked(given[stage])
@@ -69,7 +69,7 @@ def assert_stages_finite(chain, scene):
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])
-def test_gradients_of_a_pass_are_finite_though_a_photograph_is_black_or_saturated(level):
+def test_gradients_are_finite_with_a_black_or_saturated_photograph(level):
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=5, width=40))
     scene.views.images[2] = level
     everything = pt.Given(pt.Silhouettes.everything(scene.views))

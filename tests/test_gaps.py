@@ -1,4 +1,4 @@
-"""A module of one's own stands in the gap between any two stages of a chain."""
+"""A custom module can be inserted between any two stages of a chain."""
 
 import functools
 
@@ -30,7 +30,7 @@ GAPS = {
 
 
 class Mine(nn.Module):
-    """A module that gives what it is handed, in a copy."""
+    """Returns a copy of its input, and records it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -61,10 +61,10 @@ def without(preset):
 
 @pytest.mark.parametrize(
     ("preset", "behind"),
-    # All gaps at once, and alone those of stages that are called a few patches at a time.
+    # All gaps together, and one by one those of stages that process a few patches per call.
     [*GAPS.items(), *(("default", (stage,)) for stage in ("warp", "factorize", "sweep"))],
 )
-def test_a_module_behind_a_stage_is_handed_its_record_and_changes_no_bit(preset, behind):
+def test_a_module_after_a_stage_receives_its_record_and_changes_no_bit(preset, behind):
     plain, views = chain_on_a_sphere(preset)
     mine = {stage: Mine() for stage in behind}
     stages = {stage: pt.Then(getattr(plain, stage), own) for stage, own in mine.items()}
@@ -75,7 +75,7 @@ def test_a_module_behind_a_stage_is_handed_its_record_and_changes_no_bit(preset,
     assert all(own.handed for own in mine.values())
 
 
-def test_points_that_light_finds_make_the_coarse_surface_anew():
+def test_points_from_light_trigger_a_second_coarse_surface():
     plain, views = chain_on_a_sphere("default")
     corners = plain.coarse_surface.record.mesh.vertices_world
     points = OrientedPoints(
@@ -99,14 +99,14 @@ def test_points_that_light_finds_make_the_coarse_surface_anew():
 
 
 @pytest.mark.parametrize("preset", SETTINGS)
-def test_there_is_a_gap_behind_every_stage(preset):
+def test_gaps_cover_every_stage(preset):
     chain, _ = chain_on_a_sphere(preset)
-    spare = {"simplify", "relight", "texture"}  # of a result, see below
-    spare |= {"coarse_surface"} if preset == "paper" else set()  # of a mesh that is given
+    spare = {"simplify", "relight", "texture"}  # these finish a result, see below
+    spare |= {"coarse_surface"} if preset == "paper" else set()  # used only with a given mesh
     assert {name for name, _ in chain.named_children()} - spare == {*GAPS[preset]}
 
 
-def test_a_module_behind_a_stage_of_the_finish_is_handed_its_record():
+def test_a_module_after_a_finishing_stage_receives_its_record():
     plain, views = chain_on_a_sphere("default")
     mine = {stage: Mine() for stage in ("simplify", "relight", "texture")}
     stages = {stage: pt.Then(getattr(plain, stage), own) for stage, own in mine.items()}
@@ -126,6 +126,6 @@ def test_written_normals_are_vertex_normals_of_the_fused_surface():
     written, surface = chain(views).mesh, fused.handed[-1]
     own = normalize(vertex_normals(surface.vertices_world, surface.faces), dim=1)
     assert_close(surface.normals_world, own, rtol=0, atol=1e-6)
-    # `repair` and `extract` keep these vertices here, in another order.
+    # `repair` and `extract` keep these vertices here, in a different order.
     nearest = torch.cdist(written.vertices_world, surface.vertices_world).argmin(dim=1)
     assert_close(written.normals_world, own[nearest], rtol=0, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Every gradient of the chain against finite differences of what it computes."""
+"""Every gradient of the chain agrees with finite differences."""
 
 import dataclasses
 
@@ -18,16 +18,16 @@ from pimper_torch.method.photometry.light_field import harmonics
 from pimper_torch.records import Silhouettes
 from pimper_torch.runtime.stage import Given
 
-# What is promised of the chain whole; single stages do far better. Kinks that are too small to tell
-# from slopes, at borders of pixels, are left: more of them in a whole scene.
+# Tolerances; single stages agree far better. Kinks at borders of pixels that are too small to
+# separate from slopes remain, and a complete scene has more of them.
 STAGE, SCENE, WHOLE = 0.002, 0.005, 0.02
 
 
-# Some of the few patches are not determined by light: their normals are those they started with.
+# Light does not determine some of the few patches: these keep their initial normals.
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 
-# No step of the differences changes a choice of a patch here, such as whether it is fitted.
+# No step of the differences changes a discrete choice here, such as whether a patch is fitted.
 FEW = {"seed": 36, "num_views": 5, "width": 32, "num_points": 11}
 
 
@@ -53,7 +53,7 @@ def in_iterations(**changes):
 
 @pytest.fixture(scope="module")
 def iterations(tiny):
-    """What the stages of the second round are handed: templates that carry a surface."""
+    """Probes of the stages of the second pass, which starts from a surface."""
     return probes(in_iterations(), *tiny)
 
 
@@ -63,8 +63,8 @@ def published():
 
 
 @pytest.mark.parametrize("stage", ["warp", "decompose", "sweep", "fuse", "repair", "remesh"])
-def test_stages_of_the_rounds_agree_with_finite_differences(iterations, stage, generator):
-    # What sways the surface little is told from rounding by longer steps.
+def test_stages_of_the_second_pass_agree_with_finite_differences(iterations, stage, generator):
+    # Inputs with a small effect on the surface need longer steps because of rounding.
     steps = (3e-6, 1e-6) if stage == "fuse" else (1e-6, 1e-7)
     found = iterations[stage].check(generator, directions=1, steps=steps)
     assert_agree(stage, found, STAGE)
@@ -86,10 +86,10 @@ def test_factorization_agrees_with_finite_differences(light, loss, generator):
 
 
 def with_constant_rooms(probe, monkeypatch):
-    """Return a probe whose later evaluations take the rooms that its first one fits.
+    """Return a probe that keeps the soft light of its first evaluation.
 
-    To autograd a room's harmonics are constants (see ``fit_light_field``), which they are not to
-    finite differences: 1 % of the mug's derivatives of albedo.
+    For autograd these harmonics are constants (see ``fit_light_field``), but not for finite
+    differences: 1 % of the mug's derivatives of albedo.
     """
     rooms, left, fit_room = [], [], lights._fit_room
 
@@ -115,28 +115,28 @@ def test_stages_agree_with_finite_differences_on_whole_scenes(
     config = SceneConfig(num_views=8, width=240, height=180, specular=specular)
     render_scene(scene, tmp_path, config)
     stages = probes(chain_of("default", scales=[0.25, 0.5]), *rendered_scene(tmp_path))
-    del stages["chain"]  # a step may change which vertices there are
+    del stages["chain"]  # a step may change the set of vertices
     assert len(stages) == 7
     stages["factorize"] = with_constant_rooms(stages["factorize"], monkeypatch)
     for stage, probe in stages.items():
         steps = (3e-6, 1e-6) if stage == "fuse" else (1e-6, 1e-7)
         pairs = probe.check(generator, directions=1, weights=0, steps=steps)
-        # One sample that is left out may pass the percentile of albedo that is the gauge to another
-        # one, and one ray that meets another cell of a template may move the surface.
+        # A removed sample may change which one is the percentile of albedo that fixes the gauge,
+        # and a ray that hits a different cell of a template may move the surface.
         smooth = {key: check for key, check in pairs.items() if check.smooth.all()}
         assert len(smooth) > len(pairs) / 2
         assert_agree(stage, smooth, SCENE)
 
 
 @pytest.mark.slow
-def test_the_chain_whole_agrees_with_finite_differences(generator):
+def test_the_complete_chain_agrees_with_finite_differences(generator):
     few = small_scene(**FEW)
     found = probes(in_iterations(), *few)["chain"].check(generator, directions=2, weights=4)
     assert_agree("chain", found, WHOLE)
 
 
 class Network(FactorPrior):
-    """Normals and inliers by a layer that all entries share, and by one of their mean."""
+    """Predicts inliers by a layer shared by all entries, and normals from their mean."""
 
     def __init__(self):
         super().__init__()
@@ -156,7 +156,7 @@ class Network(FactorPrior):
 
 
 @pytest.mark.slow
-def test_parameters_of_a_prior_agree_through_factorization_and_sweep(generator):
+def test_gradients_of_prior_parameters_agree_through_factorization_and_sweep(generator):
     scene, coarse = small_scene(**FEW)
     chain = chain_of("default", scales=[1.0])
     chain.silhouettes = Given(Silhouettes.everything(scene.views))
@@ -176,7 +176,7 @@ def test_parameters_of_a_prior_agree_through_factorization_and_sweep(generator):
         swept = torch.func.functional_call(chain, moved, (scene,)).patches
         normals, offsets = [], []
         for photometric, heights in zip(swept.photometric.buckets, swept.buckets, strict=True):
-            known = photometric.valid.flatten(1).any(dim=1)  # lights of others are constants
+            known = photometric.valid.flatten(1).any(dim=1)  # lights of other patches are constants
             normals.append(photometric.normals_patch[known].flatten())
             offsets.append(heights.offset[known].flatten())
         return {"normals": torch.cat(normals), "offset": torch.cat(offsets)}
@@ -186,7 +186,7 @@ def test_parameters_of_a_prior_agree_through_factorization_and_sweep(generator):
     assert_agree("prior", pairs, STAGE)
 
 
-def test_a_part_that_autograd_does_not_see_is_noticed(generator):
+def test_a_detached_part_is_detected(generator):
     found = check_derivatives(
         lambda x: {"sum": x["a"] * x["b"] + x["a"].detach() ** 2},
         {name: torch.rand(7, generator=generator, dtype=torch.float64) + 1 for name in ("a", "b")},
@@ -196,9 +196,9 @@ def test_a_part_that_autograd_does_not_see_is_noticed(generator):
     assert found["b", "sum"].spread < 1e-6
 
 
-def test_jumps_are_told_from_errors(generator):
+def test_jumps_are_distinguished_from_errors(generator):
     places = torch.linspace(0.05, 0.95, 19, dtype=torch.float64)
-    places[4] = 1 / 3  # moved by a step of either size, it passes the edge of a bin
+    places[4] = 1 / 3  # a step of either size moves it across the edge of a bin
 
     def binned(x):
         return {"y": (3 * x["x"]).floor() + x["x"] ** 2}
@@ -209,7 +209,7 @@ def test_jumps_are_told_from_errors(generator):
     assert check.spread < 1e-6
 
 
-def test_a_direction_that_jumps_all_over_tells_nothing(generator):
+def test_a_discontinuous_direction_gives_no_ratio(generator):
     def counted(x):
         return {"y": x["x"] + (x["x"].sum() > 0)}
 

@@ -1,4 +1,4 @@
-"""Chains and stages are modules as others of torch: moved, copied, saved, compiled."""
+"""Chains and stages are moved, copied, saved and compiled like other torch modules."""
 
 import copy
 import functools
@@ -13,7 +13,7 @@ import pimper_torch as pt
 from pimper_torch.records import Silhouettes
 from pimper_torch.runtime.stage import Given
 
-LIT = pytest.mark.filterwarnings("ignore:Factorization")  # few patches are lit in enough views
+LIT = pytest.mark.filterwarnings("ignore:Factorization")  # few patches have enough lit views
 
 
 class Scaled(pt.Stage):
@@ -58,16 +58,16 @@ def mesh():
     ],
 )
 @pytest.mark.parametrize("make", [small_chain, pt.Published, pt.Warp])
-def test_what_has_nothing_to_move_says_what_to_move_and_stays(make, moved):
+def test_moving_a_chain_without_parameters_warns_and_changes_nothing(make, moved):
     module = make()
-    told = rf"{type(module).__name__} has no parameters.*records.*`views.to\('cuda'\)`"
-    with pytest.warns(pt.PimperWarning, match=told) as caught:
+    message = rf"{type(module).__name__} has no parameters.*records.*`views.to\('cuda'\)`"
+    with pytest.warns(pt.PimperWarning, match=message) as caught:
         assert moved(module) is module
     assert len(caught) == 1
     assert caught[0].filename == __file__
 
 
-def test_habits_that_change_nothing_are_silent(recwarn):
+def test_module_calls_without_effect_are_silent(recwarn):
     chain = small_chain()
     silent = chain.to("cpu").cpu().float().to(torch.float32).eval().train().requires_grad_(False)
     silent.share_memory().to(memory_format=torch.channels_last).zero_grad()
@@ -75,7 +75,7 @@ def test_habits_that_change_nothing_are_silent(recwarn):
     assert not recwarn.list
 
 
-def test_parameters_inside_a_chain_move_and_what_holds_a_chain_moves_its_own(recwarn):
+def test_parameters_of_a_chain_and_of_its_container_move(recwarn):
     chain = small_chain(factorize=Scaled()).double()
     assert chain.factorize.gain.dtype == torch.float64
     assert chain.to("meta").factorize.gain.device.type == "meta"
@@ -86,7 +86,7 @@ def test_parameters_inside_a_chain_move_and_what_holds_a_chain_moves_its_own(rec
     assert model["head"].weight.device.type == "meta"
 
 
-def test_the_state_of_a_chain_is_that_of_the_parameters_put_into_it():
+def test_the_state_dict_of_a_chain_has_the_parameters_of_its_stages():
     assert small_chain().state_dict() == {}
     chain, other = small_chain(factorize=Scaled()), small_chain(factorize=Scaled())
     with torch.no_grad():
@@ -108,14 +108,14 @@ def test_a_copy_of_a_chain_gives_the_same_bits(copied):
     assert torch.equal(found.albedo, mesh().albedo)
 
 
-# Inductor takes minutes for dozens of graphs of a few operations; Dynamo cuts them out.
+# Inductor takes minutes for dozens of graphs of a few operations; Dynamo alone finds them.
 COMPILED = pytest.param(
     functools.partial(torch.compile, backend="eager"), marks=pytest.mark.slow, id="compile"
 )
 
 
 @pytest.mark.parametrize("wrapped", [COMPILED, nn.DataParallel])
-def test_a_compiled_or_replicated_warp_gives_what_the_plain_one_does(wrapped):
+def test_a_compiled_or_replicated_warp_gives_the_same_result(wrapped):
     scene, coarse = given()
     patches = pt.Decompose()(coarse, scene.cameras)
     patches = patches.replace(buckets=patches.buckets[:1])

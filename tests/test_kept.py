@@ -1,4 +1,4 @@
-"""Runs that go on where an earlier one ended."""
+"""Runs resume where an earlier one ended."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ from pimper_torch.runtime.store import digest
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
-# Of two passes over given facets, in order.
+# Two passes over given facets, in order.
 STAGES = ["silhouettes", "light", "depth_from_light", "photometry", "fuse", "remesh"]
 STAGES += ["light", "photometry", "fuse", "extract"]
 
@@ -55,7 +55,7 @@ def run(given, store, **changes):
 
 @pytest.fixture(scope="module")
 def whole(given, tmp_path_factory):
-    """A run that was never interrupted, without a store, and the store of another."""
+    """An uninterrupted run without a store, and the store of a second run."""
     folder = tmp_path_factory.mktemp("kept")
     result, listener = run(given, folder)
     assert listener.kept == []
@@ -66,7 +66,7 @@ def bits(result):
     return digest(result.replace(report=()))
 
 
-def test_a_run_that_keeps_gives_what_one_gives_that_does_not(whole):
+def test_a_store_does_not_change_the_result(whole):
     without, _, keeping = whole
     assert bits(keeping) == bits(without) is not None
     assert keeping.left_out == without.left_out
@@ -77,7 +77,7 @@ def test_a_run_that_keeps_gives_what_one_gives_that_does_not(whole):
 
 
 @pytest.mark.parametrize("done", [1, 3, 6])
-def test_a_run_goes_on_after_any_stage_to_the_same_bits(given, whole, tmp_path, done):
+def test_a_run_resumes_after_any_stage_with_the_same_bits(given, whole, tmp_path, done):
     expected, folder, _ = whole
     paths = sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime_ns)
     assert [path.name.split("-")[0] for path in paths] == STAGES
@@ -89,19 +89,19 @@ def test_a_run_goes_on_after_any_stage_to_the_same_bits(given, whole, tmp_path, 
     assert [name for name in listener.done if name in STAGES] == STAGES[done:]
 
 
-def test_a_changed_setting_runs_what_depends_on_it(given, whole):
+def test_a_changed_setting_reruns_its_dependent_stages(given, whole):
     _, folder, _ = whole
     _, listener = run(given, folder, extract={"max_hole": 0.3})
     assert "extract" in listener.done
     assert listener.kept.count("photometry") == 2
     _, listener = run(given, folder, factorize={"light_prior": 2.0})
     assert listener.kept == STAGES[:3]
-    # What the first pass gives doesn't depend on the second one's scale.
+    # The first pass does not depend on the scale of the second.
     _, listener = run(given, folder, scales=[0.25, 0.4])
     assert listener.kept == STAGES[:6]
 
 
-def test_other_photographs_are_another_run(given, whole):
+def test_different_photographs_rerun_everything(given, whole):
     _, folder, _ = whole
     scene, coarse = given
     brighter = scene.views.replace(images=scene.views.images * 1.001)
@@ -110,14 +110,14 @@ def test_other_photographs_are_another_run(given, whole):
 
 
 class Doubtful(Extract):
-    """The package's own, but of another module."""
+    """The package's stage, subclassed in a different module."""
 
     def forward(self, surface: Surface) -> Mesh:
         caution("doubtful")
         return super().forward(surface)
 
 
-def test_a_stage_of_ones_own_is_called_every_time(given, whole):
+def test_a_custom_stage_is_called_every_time(given, whole):
     _, folder, _ = whole
     chain, listener = chain_of(given, folder)
     chain.extract = Doubtful()
@@ -127,7 +127,7 @@ def test_a_stage_of_ones_own_is_called_every_time(given, whole):
     assert listener.done.count("extract") == 2
 
 
-def test_a_store_that_cannot_be_written_ends_no_run(given, whole, tmp_path):
+def test_an_unwritable_store_does_not_end_a_run(given, whole, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.warns(PimperWarning, match=r"cannot be kept there.*Free space"):
         result, _ = run(given, tmp_path / "file" / "folder")

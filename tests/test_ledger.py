@@ -1,4 +1,4 @@
-"""What guards leave out is counted, by whom and why, and nothing else changes."""
+"""Removals are recorded with guard, count and reason, without changing results."""
 
 import re
 from pathlib import Path
@@ -35,14 +35,14 @@ def test_a_mask_is_counted_and_names_are_those_of_its_photographs():
     )
 
 
-def test_outside_of_a_run_nothing_is_noted():
+def test_outside_a_run_no_removal_is_recorded():
     with noted() as entries:
         leave_out("extract.borders", torch.ones(3, dtype=torch.bool))
     assert entries == []
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_what_threads_leave_out_is_added_up_for_each_guard_and_call(threads, monkeypatch):
+def test_removals_of_threads_are_summed_per_guard_and_call(threads, monkeypatch):
     monkeypatch.setattr("pimper_torch.runtime.parallel.num_workers", lambda: threads)
 
     def work(number):
@@ -61,7 +61,7 @@ def test_what_threads_leave_out_is_added_up_for_each_guard_and_call(threads, mon
     assert distinct(entries) == (FAILED,)
 
 
-def test_a_listener_hears_masks_and_places_in_threads_too():
+def test_a_listener_receives_masks_and_positions_from_threads():
     heard = []
     vertices = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
@@ -83,7 +83,7 @@ def test_a_listener_hears_masks_and_places_in_threads_too():
     assert nothing is nowhere is None
 
 
-def test_the_closing_line_names_photographs_and_what_is_more_than_a_twentieth():
+def test_the_closing_line_names_photographs_and_removals_above_five_percent():
     left_out = [
         entry("sfm.missing", 2, 8, ("IMG_1", "IMG_2")),
         entry("remesh.data", 500, 1000),
@@ -100,7 +100,7 @@ def test_the_closing_line_names_photographs_and_what_is_more_than_a_twentieth():
     assert closing_line([entry("warp", 90, 100), entry("sfm.missing", 0, 8)]) == ""
 
 
-def test_every_guard_is_entered_somewhere_under_its_name():
+def test_every_guard_is_recorded_under_its_name():
     package = Path(pimper_torch.__file__).parent
     sources = [path.read_text() for path in package.rglob("*.py") if path.name != "ledger.py"]
     called = re.findall(r'"([a-z_.]+)"', " ".join(text for text in sources if "leave_out(" in text))

@@ -23,7 +23,7 @@ LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
 
 @pytest.fixture
 def small(monkeypatch, tmp_path):
-    """Map whatever is not empty, into a folder of the test's."""
+    """Map every tensor that is not empty, to the test's folder."""
     monkeypatch.setattr(mapped, "LARGE", 1)
     monkeypatch.setattr(mapped, "_in_memory", lambda folder: False)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -48,7 +48,7 @@ def is_mapped(tensor):
     )
 
 
-def test_large_tensors_hold_what_was_written_whatever_is_dropped(small):
+def test_mapped_tensors_keep_their_values_after_references_are_dropped(small):
     tensor = mapped.zeros((3, 5), torch.float64)
     assert is_mapped(tensor)
     assert not bool(tensor.any())
@@ -68,7 +68,7 @@ def test_photographs_on_disk_have_the_bits_of_those_in_memory(photos, request):
     assert torch.equal(plain.masks, found.masks)
 
 
-def test_nothing_is_left_of_a_file_and_its_space_comes_back(small, tmp_path):
+def test_mapped_files_are_removed_and_their_space_is_freed(small, tmp_path):
     tensor = mapped.zeros((1000,))
     assert not list(tmp_path.iterdir())
     assert len(mapped._mapped) >= 1
@@ -78,7 +78,7 @@ def test_nothing_is_left_of_a_file_and_its_space_comes_back(small, tmp_path):
 
 
 @LINUX
-def test_nothing_is_left_after_a_kill(tmp_path):
+def test_no_file_remains_after_a_kill(tmp_path):
     code = (
         "import os, signal; from pimper_torch.runtime import mapped; mapped.LARGE = 1;"
         "mapped._in_memory = lambda folder: False; held = mapped.zeros((1000,)); held += 1;"
@@ -104,7 +104,7 @@ def test_pages_on_disk_are_not_counted_as_memory(monkeypatch):
     assert float(tensor.sum()) == 2.5e7
 
 
-def test_a_disk_without_space_is_told_before_anything_is_written(small, monkeypatch):
+def test_a_full_disk_is_reported_before_writing(small, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -113,7 +113,7 @@ def test_a_disk_without_space_is_told_before_anything_is_written(small, monkeypa
         mapped.zeros((1000, 1_000_000))
 
 
-def test_files_go_to_a_disk_where_the_usual_folder_is_memory(small, monkeypatch, tmp_path):
+def test_files_go_to_disk_if_the_temporary_folder_is_in_memory(small, monkeypatch, tmp_path):
     monkeypatch.setattr(mapped, "_in_memory", lambda folder: folder == str(tmp_path))
     assert mapped._folder() == "/var/tmp"
     monkeypatch.setattr(mapped, "_in_memory", lambda folder: True)
@@ -122,7 +122,7 @@ def test_files_go_to_a_disk_where_the_usual_folder_is_memory(small, monkeypatch,
 
 
 @LINUX
-def test_folders_in_memory_are_known_by_their_mount():
+def test_folders_in_memory_are_recognised_by_their_mount():
     mounts = [line.split() for line in Path("/proc/mounts").read_text().splitlines()]
     kinds = {point: kind for _, point, kind, *_ in mounts}
     inside = [point for point, kind in kinds.items() if kind == "tmpfs"]
@@ -132,7 +132,7 @@ def test_folders_in_memory_are_known_by_their_mount():
     assert not mapped._in_memory("/proc")
 
 
-def test_parts_copies_and_selections_are_what_they_are_in_memory(request):
+def test_slices_copies_and_selections_equal_those_in_memory(request):
     tensor = torch.arange(60.0).reshape(5, 12)
     picked = torch.tensor([4, 0, 0]), torch.tensor([True, False, True, False, True])
     plain = [tensor[index] for index in picked]
@@ -148,7 +148,7 @@ def test_parts_copies_and_selections_are_what_they_are_in_memory(request):
     assert (first.shape, second.shape) == ((2, 3), (4,))
 
 
-def test_what_is_copied_keeps_its_gradient(small):
+def test_a_copy_to_disk_keeps_its_gradient(small):
     values = torch.ones(3, requires_grad=True)
     mapped.copied(values).square().sum().backward()
     assert values.grad is not None
@@ -156,7 +156,7 @@ def test_what_is_copied_keeps_its_gradient(small):
 
 
 def chain_of(photos):
-    """Load photographs, bend them, take masks for silhouettes and build pyramids."""
+    """Load and undistort photographs, use masks as silhouettes and build pyramids."""
     views = load_views(photos, masks=photos.with_name("masks"))
     params = (30.0, 15.0, 10.0, -0.1)
     lens = CameraModel(camera=1, model="SIMPLE_RADIAL", params=params, width=30, height=20)
@@ -183,6 +183,6 @@ def test_small_tensors_and_those_of_other_devices_stay_in_memory():
     assert mapped.zeros((mapped.LARGE,), torch.uint8, "meta").is_meta
 
 
-def test_a_folder_that_may_not_be_written_or_is_gone_is_passed_over(small, monkeypatch, tmp_path):
+def test_an_unwritable_or_missing_folder_is_skipped(small, monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
     assert mapped._folder() == "/var/tmp"

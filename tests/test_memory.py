@@ -17,12 +17,12 @@ def test_sizes_are_read(text, size):
 
 
 @pytest.mark.parametrize("text", ["4", "GB", "-1GB", "4 TB", "4GB or so"])
-def test_what_is_no_size_is_refused(text):
+def test_an_invalid_size_is_refused(text):
     with pytest.raises(ConfigError, match=r"max_memory is .* such as 4GB"):
         pt.load_config("default", {"max_memory": text})
 
 
-def test_a_surface_is_fused_whole_by_blocks_or_not_at_all(monkeypatch):
+def test_memory_decides_between_whole_blockwise_and_no_fusion(monkeypatch):
     scene, coarse = small_scene(num_views=6, width=64)
     patches = Decompose()(coarse, scene.cameras)
     assert largest_problem(float("inf"), patches, 0.5, 1.0) == float("inf")
@@ -39,16 +39,16 @@ def test_a_surface_is_fused_whole_by_blocks_or_not_at_all(monkeypatch):
         limit = 1e5 * 1.1**step
         with suppress(ReconstructionError):
             found.append(limit / largest_problem(limit, patches, 0.5, 1.0))
-    # Parts of the limit, in vertices of blocks: none where all fits, the larger limits.
+    # Fractions of the limit per block vertex: zero once everything fits, at larger limits.
     first = next(index for index, part in enumerate(found) if part == 0)
     assert first > 0
     assert not any(found[first:])
     assert all(part / found[0] in (0.25, 0.5, 1, 2, 4) for part in found[:first])
 
 
-def test_what_is_held_is_what_was_allocated():
+def test_resident_memory_grows_by_the_allocation():
     before = resident_bytes()
-    with mmap.mmap(-1, 100_000_000) as block:  # of the system, whatever the process has free
+    with mmap.mmap(-1, 100_000_000) as block:  # from the system, not from the heap
         for page in range(0, len(block), mmap.PAGESIZE):
             block[page] = 1
         assert 8e7 < resident_bytes() - before < 1.2e8

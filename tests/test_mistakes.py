@@ -1,4 +1,4 @@
-"""Plausible mistakes are refused in a sentence that says what was found and what to do."""
+"""Plausible mistakes are refused with a message that names the error and its fix."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def scene_of(scene, images):
 
 
 @pytest.mark.parametrize(
-    ("mistaken", "told"),
+    ("mistaken", "message"),
     [
         (
             lambda linear: linear.permute(0, 2, 3, 1),
@@ -45,12 +45,12 @@ def scene_of(scene, images):
         (lambda linear: to_bytes(linear).numpy(), "images is uint8; "),
     ],
 )
-def test_images_of_another_layout_range_or_coding_are_refused(given, mistaken, told):
-    with pytest.raises(pt.InputError, match=told):
+def test_images_of_a_wrong_layout_range_or_encoding_are_refused(given, mistaken, message):
+    with pytest.raises(pt.InputError, match=message):
         scene_of(given, mistaken(given.views.images))
 
 
-def test_images_that_look_like_srgb_are_warned_of_and_not_when_decoded(given, recwarn):
+def test_srgb_images_are_warned_of_and_linear_ones_are_not(given, recwarn):
     coded = to_bytes(given.views.images) / 255
     with pytest.warns(pt.PimperWarning, match=r"255ths.*hold sRGB.*linear_from_srgb\(images\)"):
         scene_of(given, coded)
@@ -63,7 +63,7 @@ def test_images_that_look_like_srgb_are_warned_of_and_not_when_decoded(given, re
 
 
 @pytest.mark.parametrize(
-    ("mistaken", "told"),
+    ("mistaken", "message"),
     [
         (torch.linalg.inv, r"by `torch.linalg.inv\(poses\)`: they seem to be camera-to-world;"),
         (lambda poses: FLIP @ poses, r"by `flip @ poses`, with `flip = .*y up and z backward"),
@@ -74,7 +74,7 @@ def test_images_that_look_like_srgb_are_warned_of_and_not_when_decoded(given, re
     ],
 )
 @pytest.mark.parametrize("preset", ["default", "paper"])
-def test_poses_of_another_direction_or_other_axes_are_told_by_the_mesh(preset, mistaken, told):
+def test_a_mesh_reveals_inverted_poses_and_flipped_axes(preset, mistaken, message):
     scene = ball.photographed(ball.all_round())
     vertices, faces = icosphere(1)
     mesh = pt.Mesh(vertices_world=vertices, faces=faces)
@@ -82,12 +82,14 @@ def test_poses_of_another_direction_or_other_axes_are_told_by_the_mesh(preset, m
     chain.placed(chain.running(), scene, None, mesh)
     poses = mistaken(scene.cameras.cam_from_world)
     wrong = pt.scene_of(scene.views.images, scene.cameras.intrinsics, poses)
-    with pytest.raises(pt.InputError, match=f"^The given mesh is in .* of 12 photographs.*{told}"):
+    with pytest.raises(
+        pt.InputError, match=f"^The given mesh is in .* of 12 photographs.*{message}"
+    ):
         chain(wrong, mesh=mesh)
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (
             lambda: pt.load_chain("default", {"sweep": {"step": 7}}),
@@ -103,15 +105,15 @@ def test_poses_of_another_direction_or_other_axes_are_told_by_the_mesh(preset, m
         ),
     ],
 )
-def test_a_misspelt_stage_or_setting_is_answered_by_the_nearest(call, told):
+def test_a_misspelt_stage_or_setting_suggests_the_nearest(call, message):
     with pytest.raises(pt.ConfigError) as caught:
         call()
-    assert str(caught.value).startswith(told)
+    assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])
 @pytest.mark.parametrize(
-    ("handed", "told"),
+    ("handed", "message"),
     [
         ("photos/", "views is str; needed: Views or SparseScene. `load_views` reads"),
         (Path("photos"), "views is PosixPath; .* `load_views` reads"),
@@ -120,14 +122,14 @@ def test_a_misspelt_stage_or_setting_is_answered_by_the_nearest(call, told):
         (None, "views is NoneType; .*It comes from whoever"),
     ],
 )
-def test_what_is_given_in_place_of_views_is_answered_by_what_makes_them(preset, handed, told):
+def test_a_wrong_argument_for_views_names_the_function_that_makes_views(preset, handed, message):
     chain = pt.load_chain(preset)
     for call in (chain, lambda views: next(chain.steps(views))):
-        with pytest.raises(pt.InputError, match=f"^{type(chain).__name__}: {told}"):
+        with pytest.raises(pt.InputError, match=f"^{type(chain).__name__}: {message}"):
             call(handed)
 
 
-def test_only_where_views_are_wanted_it_is_said_what_reads_them(given):
+def test_load_views_is_suggested_only_for_arguments_of_type_views(given):
     with pytest.raises(pt.InputError, match=r"^Warp: views is str; .* `load_views` reads"):
         pt.Warp()("photos/", given.cameras, None)
     with pytest.raises(pt.InputError, match=r"^Decompose: coarse is Tensor; .*It comes from whoe"):

@@ -1,4 +1,4 @@
-"""Notebooks are kept with what they said and drew, and say and draw it again."""
+"""Notebooks are stored with their outputs, and reproduce them."""
 
 import base64
 import doctest
@@ -42,7 +42,7 @@ def differ(before, after):
     return len(list(run.differences(notebook(before), notebook(after))))
 
 
-def test_runs_differ_where_a_word_a_number_or_a_picture_does():
+def test_outputs_differ_in_words_numbers_and_images():
     said = cell("3.00 degrees off")
     assert differ(said, cell("3.05 degrees off")) == 0  # within the tolerance
     assert differ(said, cell("3.20 degrees off")) == 1
@@ -50,7 +50,7 @@ def test_runs_differ_where_a_word_a_number_or_a_picture_does():
     assert differ(said, cell("")) == 1
     assert differ(cell("100 facets"), cell("103 facets")) == 1
     assert differ(cell("100 facets", tolerance=0.05), cell("103 facets")) == 0
-    assert differ(cell("0.01 of it"), cell("0.02 of it")) == 0  # one in the last digit
+    assert differ(cell("0.01 of it"), cell("0.02 of it")) == 0  # one unit of the last digit
     assert differ(cell("0.01 of it"), cell("0.03 of it")) == 1
     pieces = cell("3.00 degrees")
     pieces.outputs += cell(" off").outputs
@@ -61,13 +61,13 @@ def test_runs_differ_where_a_word_a_number_or_a_picture_does():
     assert list(run.differences(notebook(said), notebook(said, cell())))
 
 
-def test_the_example_of_the_comparison_holds():
+def test_the_example_of_the_comparison_is_correct():
     ran = doctest.testmod(run)
     assert ran.attempted > 0
     assert ran.failed == 0
 
 
-def test_the_digest_is_of_what_runs():
+def test_the_digest_covers_only_code():
     text = nbformat.v4.new_markdown_cell("words")
     one, other = nbformat.v4.new_code_cell("1"), nbformat.v4.new_code_cell("2")
     assert run.digest(notebook(one, text)) == run.digest(notebook(text, one))
@@ -76,7 +76,7 @@ def test_the_digest_is_of_what_runs():
 
 
 @every
-def test_a_notebook_is_kept_with_the_outputs_of_its_source(path):
+def test_a_notebook_has_the_outputs_of_its_source(path):
     kept = run.read(path)
     cells = run.code_cells(kept)
     assert kept.metadata["pimper_torch"]["ran"] == run.digest(kept), (
@@ -85,13 +85,13 @@ def test_a_notebook_is_kept_with_the_outputs_of_its_source(path):
     assert [one.execution_count for one in cells] == list(range(1, len(cells) + 1))
     outputs = [output for one in cells for output in one.outputs]
     assert all(output.output_type != "error" for output in outputs)
-    assert all(output.get("name") != "stderr" for output in outputs)  # paths of a machine
+    assert all(output.get("name") != "stderr" for output in outputs)  # contains local paths
     assert any(run.pictures(one) for one in cells)
     assert path.stat().st_size < MAX_BYTES
 
 
 @pytest.mark.slow
 @every
-def test_a_notebook_says_and_draws_again_what_it_is_kept_with(path):
+def test_a_notebook_reproduces_its_outputs(path):
     kept = run.read(path)
     assert list(run.differences(kept, run.executed(kept))) == []

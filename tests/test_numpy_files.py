@@ -1,4 +1,4 @@
-"""NumPy's files: what NumPy wrote comes back, and what a stranger wrote takes no memory."""
+"""Files written by NumPy are read, and untrusted ones allocate no memory."""
 
 import io
 import struct
@@ -22,7 +22,7 @@ from pimper_torch.runtime.numpy_files import read_npy, read_npz
         np.arange(3, dtype=">f4"),
     ],
 )
-def test_arrays_come_back_as_numpy_reads_them(array, tmp_path):
+def test_arrays_are_read_as_by_numpy(array, tmp_path):
     np.save(tmp_path / "a.npy", array)
     np.savez_compressed(tmp_path / "a.npz", first=array, second=array[..., None])
     np.testing.assert_array_equal(read_npy(tmp_path / "a.npy"), array)
@@ -48,7 +48,7 @@ def header(text):
         "{'descr': '<f8', 'fortran_order': False, 'shape': (2**9**9,), }\n",
     ],
 )
-def test_a_header_that_says_too_much_is_refused_before_memory_is_taken(tmp_path, text):
+def test_an_oversized_header_is_refused_before_allocation(tmp_path, text):
     (tmp_path / "a.npy").write_bytes(header(text) + bytes(64))
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("a.npy", header(text) + bytes(64))
@@ -59,7 +59,7 @@ def test_a_header_that_says_too_much_is_refused_before_memory_is_taken(tmp_path,
     assert getrusage(RUSAGE_SELF).ru_maxrss - before < 1e4  # kB
 
 
-def test_an_archive_that_unpacks_to_more_than_is_allowed_is_refused(tmp_path):
+def test_an_archive_that_unpacks_beyond_the_limit_is_refused(tmp_path):
     with (
         zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
         archive.open("a.npy", "w") as member,
@@ -71,7 +71,7 @@ def test_an_archive_that_unpacks_to_more_than_is_allowed_is_refused(tmp_path):
         read_npz(tmp_path / "a.npz")
 
 
-def test_what_is_no_array_or_archive_is_refused(tmp_path):
+def test_a_file_without_array_or_archive_is_refused(tmp_path):
     path = tmp_path / "a"
     whole = io.BytesIO()
     np.savez_compressed(whole, a=np.random.default_rng(0).random(100))

@@ -1,4 +1,4 @@
-"""Pages say what is so: links lead somewhere, messages are the program's, scripts have options."""
+"""Pages are correct: links resolve, and quoted messages and script options exist."""
 
 import ast
 import functools
@@ -27,7 +27,7 @@ MODULE = re.compile(r"^\.\. automodule:: (\S+)$", flags=re.MULTILINE)
 SCRIPT = re.compile(r"^    .*?python (benchmarks/\w+\.py)(.*)$", flags=re.MULTILINE)
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 
-# The site has these pages from elsewhere.
+# The site gets these pages from other places.
 INCLUDED = {DOCS / "benchmarks.md": ROOT / "benchmarks" / "README.md"}
 
 
@@ -36,7 +36,7 @@ def text_of(page: Path) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """Name headings as GitHub and the site do."""
+    """Return the anchors of headings, as on GitHub and the site."""
     plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in HEADING.findall(text_of(page)))
     return {heading.strip().replace(" ", "-") for heading in plain}
 
@@ -60,12 +60,12 @@ def bare(text: str) -> str:
     return " ".join(text.replace("`", "").split())
 
 
-def test_messages_of_the_page_on_failures_are_the_programs():
+def test_messages_on_the_page_on_failures_are_in_the_code():
     quoted = re.findall(r"^\| `(.+?)` \| ", text_of(DOCS / "failures.md"), flags=re.MULTILINE)
     assert len(quoted) > 25
     files = (path for package in PACKAGES for path in package.rglob("*.py"))
-    told = [bare(one) for path in files for _, one in strings(ast.parse(path.read_text("utf-8")))]
-    assert [quote for quote in quoted if not any(bare(quote) in text for text in told)] == []
+    texts = [bare(one) for path in files for _, one in strings(ast.parse(path.read_text("utf-8")))]
+    assert [quote for quote in quoted if not any(bare(quote) in text for text in texts)] == []
 
 
 def documented() -> set[str]:
@@ -82,7 +82,7 @@ def test_the_reference_has_the_modules_of_all_public_names():
     assert homes <= documented()
 
 
-def test_the_reference_names_modules_that_there_are():
+def test_the_reference_names_existing_modules():
     for name in documented():
         assert import_module(name).__doc__, name
 
@@ -90,13 +90,13 @@ def test_the_reference_names_modules_that_there_are():
 @functools.cache
 def options_of(script: str) -> set[str]:
     found = set(re.findall(r'"(--[a-z-]+)"', (ROOT / script).read_text(encoding="utf-8")))
-    if script.endswith("speed.py"):  # hands the others to `pimper reconstruct`
+    if script.endswith("speed.py"):  # passes the others to `pimper reconstruct`
         fields = (*CommonOptions.__dataclass_fields__, *InputOptions.__dataclass_fields__)
         found |= {f"--{name.replace('_', '-')}" for name in fields}
     return found
 
 
-def test_scripts_of_the_benchmarks_have_the_options_that_the_page_gives_them():
+def test_benchmark_scripts_have_the_documented_options():
     page = text_of(ROOT / "benchmarks" / "README.md")
     commands = SCRIPT.findall(page)
     assert len(commands) > 20

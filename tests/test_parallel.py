@@ -19,7 +19,7 @@ def two_threads():
     torch.set_num_threads(before)
 
 
-def test_results_come_in_the_order_of_the_items(two_threads):
+def test_results_have_the_order_of_the_items(two_threads):
     def work(item):
         time.sleep(0.02 if item % 2 == 0 else 0)
         return item * item
@@ -27,12 +27,12 @@ def test_results_come_in_the_order_of_the_items(two_threads):
     assert list(side_by_side(work, range(9))) == [item * item for item in range(9)]
 
 
-def test_two_items_are_worked_on_at_the_same_time(two_threads):
+def test_two_items_are_processed_in_parallel(two_threads):
     both = threading.Barrier(2, timeout=10)
     assert list(side_by_side(lambda _: both.wait() >= 0, range(2))) == [True, True]
 
 
-def test_workers_have_one_thread_each_and_torch_gets_its_own_back(two_threads):
+def test_workers_have_one_thread_each_and_torch_restores_its_threads(two_threads):
     inside = list(side_by_side(lambda _: (torch.get_num_threads(), num_workers()), range(4)))
     assert inside == [(1, 1)] * 4
     assert torch.get_num_threads() == 2
@@ -40,7 +40,7 @@ def test_workers_have_one_thread_each_and_torch_gets_its_own_back(two_threads):
     assert torch.get_num_threads() == 2
 
 
-def test_workers_see_the_callers_context_and_whether_gradients_are_recorded(two_threads):
+def test_workers_inherit_the_callers_context_and_grad_mode(two_threads):
     token = COLOUR.set("red")
     with torch.no_grad():
         seen = list(side_by_side(lambda _: (COLOUR.get(), torch.is_grad_enabled()), range(3)))
@@ -49,7 +49,7 @@ def test_workers_see_the_callers_context_and_whether_gradients_are_recorded(two_
     assert all(side_by_side(lambda _: torch.is_grad_enabled(), range(3)))
 
 
-def test_work_within_work_stays_in_its_worker(two_threads):
+def test_nested_work_stays_in_its_worker(two_threads):
     def outer(item):
         here = threading.get_ident()
         return all(side_by_side(lambda _: threading.get_ident() == here, range(3)))
@@ -57,7 +57,7 @@ def test_work_within_work_stays_in_its_worker(two_threads):
     assert all(side_by_side(outer, range(3)))
 
 
-def test_the_first_failure_in_order_is_raised_and_no_more_is_begun(two_threads):
+def test_the_first_failure_in_order_is_raised_and_stops_new_work(two_threads):
     begun = []
 
     def work(item):
@@ -72,7 +72,7 @@ def test_the_first_failure_in_order_is_raised_and_no_more_is_begun(two_threads):
     assert torch.get_num_threads() == 2
 
 
-def test_no_more_results_than_workers_wait_to_be_taken(two_threads):
+def test_at_most_one_result_per_worker_is_pending(two_threads):
     begun = []
     results = side_by_side(lambda item: begun.append(item), range(100))
     next(results)
@@ -81,16 +81,16 @@ def test_no_more_results_than_workers_wait_to_be_taken(two_threads):
     assert len(begun) <= 4
 
 
-def test_progress_counts_items_and_not_what_they_walk_through(two_threads):
-    told = []
-    with listening(lambda done, total: told.append((done, total))):
+def test_progress_counts_items_and_ignores_their_inner_progress(two_threads):
+    progress = []
+    with listening(lambda done, total: progress.append((done, total))):
         list(side_by_side(lambda _: list(track(range(7))), range(3)))
         list(side_by_side(lambda _: None, range(3), tracked=False))
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert progress == [(1, 3), (2, 3), (3, 3)]
 
 
 @pytest.mark.parametrize(("rows", "size", "parts"), [(40_000, 1, 2), (100, 1, 1), (100, 400, 2)])
-def test_ranges_make_up_all_rows_and_answer_in_their_order(two_threads, rows, size, parts):
+def test_ranges_partition_all_rows_in_order(two_threads, rows, size, parts):
     found = over_rows(lambda given, first, last: (given, first, last), rows, "it", size=size)
     assert [each[0] for each in found] == ["it"] * parts
     assert [each[1:] for each in found] == [

@@ -1,4 +1,4 @@
-"""Whatever takes a path takes a string: mypy checks that the bodies treat it as one."""
+"""Every path argument accepts a string; mypy checks that the bodies convert it."""
 
 import importlib
 import inspect
@@ -11,13 +11,13 @@ import pytest
 
 import pimper_torch
 
-# Rooms whose public functions people call; of the wings, what a room exports.
+# Subpackages whose public functions users call; of the optional ones, their exports.
 ROOMS = ("method.chains", "runtime.config", "doors.io", "records", "result.viz")
 EXPORTING = ("baselines", "datasets", "metrics", "scenes")
 
 
 def functions() -> Iterator[typing.Any]:
-    """List what users call: exported names, and the public functions of the rooms at the edge."""
+    """Yield what users call: exported names, and public functions of the outer subpackages."""
     yield from (getattr(pimper_torch, name) for name in pimper_torch._names)
     for name in EXPORTING:
         room = importlib.import_module(f"pimper_bench.{name}")
@@ -39,15 +39,15 @@ def modules() -> Iterator[str]:
 
 
 def parameters(found: typing.Any) -> Iterator[tuple[str, typing.Any]]:
-    """Give annotated parameters of a function, or of a class's constructor and methods."""
+    """Yield annotated parameters of a function, or of a class's constructor and methods."""
     names = vars(found) if inspect.isclass(found) else {"": found}
     for name, one in names.items():
         if inspect.isfunction(one) and (not name.startswith("_") or name == "__init__"):
-            # Figures are annotated in quotes: matplotlib is imported when one is drawn.
+            # Figures are annotated as strings: matplotlib is imported when one is drawn.
             hints = inspect.get_annotations(inspect.unwrap(one))
             for key, hint in hints.items():
                 options = {key: hint}
-                if typing.get_origin(hint) is typing.Unpack:  # of a dictionary that readers share
+                if typing.get_origin(hint) is typing.Unpack:  # a dictionary shared by readers
                     options = typing.get_type_hints(typing.get_args(hint)[0])
                 yield from (
                     (f"{found.__name__}.{name}({key})", one) for key, one in options.items()

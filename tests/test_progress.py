@@ -9,7 +9,7 @@ def test_every_batch_is_reported_with_the_total():
     assert heard == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_nobody_listening_is_no_error_and_listeners_do_not_outlive_their_block():
+def test_progress_needs_no_listener_and_listeners_end_with_their_block():
     heard = []
     with listening(lambda done, total: heard.append(done)):
         pass
@@ -17,7 +17,7 @@ def test_nobody_listening_is_no_error_and_listeners_do_not_outlive_their_block()
     assert heard == []
 
 
-def test_the_inner_listener_hears_and_the_outer_one_comes_back():
+def test_the_inner_listener_replaces_the_outer_one_within_its_block():
     outer, inner = [], []
     with listening(lambda done, total: outer.append(done)):
         with listening(lambda done, total: inner.append(done)):

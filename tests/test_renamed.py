@@ -1,4 +1,4 @@
-"""Names of the last version work for one more, with a warning that names the new one."""
+"""Names of the previous version work for one more, with a warning that gives the new name."""
 
 import pytest
 import torch
@@ -12,19 +12,19 @@ from pimper_torch.method.photometry import Bilinear, Cone
     ("old", "new"),
     [("size", "scale"), ("exchange", "export"), ("settled", "resolve_prior_conventions")],
 )
-def test_former_names_of_the_package_are_found_with_a_warning(old, new):
+def test_former_names_of_the_package_work_with_a_warning(old, new):
     with pytest.warns(DeprecationWarning, match=f"`pimper_torch.{old}` is now `{new}`"):
         assert getattr(pt, old) is getattr(pt, new)
 
 
-def test_a_former_name_of_a_record_is_found_with_a_warning():
+def test_a_former_name_of_a_record_works_with_a_warning():
     with pytest.warns(DeprecationWarning, match="`Lens` is now `CameraModel`"):
         assert pt.records.Lens is pt.records.CameraModel
     with pytest.raises(AttributeError, match="has no attribute 'Lense'"):
         pt.records.Lense  # noqa: B018
 
 
-def test_a_record_is_made_and_read_by_former_names_of_its_fields():
+def test_former_names_of_fields_work_in_constructor_and_attribute():
     lights = torch.rand(1, 3, 4)
     fields = {"radiance": torch.rand(1, 3, 5), "weight": torch.ones(1, 3, 5), "lights": lights}
     fields |= {"shading": torch.rand(1, 4, 5), "regularization": torch.ones(1, 3)}

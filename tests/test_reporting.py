@@ -46,7 +46,7 @@ class Listener(Silent):
         self.heard.append(f"finished {report.name}")
 
 
-def test_stages_are_reported_in_the_order_they_run_with_their_figures():
+def test_stages_are_reported_in_order_with_their_figures():
     listener = Listener()
     with recorded(listener) as reports:
         called("second", tetrahedron)
@@ -57,7 +57,7 @@ def test_stages_are_reported_in_the_order_they_run_with_their_figures():
     assert listener.heard[:3] == ["started second", "1/1", "finished second"]
 
 
-def test_a_stage_that_fails_does_not_finish_and_those_inside_another_are_part_of_it():
+def test_failed_and_nested_stages_have_no_report():
     listener = Listener()
     with recorded(listener):
         with pytest.raises(ValueError, match="on purpose"):
@@ -67,7 +67,7 @@ def test_a_stage_that_fails_does_not_finish_and_those_inside_another_are_part_of
 
 
 def test_threads_have_reports_of_their_own():
-    told = {}
+    names = {}
     inside = threading.Barrier(2, timeout=60)
     listeners = {"first": Listener(), "second": Listener()}
 
@@ -76,14 +76,14 @@ def test_threads_have_reports_of_their_own():
             inside.wait()
             called(stage, tetrahedron)
             inside.wait()
-        told[stage] = [entry.name for entry in reports]
+        names[stage] = [entry.name for entry in reports]
 
     threads = [threading.Thread(target=call, args=(stage,)) for stage in listeners]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert told == {name: [name, "between stages"] for name in listeners}
+    assert names == {name: [name, "between stages"] for name in listeners}
     for name, listener in listeners.items():
         assert listener.heard == [f"started {name}", "1/1", f"finished {name}"]
 
@@ -98,13 +98,13 @@ class Clock:
         self.now += seconds
 
 
-def test_every_second_of_a_call_belongs_to_one_line(monkeypatch):
+def test_times_of_stages_sum_to_the_time_of_the_call(monkeypatch):
     clock = Clock()
     for module in (journal, reporting):
         monkeypatch.setattr(module, "time", clock)
     kept = StageReport(name="kept", seconds=1e6, peak_memory_mb=0.0, figures={}, kept=True)
     with recorded(Silent()) as reports:
-        with stage("read"), aside("keep"):  # a stage's own, whatever it does
+        with stage("read"), aside("keep"):  # counts as time of the stage
             clock.sleep(1)
         for _ in range(2):
             with recorded(Silent()):
@@ -123,8 +123,8 @@ def test_every_second_of_a_call_belongs_to_one_line(monkeypatch):
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux what is resident")
-def test_peak_memory_rises_by_what_is_allocated_and_does_not_fall():
-    """In a process of its own: pages of a long one may be reclaimed or used again meanwhile."""
+def test_peak_memory_rises_by_the_allocation_and_does_not_fall():
+    """In a new process: pages of a long-running one may be reclaimed or reused."""
     source = """
 import mmap, pathlib, torch
 from pimper_torch.runtime.reporting import peak_memory_mb
@@ -138,9 +138,9 @@ print(before, risen, peak_memory_mb())
     command = [sys.executable, "-c", source]
     answer = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     before, risen, after = map(float, answer.split())
-    assert risen - before == pytest.approx(64, abs=8)  # the interpreter's own
+    assert risen - before == pytest.approx(64, abs=8)  # the interpreter's allocations
     assert after == pytest.approx(risen, abs=8)
 
 
-def test_what_has_no_figures_reports_none():
+def test_a_record_without_figures_reports_none():
     assert figures("nothing of ours") == {}

@@ -8,7 +8,7 @@ from pimper_torch.runtime.errors import PimperWarning, caution
 
 
 class Noting(nn.Module):
-    """A stage that gives what it was handed, in a list, and says that it was called."""
+    """Returns its inputs as a list, and emits a warning at every call."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -29,7 +29,7 @@ def running(stages):
     return Running(names={one: name for name, one in stages.items()}, store=None)
 
 
-def test_passes_but_the_last_are_silent_unless_they_fail(stages):
+def test_only_the_last_pass_warns_unless_one_fails(stages):
     run = running(stages)
     with pytest.warns(PimperWarning) as caught:
         found = [run(stages["fuse"], *one) for one in run.passes((0.25, 0.5, 1.0))]

@@ -1,4 +1,4 @@
-"""What SECURITY.md says of the package's own code."""
+"""The package's code agrees with SECURITY.md."""
 
 import ast
 from functools import cache
@@ -14,7 +14,7 @@ NETWORK = {"socket", "urllib", "http", "ftplib", "requests", "httpx", "aiohttp",
 
 @cache
 def _found():
-    """List imports and calls of all files: once, and only where a test asks for them."""
+    """List imports and calls of all files, once and only on demand."""
     imports, calls = [], []
     for package, path in ((each, path) for each in PACKAGES for path in each.rglob("*.py")):
         name = path.relative_to(package).as_posix()
@@ -45,19 +45,19 @@ def test_nothing_is_unpickled():
     assert not [path for path, name, _ in calls() if name == "torch.load"]
 
 
-def test_no_network_connection_is_opened():
+def test_no_network_connection_is_made():
     found = {path for path, name in imports() if name in NETWORK}
-    assert found == {"result/viewer/server.py"}  # which looks whether an address is this machine's
+    assert found == {"result/viewer/server.py"}  # checks whether an address is local
 
 
-def test_no_text_is_evaluated():
+def test_no_text_is_evaluated_as_code():
     assert not [path for path, name, _ in calls() if name in ("eval", "exec", "compile")]
     assert not [path for path, name, _ in calls() if name in ("os.system", "yaml.unsafe_load")]
     loaders = {path for path, name, _ in calls() if name == "yaml.load"}
     assert loaders == {"runtime/config.py"}  # by a subclass of SafeLoader
 
 
-def test_only_baselines_and_python_itself_are_run():
+def test_only_baselines_and_python_are_run_as_processes():
     assert {path for path, name in imports() if name in ("subprocess", "pty")} == {
         "result/asset/atlas.py",  # Python, which calls xatlas
         "cli/batches/task.py",  # Python, which is `pimper reconstruct`

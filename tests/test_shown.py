@@ -1,4 +1,4 @@
-"""What documents show is real: commands, options, settings, names, files and extras exist."""
+"""Commands, options, settings, names, files and extras in documents exist."""
 
 import functools
 import re
@@ -35,14 +35,14 @@ SOURCES = [path for path in FILES if CODE.search(path.read_text("utf-8"))]
 
 
 def named(path: Path) -> str:
-    inside = path.is_relative_to(PACKAGE)  # which may be installed elsewhere
+    inside = path.is_relative_to(PACKAGE)  # may be installed in a different place
     return path.relative_to(PACKAGE.parent if inside else ROOT).as_posix()
 
 
 REFUSALS = (AssertionError, PimperError, AttributeError, TypeError, ImportError, SyntaxError)
 
 
-# -- one check for each kind of code within a sentence, the first that its form asks for ----------
+# -- one check for each kind of inline code; the first whose form matches is used -----------------
 def extras(text: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     offered = {*project["project"]["optional-dependencies"], *project["dependency-groups"], "…"}
@@ -52,7 +52,7 @@ def extras(text: str) -> None:
 
 
 def dotted(text: str) -> None:
-    """A setting, a guard, or a name in a module, from the package or below it."""
+    """Check a setting, a guard, or a name in a module, absolute or relative to a package."""
     if text in understood.settings() or text in GUARDS:
         return
     first, *rest = path = text.split(".")
@@ -66,7 +66,7 @@ def dotted(text: str) -> None:
 
 
 def is_defined(path: list[str], package: Path = PACKAGE) -> bool:
-    """Whether names lead to a module, or to what one defines."""
+    """Return whether dotted names lead to a module or a definition in one."""
     place, rest = package, [*path]
     while rest and (place / rest[0]).is_dir():
         place /= rest.pop(0)
@@ -81,7 +81,7 @@ def is_defined(path: list[str], package: Path = PACKAGE) -> bool:
 
 @functools.cache
 def words_of(file: Path) -> set[str]:
-    """Names that a module binds; quicker than to import it."""
+    """Return names that a module binds; faster than an import."""
     text = file.read_text(encoding="utf-8")
     stub = file.with_suffix(".pyi")
     text += stub.read_text(encoding="utf-8") if stub.exists() else ""
@@ -92,7 +92,7 @@ def words_of(file: Path) -> set[str]:
 
 
 def role(name: str) -> None:
-    """A name in full, or one of the module or of another of the packages."""
+    """Check a full name, or one of the module or of any package."""
     first, *rest = name.split(".")
     if first in PACKAGES:
         assert is_defined(rest, PACKAGES[first]), f"{name} leads nowhere"
@@ -109,7 +109,7 @@ def words_of_packages() -> set[str]:
 def file(text: str) -> None:
     roots = (ROOT, PACKAGE, BENCH)
     if not any((root / text.split("/")[0]).exists() for root in roots) and "/" in text:
-        return  # of another project
+        return  # of a different project
     ends = [f"/{named(one)}" for one in every_file()]
     assert any(end.endswith(f"/{text.lstrip('./')}") for end in ends), f"there is no file {text}"
 
@@ -127,7 +127,7 @@ def options_of_benchmarks() -> set[str]:
 
 
 def python(text: str) -> None:
-    """An expression, or the first line of a loop."""
+    """Check an expression, or the first line of a loop."""
     followed.follow(text if not text.startswith("for ") else f"{text}: ...")
 
 
@@ -163,7 +163,7 @@ def console(block: str) -> None:
             extras(command)
 
 
-# Those of Sphinx have braces.
+# Sphinx directives have braces.
 BLOCKS: dict[str, Callable[[str], None]] = {
     "python": followed.follow,
     "yaml": lambda block: understood.setting(yaml.safe_load(block)),
@@ -173,7 +173,7 @@ BLOCKS: dict[str, Callable[[str], None]] = {
 
 
 def pieces() -> Iterator[Any]:
-    """What documents show, each text of a document once."""
+    """Yield the code in documents, each text once per document."""
     for path in DOCUMENTS:
         once = {piece.text: piece for piece in reversed([*shown_in(path)])}
         for piece in reversed(once.values()):
@@ -184,13 +184,13 @@ def pieces() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("piece", "check"), [*pieces()])
-def test_what_documents_show_is_there(piece, check, monkeypatch):
+def test_code_in_documents_exists(piece, check, monkeypatch):
     monkeypatch.chdir(ROOT)
     check(piece.text)
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=named)
-def test_what_docstrings_and_messages_show_is_there(path, monkeypatch):
+def test_code_in_docstrings_and_messages_exists(path, monkeypatch):
     monkeypatch.chdir(ROOT)
     wrong = []
     for piece in shown_in(path):
@@ -237,7 +237,7 @@ def test_what_docstrings_and_messages_show_is_there(path, monkeypatch):
         "```python\nimport pimper_torch as p\nviews = p.load_views('a')\nviews.imagez\n```",
     ],
 )
-def test_what_is_not_there_is_refused(text, monkeypatch):
+def test_code_that_does_not_exist_is_refused(text, monkeypatch):
     monkeypatch.chdir(ROOT)
     (piece,) = in_markdown(text)
     check = check_of(piece)

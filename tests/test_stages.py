@@ -1,4 +1,4 @@
-"""What a swapped stage may get wrong is told where its record enters the next one."""
+"""Errors of a custom stage are reported where its record enters the next stage."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from torch import nn
 import pimper_torch as pt
 from pimper_torch.runtime.stage import Given
 
-# Some of the few patches are not lit in enough views.
+# Some of the few patches have too few lit views.
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
 
@@ -29,7 +29,7 @@ def chain_on(scene, coarse):
 
 
 def changed(found, **changes):
-    """Change fields of the first bucket."""
+    """Replace fields of the first bucket."""
     first, *rest = found.buckets
     new = {name: change(getattr(first, name)) for name, change in changes.items()}
     return found.replace(buckets=(first.replace(**new), *rest))
@@ -44,7 +44,7 @@ def spoilt(normals):
 
 
 @pytest.mark.parametrize(
-    ("mistake", "told"),
+    ("mistake", "message"),
     [
         (lambda found: None, "photometric is NoneType; needed: PhotometricPatches"),
         (lambda found: found.patches, "photometric is PatchSet; needed: PhotometricPatches"),
@@ -73,13 +73,13 @@ def spoilt(normals):
         (lambda found: changed(found, information=lambda i: -1 - i), "outside .0, inf., such as -"),
     ],
 )
-def test_a_factorization_of_ones_own_is_told_what_is_wrong(factorized, mistake, told):
+def test_errors_of_a_custom_factorization_are_named(factorized, mistake, message):
     scene, seen, found = factorized
-    with pytest.raises(pt.InputError, match=f"Sweep: .*{told}"):
+    with pytest.raises(pt.InputError, match=f"Sweep: .*{message}"):
         pt.Sweep()(scene.views, scene.cameras, seen, mistake(found))
 
 
-def test_in_a_chain_the_message_names_the_stage_that_was_handed_it():
+def test_in_a_chain_the_message_names_the_receiving_stage():
     scene, coarse = small_scene(num_views=5, width=48)
     chain = chain_on(scene, coarse)
     chain.factorize = Given(None)
@@ -87,7 +87,7 @@ def test_in_a_chain_the_message_names_the_stage_that_was_handed_it():
         chain(scene)
 
 
-def test_what_stages_give_passes_and_is_looked_through_once(factorized, monkeypatch):
+def test_records_of_stages_are_valid_and_checked_once(factorized, monkeypatch):
     _, _, found = factorized
     calls = []
     monkeypatch.setattr("pimper_torch.records.patches.not_unit", lambda *_: calls.append(1) or "")
@@ -99,7 +99,7 @@ def test_what_stages_give_passes_and_is_looked_through_once(factorized, monkeypa
     assert len(calls) == 2 * len(found.buckets)
 
 
-def test_a_module_of_torchs_own_may_stand_for_a_stage():
+def test_a_plain_torch_module_may_replace_a_stage():
     class Plain(nn.Module):
         def forward(self, surface):
             return surface.mesh
@@ -111,7 +111,7 @@ def test_a_module_of_torchs_own_may_stand_for_a_stage():
     assert len(chain.extract(last.surface).faces) == len(last.surface.faces)
 
 
-def test_patches_are_counted_indexed_and_walked_through(factorized):
+def test_patches_are_counted_indexed_and_iterated(factorized):
     _, seen, found = factorized
     patches = found.patches
     assert len(found) == len(patches) == len(patches.coarse.mesh.faces)
@@ -127,7 +127,7 @@ def test_patches_are_counted_indexed_and_walked_through(factorized):
         found[99]
 
 
-def test_a_number_of_every_patch_is_drawn_in_a_view(factorized, tmp_path):
+def test_a_number_per_patch_is_drawn_in_a_view(factorized, tmp_path):
     scene, seen, found = factorized
     statuses = pt.by_facet(found, "status")
     for templates, bucket in zip(found.patches.buckets, found.buckets, strict=True):
@@ -147,7 +147,7 @@ def test_a_number_of_every_patch_is_drawn_in_a_view(factorized, tmp_path):
         pt.plot_patch(found)
 
 
-def test_residuals_and_the_light_of_a_sample_are_drawn_beside_photometry(factorized):
+def test_residuals_and_the_light_of_a_sample_are_drawn(factorized):
     _, seen, found = factorized
     views, own = seen[3].buckets[0], found[3].buckets[0]
     counted = (views.valid[0] & own.observed[0]).sum(dim=0)

@@ -43,7 +43,7 @@ def values(swept):
         yield from (photometry.valid, photometry.information, heights.offset, heights.information)
 
 
-def test_a_few_buckets_at_a_time_give_what_all_patches_give_at_once(given):
+def test_streamed_buckets_give_the_result_of_all_patches(given):
     views, cameras, patches = given
     light = FitLight()(Warp()(views, cameras, thinned(patches)))
     seen = Warp()(views, cameras, patches)
@@ -52,7 +52,7 @@ def test_a_few_buckets_at_a_time_give_what_all_patches_give_at_once(given):
     found = streamed(given)
     assert found.averaged == expected.averaged
     for one, other in zip(values(found), values(expected), strict=True):
-        # Convolutions of the windows round as their batches are cut.
+        # Rounding of the windows' convolutions depends on the batches.
         size = float(other.double().abs().max())
         assert_close(one, other, rtol=0, atol=0 if other.dtype == torch.bool else 1e-4 * size)
 
@@ -81,7 +81,7 @@ def in_iterations(listener, **changes):
     return chain, scene
 
 
-def test_steps_show_the_records_of_every_pass_and_end_where_the_run_ends():
+def test_steps_have_the_records_of_every_pass_and_end_with_the_result():
     chain, scene = in_iterations(Silent())
     shown = []
     chain.preview = lambda _, coarse: shown.append(coarse)
@@ -94,14 +94,14 @@ def test_steps_show_the_records_of_every_pass_and_end_where_the_run_ends():
     stages = [name for name in names if name != "between stages"]
     assert [report.name for report in result.report] == [*stages, "extract", "between stages"]
     assert torch.equal(chain.extract(steps[-1].surface).vertices_world, result.mesh.vertices_world)
-    # The second pass stands on facets that were remeshed on the first one's surface.
+    # The second pass uses facets remeshed on the surface of the first.
     assert steps[0].coarse is chain.coarse_surface.record
     contours = Contours.none(steps[0].silhouettes, scene.cameras)
     remeshed = chain.remesh(steps[0].heights, steps[0].surface, contours)
     assert torch.equal(steps[1].coarse.mesh.faces, remeshed.mesh.faces)
 
 
-def test_who_watches_is_shown_cameras_and_every_pass_and_changes_nothing():
+def test_an_observer_receives_cameras_and_every_pass_and_changes_nothing():
     chain, scene = in_iterations(Silent())
     expected = chain(scene.views)
     seen = []
@@ -115,22 +115,22 @@ def test_who_watches_is_shown_cameras_and_every_pass_and_changes_nothing():
     assert torch.equal(found.mesh.albedo, expected.mesh.albedo)
 
 
-def test_a_round_reports_its_photometry_once_and_what_each_part_takes():
+def test_a_pass_reports_photometry_once_with_the_time_of_each_part():
     listener = Listener()
     chain, scene = in_iterations(listener, decompose={"bucket_entries": 6000})
     result = chain(scene.views)
-    told = [report for report in result.report if report.name == "photometry"]
-    assert len(told) == 2
+    reports = [report for report in result.report if report.name == "photometry"]
+    assert len(reports) == 2
     assert not {"factorize", "sweep"} & set(listener.heard)
-    parts = [told[1].figures[f"{part}_seconds"] for part in ("warp", "factorize", "sweep")]
+    parts = [reports[1].figures[f"{part}_seconds"] for part in ("warp", "factorize", "sweep")]
     assert min(parts) > 0
-    assert sum(parts) < torch.get_num_threads() * told[1].seconds
+    assert sum(parts) < torch.get_num_threads() * reports[1].seconds
     patches = result.patches.patches
     samples = 6 * sum(int(bucket.inside.sum()) for bucket in patches.buckets)
-    assert told[1].figures["samples"] == samples
+    assert reports[1].figures["samples"] == samples
     seen = Warp()(scene.views, scene.cameras, patches)
     valid = sum(int(bucket.valid.sum()) for bucket in seen.buckets)
-    assert told[1].figures["missing_samples"] == pytest.approx(samples - valid, rel=0.05)
+    assert reports[1].figures["missing_samples"] == pytest.approx(samples - valid, rel=0.05)
     count = len(patches.buckets)
     assert f"{count}/{count}" in listener.heard
 
@@ -147,7 +147,7 @@ def test_gradients_reach_the_photographs_through_the_buckets(given):
 
 
 def with_others(given):
-    """Put photographs that buckets are not seen in between those that they are."""
+    """Interleave photographs that do not see the buckets with those that do."""
     views, cameras, patches = given
     order = torch.tensor([0, 0, 1, 2, 5, 3, 4, 3, 5, 2])
     own = torch.tensor([1, 0, 1, 1, 0, 1, 1, 0, 1, 0]) > 0
@@ -163,7 +163,7 @@ def with_others(given):
 
 
 @pytest.mark.parametrize("kernels", ["numba", "torch"])
-def test_photographs_that_a_bucket_is_not_seen_in_change_no_bit_of_it(given, kernels):
+def test_photographs_that_do_not_see_a_bucket_change_no_bit_of_it(given, kernels):
     (views, cameras, patches), own = with_others(given)
     with using(kernels):
         seen = Warp()(*given)
@@ -184,7 +184,7 @@ def test_photographs_that_a_bucket_is_not_seen_in_change_no_bit_of_it(given, ker
         assert torch.equal(one, other)
 
 
-def test_light_is_fitted_to_the_photographs_that_buckets_have_as_if_others_were_missing(given):
+def test_light_is_fitted_as_if_unused_photographs_were_missing(given):
     views, cameras, patches = given
     masks = torch.tensor([[1, 1, 1, 1, 1, 0], [0, 1, 1, 1, 1, 1]]) > 0
     own = [masks[number % 2] for number in range(len(patches.buckets))]
@@ -207,7 +207,7 @@ def test_light_is_fitted_to_the_photographs_that_buckets_have_as_if_others_were_
         assert torch.equal(getattr(found, name), getattr(expected, name))
 
 
-def test_gradients_reach_the_photographs_that_a_bucket_is_seen_in_alone(given):
+def test_gradients_reach_only_the_photographs_that_see_a_bucket(given):
     (views, cameras, patches), own = with_others(given)
 
     def gradient(views, cameras, patches):

@@ -1,4 +1,4 @@
-"""From tensors to a saved result, and looking inside a run, as a researcher would."""
+"""From tensors to a saved result, and inspection of a run."""
 
 import logging
 import runpy
@@ -33,7 +33,7 @@ def scene_of(scene, **changes):
     return pt.scene_of(**(fields | changes))
 
 
-def test_a_scene_of_tensors_is_that_of_structure_from_motion(given):
+def test_a_scene_of_tensors_equals_that_of_structure_from_motion(given):
     scene, _ = given
     made = scene_of(scene, points_world=scene.points_world, observed=scene.observed)
     assert torch.equal(made.observed, scene.observed)
@@ -44,7 +44,7 @@ def test_a_scene_of_tensors_is_that_of_structure_from_motion(given):
     assert [lens.camera for lens in made.lenses] == [1] * 6  # one K: one camera
 
 
-def test_arrays_lists_one_pinhole_and_poses_of_three_rows_are_taken(given):
+def test_arrays_lists_one_pinhole_and_poses_of_three_rows_are_accepted(given):
     scene, _ = given
     made = scene_of(
         scene,
@@ -58,7 +58,7 @@ def test_arrays_lists_one_pinhole_and_poses_of_three_rows_are_taken(given):
     assert made.views.masks.dtype == torch.bool
 
 
-def test_a_point_is_taken_to_be_seen_where_it_falls_on_the_object(given):
+def test_a_point_counts_as_observed_if_it_projects_onto_the_object(given):
     scene, _ = given
     masks = torch.ones(6, 48, 64, dtype=torch.bool)
     masks[2] = False
@@ -68,7 +68,7 @@ def test_a_point_is_taken_to_be_seen_where_it_falls_on_the_object(given):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ({"images": torch.zeros(3, 3)}, r"images has shape \(3, 3\); needed: view channel"),
         ({"images": torch.zeros(6, 3, 48, 64, dtype=torch.uint8)}, "images is uint8; .*load_views"),
@@ -84,12 +84,12 @@ def test_a_point_is_taken_to_be_seen_where_it_falls_on_the_object(given):
         ({"points_world": [[0.0, 0, 1]], "observed": [[True]]}, r"observed has shape \(1, 1\)"),
     ],
 )
-def test_what_is_no_scene_is_refused_by_name(given, change, told):
-    with pytest.raises(pt.InputError, match=told):
+def test_an_invalid_scene_is_refused_by_name(given, change, message):
+    with pytest.raises(pt.InputError, match=message):
         scene_of(given[0], **change)
 
 
-def test_cameras_of_another_convention_are_recognised(given):
+def test_cameras_of_a_different_convention_are_recognised(given):
     scene, _ = given
     opengl = scene.cameras.cam_from_world.clone()
     opengl[:, 1:3] *= -1
@@ -109,7 +109,7 @@ def test_from_tensors_to_a_saved_result(given, tmp_path):
     result = chain(scene_of(scene), mesh=coarse.mesh)
     pt.write_result(result, chain.config, tmp_path / "out")
     mesh = trimesh.load(tmp_path / "out" / "mesh.ply")
-    off = np.linalg.norm(mesh.vertices, axis=1) - 1  # the ball's own radius
+    off = np.linalg.norm(mesh.vertices, axis=1) - 1  # the ball's radius
     assert np.abs(off).mean() < 0.01
     assert (tmp_path / "out" / "sparse" / "cameras.bin").is_file()
     with pytest.raises(pt.InputError, match="cameras are given twice"):
@@ -117,7 +117,7 @@ def test_from_tensors_to_a_saved_result(given, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
-def test_a_researcher_looks_into_a_run(given, tmp_path, caplog):
+def test_a_researcher_inspects_a_run(given, tmp_path, caplog):
     scene, coarse = given
     main = runpy.run_path(str(SCRIPT))["main"]
     with caplog.at_level(logging.INFO, logger="run"):
@@ -129,7 +129,7 @@ def test_a_researcher_looks_into_a_run(given, tmp_path, caplog):
 
 
 @pytest.mark.parametrize("kind", ["tensors", "arrays", "lists"])
-def test_cameras_far_from_the_origin_give_the_scene_of_those_near_it(given, kind):
+def test_cameras_far_from_the_origin_give_the_same_scene(given, kind):
     scene, _ = given
     offset = torch.tensor([448231.25, 5411923.5, 312.125], dtype=torch.float64)
     poses = from_local(scene.cameras.cam_from_world.double(), tuple(offset.tolist()))
@@ -162,7 +162,7 @@ def placed(scene):
 
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
-def test_a_chain_triangulates_points_for_poses_that_come_without():
+def test_a_chain_triangulates_points_for_given_poses():
     cameras = cameras_on_an_arc()
     views = photographs(cameras, lit=False)
     made = pt.scene_of(views.images.float(), cameras.intrinsics, cameras.cam_from_world)
@@ -182,7 +182,7 @@ def test_an_unknown_reference_is_refused_before_structure_from_motion(preset, mo
         chain(views)
 
 
-def test_a_chain_refuses_poses_of_another_convention():
+def test_a_chain_refuses_poses_of_a_different_convention():
     cameras = cameras_on_an_arc()
     views = photographs(cameras, lit=False)
     poses = cameras.cam_from_world.inverse()

@@ -1,4 +1,4 @@
-"""What somebody meets who looks round in the package: names, help, completion."""
+"""A new user's view of the package: names, help, completion."""
 
 import pydoc
 from inspect import ismodule
@@ -15,7 +15,7 @@ def test_the_tour_is_one_screen():
     assert len(pydoc.plain(pydoc.render_doc(pt))) < 20_000
 
 
-def test_a_public_name_stands_at_the_top_or_in_a_room_that_does():
+def test_a_public_name_is_in_the_package_or_a_listed_subpackage():
     rooms = [room for name in pt.__all__ if ismodule(room := getattr(pt, name))]
     for name in pt._names:
         value = getattr(pt, name)
@@ -35,8 +35,8 @@ def test_a_public_name_stands_at_the_top_or_in_a_room_that_does():
         ("pt.stages.", {"Warp", "Factorize", "Stage"}),
     ],
 )
-def test_an_editor_and_a_notebook_offer_what_there_is(code, offered):
-    """Nothing is run for it."""
+def test_completion_offers_existing_names(code, offered):
+    """Completion does not execute code."""
     in_a_file = jedi.Script(f"import pimper_torch as pt\n{code}").complete()
     assert offered <= {one.name for one in in_a_file}
     in_a_cell = jedi.Interpreter(code, [{"pt": pt}]).complete()

@@ -17,7 +17,7 @@ def photos(tmp_path):
 
 @pytest.fixture
 def ctrl_c(monkeypatch):
-    """Let whoever looks at a page have seen enough of it."""
+    """Simulate Ctrl-C while a page is served."""
     from pimper_torch.result.viewer.viewer import Viewer
 
     def pressed(_):
@@ -28,7 +28,7 @@ def ctrl_c(monkeypatch):
 
 @pytest.fixture
 def chain(reconstruction, monkeypatch, lit_before):
-    """Put a chain in the place of the real one that tells what it was given."""
+    """Replace the real chain by one that records its arguments."""
     from pimper_torch.cli import run
     from pimper_torch.doors.io import results
     from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
@@ -54,9 +54,9 @@ def chain(reconstruction, monkeypatch, lit_before):
             return CoarseToFine().finish(result, files)
 
         def work(self):
-            """Whatever a test wants to happen in the centre of a run."""
+            """Do nothing; tests replace it by events in the middle of a run."""
 
-    # Drawn in tests/io and tests/viz: half of what a run without work takes.
+    # Tested in tests/io and tests/viz: half of the time of a run without work.
     for draw in ("draw_overview", "draw_turn"):
         monkeypatch.setattr(results, draw, lambda *given: Image.new("L", (1, 1)).save(given[-1]))
     monkeypatch.setattr(run, "make_chain", Chain)

@@ -25,17 +25,17 @@ def show(terminal, plan=()):
         bars.started("warp")
         bars.progressed(1, 4)
         bars.finished(report)
-        bars.progressed(1, 4)  # late news of a stage that has ended
+        bars.progressed(1, 4)  # late progress of a finished stage
     return text.getvalue()
 
 
-def test_a_terminal_sees_a_bar_that_ends_full():
+def test_a_terminal_shows_a_bar_that_ends_full():
     shown = show(terminal=True)
     assert "100%" in shown
     assert "samples 12,345, missing samples 3,086" in shown
 
 
-def test_a_log_file_sees_one_line_a_stage():
+def test_a_log_file_has_one_line_per_stage():
     shown = show(terminal=False)
     assert " ".join(shown.split()) == "warp 2.5 s samples 12,345, missing samples 3,086"
 
@@ -48,7 +48,7 @@ def test_a_log_file_sees_one_line_a_stage():
         (True, 0.0, []),
     ],
 )
-def test_a_log_file_sees_each_tenth_of_a_long_stage_once(terminal, seconds, shown):
+def test_a_log_file_has_each_tenth_of_a_long_stage_once(terminal, seconds, shown):
     text = io.StringIO()
     console = Console(file=text, force_terminal=terminal, width=120)
     with Bars(console, Forecast(), seconds=seconds) as bars:
@@ -59,7 +59,7 @@ def test_a_log_file_sees_each_tenth_of_a_long_stage_once(terminal, seconds, show
     assert [words[1] for words in lines if len(words) == 2 and words[0] == "write"] == shown
 
 
-def test_the_time_left_for_the_run_is_told_in_the_line_of_the_stage():
+def test_the_line_of_a_stage_has_the_remaining_time_of_the_run():
     plan = [("warp", 2.5), ("write", 600.0)]
     assert show(False, plan).splitlines()[0].endswith("samples 3,086  [about 10 minutes left]")
     assert "about 10 minutes left" in show(True, plan)

@@ -1,4 +1,4 @@
-"""Commands of other distributions are found, named in the help, and missed in a sentence."""
+"""Commands of other distributions are found, listed in the help, and reported if missing."""
 
 from importlib.metadata import EntryPoint
 
@@ -11,7 +11,7 @@ GROUP = "pimper.commands"
 
 
 def offer(monkeypatch, *entries, installed=None):
-    """Let distributions offer commands, and ``pimper_bench`` be there or not."""
+    """Simulate distributions that offer commands, with or without ``pimper_bench``."""
     made = [EntryPoint(name, module, GROUP) for name, module in entries]
     monkeypatch.setattr(module, "entry_points", lambda group: made if group == GROUP else [])
     monkeypatch.setattr(module, "find_spec", lambda _: installed)
@@ -24,7 +24,7 @@ def helped(capsys):
 
 
 @pytest.mark.parametrize("name", OF_BENCH)
-def test_without_the_distribution_a_sentence_says_so(name, capsys, monkeypatch):
+def test_a_missing_distribution_is_named(name, capsys, monkeypatch):
     offer(monkeypatch)
     assert main([name, "mug"]) == 2
     message = capsys.readouterr().err
@@ -34,7 +34,7 @@ def test_without_the_distribution_a_sentence_says_so(name, capsys, monkeypatch):
     assert name not in helped(capsys)
 
 
-def test_the_help_names_what_is_there(capsys, monkeypatch):
+def test_the_help_lists_the_available_commands(capsys, monkeypatch):
     usual = helped(capsys)
     assert {*OF_BENCH} < {*usual}
     offer(monkeypatch, ("render", "pimper_bench.cli.render_command"), ("stroke", "brushes.cli"))
@@ -46,14 +46,14 @@ def test_the_help_names_what_is_there(capsys, monkeypatch):
     assert [*found][-1] == "stroke"
 
 
-def test_a_checkout_serves_without_being_installed_and_what_is_installed_comes_first(monkeypatch):
+def test_commands_work_from_a_checkout_and_installed_ones_take_precedence(monkeypatch):
     offer(monkeypatch, installed="there")
     assert OF_BENCH.items() <= commands().items()
     offer(monkeypatch, ("render", "brushes.cli"), installed="there")
     assert (OF_BENCH | {"render": "brushes.cli"}).items() <= commands().items()
 
 
-def test_a_command_of_another_distribution_is_carried_out(tmp_path, capsys, monkeypatch):
+def test_a_command_of_a_different_distribution_is_run(tmp_path, capsys, monkeypatch):
     (tmp_path / "brushes.py").write_text(
         "def checked(command, arguments):\n    return [command, *arguments]\n"
         "def run(job, output):\n    print(*job)\n"

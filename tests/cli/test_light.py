@@ -1,4 +1,4 @@
-"""Help and refusals come without what takes long to load: torch alone takes more than a second."""
+"""Help and refusals do not load slow modules: torch alone takes more than a second."""
 
 import subprocess
 import sys
@@ -7,7 +7,7 @@ HEAVY = {"torch", "numpy", "scipy", "kornia", "numba", "pycolmap"}
 
 
 def answers(code: str, folder: object = None) -> list[str]:
-    """Run code in a process in which nothing is loaded, and return the lines it prints."""
+    """Run code in a new process, and return the lines it prints."""
     line = [sys.executable, "-c", f"import sys\nfrom pimper_torch.cli.main import main\n{code}"]
     ran = subprocess.run(line, capture_output=True, text=True, cwd=folder)
     assert ran.returncode == 0, ran.stderr
@@ -54,7 +54,7 @@ def test_help_and_refusals_load_nothing_heavy(tmp_path):
     assert all(len(line.split()) <= 3 for line in found[: -len(REFUSED)])
 
 
-def test_whoever_has_read_enough_sees_no_traceback():
+def test_a_closed_pipe_gives_no_traceback():
     code = """if True:
         import os
         reading, writing = os.pipe()

@@ -30,7 +30,7 @@ def run(*arguments):
     return main([str(argument) for argument in arguments])
 
 
-ASKED_FOR = {  # in vain
+ASKED_FOR = {  # optional files, not requested here
     *("masks", "mesh.stl", "mesh.obj", "asset.usdz"),
     *("asset.obj", "asset.mtl", "asset_albedo.png", "asset_normal.png"),
 }
@@ -46,36 +46,36 @@ def reconstruct(photos, chain, tmp_path):
     return lambda *given: run("reconstruct", photos, "-o", tmp_path / "out", *given)
 
 
-def test_a_run_writes_the_result_and_says_where(reconstruct, chain, tmp_path, capsys):
+def test_a_run_writes_the_result_and_prints_its_path(reconstruct, chain, tmp_path, capsys):
     assert reconstruct() == 0
     assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
     config, views, sparse = chain.given
     assert config == CoarseToFineConfig() == load_config("default")
     assert views.names == ("0.png", "1.png", "2.png", "3.png")
     assert sparse is None
-    told = capsys.readouterr()
-    assert f"{tmp_path}/out/mesh.ply" in told.out
-    assert "3 of 4 photographs" in told.out
+    printed = capsys.readouterr()
+    assert f"{tmp_path}/out/mesh.ply" in printed.out
+    assert "3 of 4 photographs" in printed.out
     for stage in ("read", "warp", "write"):
-        assert stage in told.err
-    assert "samples 1,200" in told.err
+        assert stage in printed.err
+    assert "samples 1,200" in printed.err
 
 
-def test_a_run_closes_with_what_guards_left_out(
+def test_a_run_ends_with_the_removals_of_guards(
     reconstruct, chain, reconstruction, tmp_path, capsys
 ):
     gone = LeftOut(
         guard="sfm.missing", what="photographs", count=1, total=4, reason="none", names=("3.png",)
     )
-    told = reconstruction.replace(left_out=(gone,))
-    chain.__call__ = lambda *_: told
+    reduced = reconstruction.replace(left_out=(gone,))
+    chain.__call__ = lambda *_: reduced
     assert reconstruct() == 0
     assert "Left out: 3.png (sfm.missing)." in capsys.readouterr().out
     (written,) = json.loads((tmp_path / "out" / "summary.json").read_text())["left_out"]
     assert LeftOut(**{**written, "names": tuple(written["names"])}) == gone
 
 
-def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):
+def test_options_override_the_preset(photos, chain, tmp_path):
     preset = tmp_path / "mine.yaml"
     preset.write_text("reconstruct: {starts: 5, seed: 3}\n")
     for place, given in enumerate((["--preset", preset], [f"--preset={preset}"])):
@@ -85,8 +85,8 @@ def test_a_preset_is_where_options_start_from(photos, chain, tmp_path):
         assert (settings.starts, settings.seed) == (5, 4)
 
 
-def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, tmp_path):
-    """The silhouettes that a run found come back to the bit, whatever they look like."""
+def test_masks_of_a_result_can_be_given_and_are_trusted(reconstruction, chain, tmp_path):
+    """The silhouettes of a run are read back bit for bit and trusted, however they look."""
     scene = reconstruction.scene
     inside = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(4))
     reliable = torch.tensor([True, True, False])
@@ -107,7 +107,7 @@ def test_masks_of_a_result_can_be_given_and_are_believed(reconstruction, chain, 
     silhouettes = FindSilhouettes()(scene.replace(views=views))
     assert silhouettes.source == "masks"
     assert torch.equal(silhouettes.masks, found.masks)
-    assert silhouettes.reliable.all()  # also of views whose silhouette was not trusted
+    assert silhouettes.reliable.all()  # including views whose silhouette was unreliable
 
 
 def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkeypatch):
@@ -119,7 +119,7 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "expected"),
     [
         (["--preset", "papre"], "Did you mean `paper`?"),
         (["--preset", "paper", "--max-memory=1GB"], "option of the preset paper, but of default"),
@@ -139,13 +139,11 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
         (["--log-level"], "--log-level is nothing"),
     ],
 )
-def test_what_the_user_can_mend_is_one_message(
-    reconstruct, chain, tmp_path, capsys, arguments, told
-):
+def test_a_user_error_is_one_message(reconstruct, chain, tmp_path, capsys, arguments, expected):
     assert reconstruct(*arguments) == 2
     message = capsys.readouterr().err
     assert message.startswith("error: ")
-    assert told in message
+    assert expected in message
     assert message.count("\n") == 1
     assert chain.given is None
     assert held(tmp_path) == ["photos"]
@@ -159,7 +157,7 @@ def test_an_occupied_out_is_refused_before_photographs_are_read(reconstruct, tmp
     assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
 
 
-def test_a_missing_gpu_is_told_before_the_run(reconstruct, chain, capsys, monkeypatch):
+def test_a_missing_gpu_is_reported_before_the_run(reconstruct, chain, capsys, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert reconstruct("--device", "cuda") == 2
     assert "finds no CUDA device" in capsys.readouterr().err
@@ -179,7 +177,7 @@ def terminate():
 
 
 @pytest.mark.parametrize(
-    ("work", "kind", "code", "told"),
+    ("work", "kind", "code", "expected"),
     [
         (fail, "ReconstructionError", 2, "error: reconstruct: only 2 of 3 photographs [1, 2] regi"),
         (interrupt, "Interrupted", 130, "interrupted; no result was written"),
@@ -187,13 +185,13 @@ def terminate():
     ],
 )
 def test_a_run_that_ends_early_leaves_nothing(
-    reconstruct, chain, tmp_path, capsys, work, kind, code, told
+    reconstruct, chain, tmp_path, capsys, work, kind, code, expected
 ):
     former = signal.getsignal(signal.SIGTERM)
     chain.work = lambda self: work()
     assert reconstruct("--json") == code
     said = capsys.readouterr()
-    assert told in said.err
+    assert expected in said.err
     last = json.loads(said.out.splitlines()[-1])
     assert (last["event"], last["kind"], last["exit_code"]) == ("error", kind, code)
     assert held(tmp_path) == ["photos"]
@@ -210,10 +208,10 @@ def test_warnings_are_sentences(reconstruct, chain, capsys):
 
 def test_help_names_the_commands_and_version_the_version(capsys):
     assert run("--help") == 0
-    told = capsys.readouterr().out
-    assert "reconstruct PHOTOS -o OUT" in told
-    assert "\n  demo " in told
-    assert "130 interrupted" in told
+    printed = capsys.readouterr().out
+    assert "reconstruct PHOTOS -o OUT" in printed
+    assert "\n  demo " in printed
+    assert "130 interrupted" in printed
     assert run("--version") == 0
     lines = dict(line.split(" ", 1) for line in capsys.readouterr().out.splitlines())
     assert lines["pimper_torch"] == installed_version()
@@ -222,12 +220,14 @@ def test_help_names_the_commands_and_version_the_version(capsys):
     assert run() == 2
 
 
-def test_a_misspelt_command_names_the_nearest(capsys):
+def test_a_misspelt_command_suggests_the_nearest(capsys):
     assert run("reconstuct") == 2
     assert "Did you mean `reconstruct`?" in capsys.readouterr().err
 
 
-def test_what_is_unexpected_is_told_and_kept(reconstruct, chain, tmp_path, capsys, monkeypatch):
+def test_an_unexpected_error_is_reported_and_saved(
+    reconstruct, chain, tmp_path, capsys, monkeypatch
+):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     chain.work = lambda self: 1 / 0
     assert reconstruct("-q") == 1
@@ -244,7 +244,7 @@ def test_what_is_unexpected_is_told_and_kept(reconstruct, chain, tmp_path, capsy
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "expected"),
     [
         (OSError(errno.ENOSPC, "No space left on device", "/tmp/a.db"), "Make room."),
         (PermissionError(errno.EACCES, "Permission denied", "/root/x"), "/root/x: the system"),
@@ -252,44 +252,46 @@ def test_what_is_unexpected_is_told_and_kept(reconstruct, chain, tmp_path, capsy
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 99 bytes"), "memory ran out"),
     ],
 )
-def test_what_the_machine_refuses_is_no_fault(reconstruct, chain, tmp_path, capsys, error, told):
+def test_an_error_of_the_system_is_not_reported_as_a_bug(
+    reconstruct, chain, tmp_path, capsys, error, expected
+):
     def refuse(_):
         raise error
 
     chain.work = refuse
     assert reconstruct() == 2
     message = capsys.readouterr().err.splitlines()[-1]
-    assert told in message
+    assert expected in message
     assert "fault" not in message
     assert held(tmp_path) == ["photos"]
 
 
-def test_a_report_that_cannot_be_written_is_told(reconstruct, chain, tmp_path, capsys, monkeypatch):
+def test_an_unwritable_crash_report_is_reported(reconstruct, chain, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
     chain.work = lambda self: 1 / 0
     assert reconstruct() == 1
-    told = capsys.readouterr().err
-    assert "Traceback" in told
-    assert "Above is what a report needs" in told
+    printed = capsys.readouterr().err
+    assert "Traceback" in printed
+    assert "Above is what a report needs" in printed
 
 
 @pytest.mark.parametrize("place", ["out", "photos", "photograph"])
 def test_names_that_are_not_utf_8_are_refused(photos, chain, tmp_path, capsys, place):
-    strange = "caf\udce9"  # of another encoding
+    strange = "caf\udce9"  # not UTF-8
     given = {"out": tmp_path / "out", "photos": photos}
     if place == "photograph":
         (photos / "0.png").rename(photos / f"{strange}.png")
     else:
         given[place] = tmp_path / strange
     assert run("reconstruct", given["photos"], "-o", given["out"]) == 2
-    assert "caf\\udce9" in (told := capsys.readouterr().err)
-    assert "the name is not UTF-8" in told
+    assert "caf\\udce9" in (printed := capsys.readouterr().err)
+    assert "the name is not UTF-8" in printed
     assert chain.given is None
 
 
 @pytest.mark.slow
 def test_names_in_utf_8_are_written_whatever_the_locale(photos, tmp_path):
-    """In the locale C Python takes UTF-8 for names, and so does what it calls."""
+    """In the C locale Python uses UTF-8 for names, and so do its libraries."""
     folder = photos.rename(photos.with_name("h\u00e9"))
     (folder / "0.png").rename(folder / "\u00fc \u96ea.png")
     ran = subprocess.run(
@@ -303,7 +305,7 @@ def test_names_in_utf_8_are_written_whatever_the_locale(photos, tmp_path):
     assert "Traceback" not in ran.stderr
 
 
-def test_a_log_of_debug_tells_tracebacks(reconstruct, chain, capsys):
+def test_the_debug_log_level_shows_tracebacks(reconstruct, chain, capsys):
     chain.work = lambda self: fail()
     assert reconstruct("--log-level", "debug") == 2
     assert "Traceback" in capsys.readouterr().err
@@ -314,54 +316,54 @@ def warn(_):
 
 
 @pytest.mark.parametrize(("given", "warned"), [(["-q"], True), (["--log-level", "error"], False)])
-def test_a_quiet_run_tells_warnings_alone(reconstruct, chain, capsys, given, warned):
+def test_a_quiet_run_shows_only_warnings(reconstruct, chain, capsys, given, warned):
     chain.work = warn
     assert reconstruct(*given) == 0
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert all(line.startswith("warning: ") for line in told.err.splitlines())
-    assert ("warning: light hardly varies." in told.err) is warned
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert all(line.startswith("warning: ") for line in printed.err.splitlines())
+    assert ("warning: light hardly varies." in printed.err) is warned
 
 
 def events(capsys):
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
 
-def test_a_machine_reads_events_one_a_line(reconstruct, chain, tmp_path, capsys):
+def test_events_are_one_json_object_per_line(reconstruct, chain, tmp_path, capsys):
     chain.work = warn
     assert reconstruct("--json") == 0
-    told = events(capsys)
-    assert told[0]["event"] == "start"
-    assert told[0]["command"] == "reconstruct"
-    assert told[0]["versions"]["pimper_torch"] == installed_version()
+    printed = events(capsys)
+    assert printed[0]["event"] == "start"
+    assert printed[0]["command"] == "reconstruct"
+    assert printed[0]["versions"]["pimper_torch"] == installed_version()
     for name in ("read", "warp", "write"):
         begun, ended = (
-            next(n for n, one in enumerate(told) if one == one | {"event": event, "stage": name})
+            next(n for n, one in enumerate(printed) if one == one | {"event": event, "stage": name})
             for event in ("stage-begin", "stage-end")
         )
         assert begun < ended
-        assert told[ended]["seconds"] >= 0
-    (ended,) = [one for one in told if one == one | {"event": "stage-end", "stage": "warp"}]
+        assert printed[ended]["seconds"] >= 0
+    (ended,) = [one for one in printed if one == one | {"event": "stage-end", "stage": "warp"}]
     assert ended["figures"] == {"samples": 1200}
     assert {"event": "progress", "stage": "read", "done": 4, "total": 4}.items() <= next(
-        one for one in told if one["event"] == "progress"
+        one for one in printed if one["event"] == "progress"
     ).items()
-    assert "light hardly varies." in [one.get("message") for one in told]
-    assert told[-1]["event"] == "result"
-    assert told[-1]["paths"]["mesh.ply"] == str(tmp_path / "out" / "mesh.ply")
-    assert told[-1]["figures"] == json.loads((tmp_path / "out" / "summary.json").read_text())
-    moments = [one["elapsed"] for one in told]
+    assert "light hardly varies." in [one.get("message") for one in printed]
+    assert printed[-1]["event"] == "result"
+    assert printed[-1]["paths"]["mesh.ply"] == str(tmp_path / "out" / "mesh.ply")
+    assert printed[-1]["figures"] == json.loads((tmp_path / "out" / "summary.json").read_text())
+    moments = [one["elapsed"] for one in printed]
     assert moments == sorted(moments)
-    begun = [one for one in told if one["event"] == "stage-begin"]
-    assert begun[0]["seconds_left"] is None  # photographs are not read yet
+    begun = [one for one in printed if one["event"] == "stage-begin"]
+    assert begun[0]["seconds_left"] is None  # no photograph has been read
     assert begun[-1]["stage"] == "write"
     assert 0 < begun[-1]["seconds_left"] < 10
-    assert [one for one in told if "seconds_left" in one][-1]["seconds_left"] == 0
-    lines = [stage["name"] for stage in told[-1]["figures"]["stages"]]
+    assert [one for one in printed if "seconds_left" in one][-1]["seconds_left"] == 0
+    lines = [stage["name"] for stage in printed[-1]["figures"]["stages"]]
     assert (lines[0], lines[-2:]) == ("import", ["between stages", "write"])
 
 
-def test_a_run_that_tells_events_does_not_wait(reconstruct, chain, reconstruction, capsys):
+def test_a_run_with_events_does_not_wait_for_the_viewer(reconstruct, chain, reconstruction, capsys):
     pytest.importorskip("viser")
 
     def show(self):
@@ -370,14 +372,14 @@ def test_a_run_that_tells_events_does_not_wait(reconstruct, chain, reconstructio
 
     chain.work = show
     assert reconstruct("--view", "--json") == 0
-    told = events(capsys)
-    (page,) = [one for one in told if one["event"] == "view"]
+    printed = events(capsys)
+    (page,) = [one for one in printed if one["event"] == "view"]
     assert page["address"].startswith("http://127.0.0.1:")
-    assert told[-1]["event"] == "result"
+    assert printed[-1]["event"] == "result"
 
 
 @pytest.mark.usefixtures("ctrl_c")
-def test_a_run_that_is_looked_at_stays_until_ctrl_c(reconstruct, chain, reconstruction, capsys):
+def test_a_run_with_a_viewer_stays_until_ctrl_c(reconstruct, chain, reconstruction, capsys):
     pytest.importorskip("viser")
     chain.work = lambda self: self.watch(reconstruction.scene)
     assert reconstruct("--view") == 0
@@ -391,7 +393,7 @@ def test_without_a_viewer_a_run_is_refused(reconstruct, tmp_path, capsys, monkey
     assert not (tmp_path / "out").exists()
 
 
-def test_the_coarse_surface_is_shown_beside_a_former_result_until_the_run_ends(
+def test_the_coarse_surface_is_a_preview_until_the_run_ends(
     reconstruct, chain, reconstruction, tmp_path, capsys
 ):
     out = tmp_path / "out"
@@ -411,8 +413,8 @@ def test_the_coarse_surface_is_shown_beside_a_former_result_until_the_run_ends(
 
     chain.work = show_and_fail
     assert reconstruct("--json", "--overwrite") == 2
-    (told,) = [one for one in events(capsys) if one["event"] == "preview"]
-    assert told["path"] == str(out / ".stages" / "preview.png")
+    (printed,) = [one for one in events(capsys) if one["event"] == "preview"]
+    assert printed["path"] == str(out / ".stages" / "preview.png")
     assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == former
     chain.work = show
     assert reconstruct("--overwrite") == 0
@@ -420,14 +422,14 @@ def test_the_coarse_surface_is_shown_beside_a_former_result_until_the_run_ends(
     assert {path.name for path in out.iterdir()} == {path.name for path in former}
 
 
-def test_what_json_cannot_hold_is_told_as_null_or_text(capsys):
+def test_values_without_json_form_become_null_or_text(capsys):
     Output(as_json=True).event("result", figures={"a": math.inf, "b": [math.nan, Path("c")]})
-    (told,) = events(capsys)
-    assert told["figures"] == {"a": None, "b": [None, "c"]}
+    (printed,) = events(capsys)
+    assert printed["figures"] == {"a": None, "b": [None, "c"]}
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
-def test_an_output_that_cannot_be_written_ends_in_a_message(capsys, monkeypatch):
+def test_unwritable_output_gives_a_message(capsys, monkeypatch):
     with Path("/dev/full").open("w") as full:
         monkeypatch.setattr(sys, "stdout", full)
         assert run("config", "default") == 2
@@ -437,7 +439,7 @@ def test_an_output_that_cannot_be_written_ends_in_a_message(capsys, monkeypatch)
     assert "Traceback" not in message
 
 
-def test_a_mesh_of_ones_own_reaches_the_chain(reconstruct, photos, chain, tmp_path):
+def test_a_given_mesh_reaches_the_chain(reconstruct, photos, chain, tmp_path):
     square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     mesh = Mesh(vertices_world=square, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
     write_ply(mesh, tmp_path / "rough.ply")

@@ -1,4 +1,4 @@
-"""Every option of every command, once, from the command line."""
+"""Every option of every command runs once from the command line."""
 
 import dataclasses
 import json
@@ -23,7 +23,7 @@ from pimper_torch.runtime.errors import ConfigError
 from pimper_torch.runtime.store import Store
 from tests.video.clips import written
 
-# What each option is given; {names} are places in the folder of `world`.
+# The values of each option; {names} are paths in the folder of `world`.
 RUNS = {
     "reconstruct": [
         "{photos} --out {out} --sparse {sparse} --mesh {ball} --masks {masks} --device cpu "
@@ -99,13 +99,13 @@ RUNS = {
     "gamma": ["{photos} --mask {masks}/view_000.png --rank 3 --max-size-px 40"],
 }
 TINY = "--num-views 2 --width 32 --height 24 --processes 1"
-# Of so small photographs half of the surface is not sure enough to be kept.
+# With such small photographs half of the surface is too uncertain to be kept.
 PRESET = "scales: [0.5]\nsweep: {min_views: 2, num_views: 4}\nextract: {max_expected_error: 9}\n"
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory, dtu):
-    """A ball and photographs of it, as `pimper render` writes them."""
+    """A ball and its photographs, as written by `pimper render`."""
     folder = tmp_path_factory.mktemp("world")
     vertices, faces = icosphere(2)
     write_ply(Mesh(vertices_world=vertices, faces=faces), folder / "ball.ply")
@@ -149,7 +149,7 @@ def world(tmp_path_factory, dtu):
 
 @pytest.fixture
 def engines(request, monkeypatch, tmp_path):
-    """Start engines where a line names one; runs of a batch are stand-ins."""
+    """Start engines if a line names one; runs of a batch are stand-ins."""
     line = request.getfixturevalue("line")
     monkeypatch.setattr(task, "_CHILD", CHILD)
     if "{scheduler}" in line:
@@ -183,7 +183,7 @@ def test_every_option_of_a_command_runs(command, line, world, engines, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_batch_ends_with_the_bits_of_a_run(world, tmp_path):
+def test_a_batch_gives_the_same_bits_as_a_run(world, tmp_path):
     assert main(["batch", str(world["table"]), "-o", str(tmp_path / "all")]) == 0
     alone = "{photos} --out {out} --sparse {sparse} --masks {masks} --preset {preset} --no-report"
     assert run("reconstruct", alone, world, tmp_path) == 0
@@ -194,7 +194,7 @@ def test_a_batch_ends_with_the_bits_of_a_run(world, tmp_path):
 
 @pytest.mark.usefixtures("ctrl_c")
 def test_every_option_of_the_demo_reaches_the_chain(chain, tmp_path):
-    # Its chain is that of `reconstruct`, whose options run above; its photographs are large.
+    # It uses the chain of `reconstruct`, whose options are tested above; its photographs are large.
     (line,) = RUNS["demo"]
     assert run("demo", line, {}, tmp_path) == 0
     config, views, _ = chain.given
@@ -205,7 +205,7 @@ def test_every_option_of_the_demo_reaches_the_chain(chain, tmp_path):
     assert chain.cache == Store(folder=kept, max_bytes=1.5e9, fresh=True)
 
 
-def test_what_stages_find_is_kept_in_the_folder_of_the_result(chain, photos, tmp_path):
+def test_records_of_stages_are_stored_in_the_result_folder(chain, photos, tmp_path):
     assert main(["reconstruct", str(photos), "-o", str(tmp_path / "out")]) == 0
     assert chain.cache == Store(folder=tmp_path / "out" / ".stages", max_bytes=8e9)
 
@@ -215,8 +215,8 @@ def test_the_reference_reaches_every_stage_that_has_one():
     assert published.coarse_surface.reference == published.triangulate.reference == "38"
 
 
-def told(command, capsys, page="--help-all"):
-    """List the options that a command's help tells, with each of their names."""
+def listed(command, capsys, page="--help-all"):
+    """List the options in a command's help, with all their names."""
     with pytest.raises(SystemExit):
         main([command, page])
     lines = re.findall(r"^  (-.*?)(?:  .*)?$", capsys.readouterr().out, flags=re.MULTILINE)
@@ -241,13 +241,13 @@ def test_help_fits_a_page(command, columns, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("command", RUNS)
-def test_no_option_is_without_a_run(command, capsys, monkeypatch):
+def test_every_option_has_a_test_run(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
-    names = told(command, capsys)
+    names = listed(command, capsys)
     if command in ("reconstruct", "demo"):
         settings = {name for field in leaves(CoarseToFineConfig()) for name in spelt(field)}
-        assert settings <= names  # those of the other chain come with its presets
-        # Those of a stage have a test below; those of the run are options like others.
+        assert settings <= names  # those of the other chain need its presets
+        # Settings of stages are tested below; those of the run are ordinary options.
         names -= {name for name in settings if "." in name}
     given = " ".join(RUNS[command]).replace("{tiny}", TINY).replace("-o ", "--out ").split()
     assert names - {"-o"} == {word for word in given if word.startswith("-")}
@@ -273,7 +273,7 @@ def leaves(config, path=()):
 
 
 def spelt(leaf):
-    """Give the names of a setting's option."""
+    """Return the names of a setting's option."""
     *stages, name = (part.replace("_", "-") for part in leaf.path)
     if leaf.kind is not bool:
         return [f"--{'.'.join([*stages, name])}"]
@@ -281,7 +281,7 @@ def spelt(leaf):
 
 
 def effects(preset, capsys):
-    """Give what the help says of each option of a preset, without its default."""
+    """Return the help text of each option of a preset, without its default."""
     with pytest.raises(SystemExit):
         main(["reconstruct", "--preset", preset, "--help-all"])
     page = re.split(r"^  (--[^\s,]+)(.*)$", capsys.readouterr().out, flags=re.MULTILINE)
@@ -292,7 +292,7 @@ def effects(preset, capsys):
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])
-def test_settings_are_80_at_most_and_the_reference_says_what_each_does(preset, capsys, monkeypatch):
+def test_settings_are_80_at_most_and_all_are_documented(preset, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     settings = list(leaves(load_config(preset)))
     assert 30 < len(settings) <= 80
@@ -302,7 +302,7 @@ def test_settings_are_80_at_most_and_the_reference_says_what_each_does(preset, c
 
 
 def other_values(leaf):
-    """Give values that a setting may have in place of its default."""
+    """Return valid values of a setting other than its default."""
     kind, value = leaf.kind, leaf.value
     if get_origin(kind) in (UnionType, Union):
         choices = [one for kind in get_args(kind) for one in get_args(kind)]
@@ -342,7 +342,7 @@ def test_every_setting_of_every_stage_reaches_the_configuration(chain, tmp_path)
     preset = tmp_path / "defaults.yaml"
     preset.write_text(f"chain: {chain().chain}\n")
     left = list(leaves(chain()))
-    while left:  # some settings exclude one another: those refused come in the next line
+    while left:  # some settings exclude each other: refused ones go into the next line
         config, line, refused = chain(), ["--preset", str(preset)], []
         for leaf in left:
             for value in other_values(leaf):

@@ -1,4 +1,4 @@
-"""What commands do to folders that hold something: as a careless user would give them."""
+"""Commands do not damage folders that already contain files."""
 
 import threading
 
@@ -21,7 +21,7 @@ def contents(folder):
 
 @pytest.fixture
 def project(tmp_path):
-    """A person's own folder, whose names are those of a result."""
+    """A user's folder with the same file names as a result."""
     folder = tmp_path / "proj"
     (folder / "sparse").mkdir(parents=True)
     (folder / "mesh.ply").write_text("a week of work")
@@ -47,7 +47,7 @@ def test_an_input_in_the_results_folder_is_refused(
     assert chain.given is None
 
 
-def test_a_persons_own_photographs_in_a_scene_are_not_overwritten(tmp_path, capsys):
+def test_user_files_in_a_scene_folder_are_not_overwritten(tmp_path, capsys):
     vertices, faces = icosphere(1)
     write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "ball.ply")
     small = ["--num-views", "2", "--width", "32", "--height", "24", "--processes", "1"]
@@ -65,7 +65,7 @@ def test_a_persons_own_photographs_in_a_scene_are_not_overwritten(tmp_path, caps
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "expected"),
     [
         ("convert {own} -o {own} --source colmap --target idr", "DATA"),
         ("convert {other} -o {own} --images {own}/sparse --source colmap --target idr", "--images"),
@@ -76,17 +76,19 @@ def test_a_persons_own_photographs_in_a_scene_are_not_overwritten(tmp_path, caps
         ("bench -o {own} --methods {own}/mine.yaml", "mine.yaml"),
     ],
 )
-def test_an_input_of_other_commands_in_their_output_is_refused(project, capsys, line, told):
+def test_an_input_inside_the_output_folder_of_other_commands_is_refused(
+    project, capsys, line, expected
+):
     (project / "mine.yaml").write_text("seed: 3\n")
     assert run(*line.format(own=project, other=project.parent).split(), "--overwrite") == 2
     message = capsys.readouterr().err
-    assert told in message
+    assert expected in message
     assert "lies in the folder of the result" in message
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "demo", "render", "bench", "convert", "export"])
-def test_two_runs_into_one_folder_do_not_meet(photos, chain, tmp_path, capsys, command):
-    """While another run holds the folder, every command that writes there is refused."""
+def test_a_folder_in_use_by_a_run_is_refused(photos, chain, tmp_path, capsys, command):
+    """While a run has the lock of the folder, every command that writes there is refused."""
     kinds = {"render": "scene", "bench": "table", "convert": "data set", "export": "data set"}
     kind = kinds.get(command, "result")
     given = {
@@ -108,7 +110,7 @@ def test_two_runs_into_one_folder_do_not_meet(photos, chain, tmp_path, capsys, c
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_holds_its_folder_from_the_first_photograph_on(photos, chain, tmp_path, monkeypatch):
+def test_a_run_locks_its_folder_before_reading_photographs(photos, chain, tmp_path, monkeypatch):
     codes = []
 
     def meanwhile(self):

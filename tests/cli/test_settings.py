@@ -1,4 +1,4 @@
-"""``pimper config``: what it prints is a file of settings, and says what each means."""
+"""``pimper config`` prints a file of settings with a comment on each."""
 
 from itertools import pairwise
 
@@ -11,7 +11,7 @@ from pimper_torch.runtime.config import presets, to_mapping
 
 
 @pytest.mark.parametrize("preset", presets())
-def test_what_is_printed_is_the_preset_with_a_word_on_each_setting(preset, tmp_path, capsys):
+def test_the_output_is_the_preset_with_a_comment_on_each_setting(preset, tmp_path, capsys):
     assert main(["config", preset]) == 0
     text = capsys.readouterr().out
     (tmp_path / "mine.yaml").write_text(text)
@@ -21,13 +21,13 @@ def test_what_is_printed_is_the_preset_with_a_word_on_each_setting(preset, tmp_p
         assert line.lstrip().startswith("#") or not line or before.lstrip().startswith("# ")
 
 
-def test_a_section_is_printed_alone(capsys):
+def test_a_single_section_is_printed(capsys):
     assert main(["config", "sweep", "--preset", "default"]) == 0
     told = yaml.safe_load(capsys.readouterr().out)
     assert told == {"sweep": to_mapping(load_config("default").sweep)}
 
 
-def test_a_setting_is_explained(capsys):
+def test_a_setting_is_described(capsys):
     assert main(["config", "reconstruct.shared-camera"]) == 0
     told = capsys.readouterr().out
     names = "--reconstruct.shared-camera, --reconstruct.no-shared-camera"
@@ -39,6 +39,6 @@ def test_a_setting_is_explained(capsys):
 @pytest.mark.parametrize(
     ("name", "near"), [("steps", "sweep.steps"), ("swep", "sweep"), ("defualt", "default")]
 )
-def test_an_unknown_name_is_refused_with_the_nearest(name, near, capsys):
+def test_an_unknown_name_is_refused_with_a_suggestion(name, near, capsys):
     assert main(["config", name]) == 2
     assert f"Did you mean `{near}`?" in capsys.readouterr().err

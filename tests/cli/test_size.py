@@ -24,7 +24,7 @@ TURNED = {1: lambda picture: picture, 6: lambda picture: np.rot90(picture), 3: n
 
 
 def saved(folder, orientation):
-    """Write photographs twice as large as those of the result, as cameras turn them."""
+    """Write photographs twice as large as those of the result, with an EXIF orientation."""
     folder.mkdir()
     noise = np.random.default_rng(5).integers(0, 256, (80, 120), dtype=np.uint8)
     exif = Image.Exif()
@@ -46,7 +46,7 @@ def line(photos, out, *more):
 
 @pytest.mark.filterwarnings(UNSURE)
 @pytest.mark.parametrize("orientation", TURNED)
-def test_clicks_in_files_are_those_in_views(orientation, reconstruction, tmp_path):
+def test_marks_in_files_agree_with_marks_in_views(orientation, reconstruction, tmp_path):
     photos = saved(tmp_path / "photos", orientation)
     more = ["--max-size-px", "60", "--scale-bar", "a,55,40", "c.png,66,50+b,60,45", "80"]
     job = parse("reconstruct", [str(photos), "-o", "out", *more])
@@ -65,12 +65,12 @@ def test_a_result_is_written_in_the_unit_of_its_scale_bar(photos, reconstruction
     out = tmp_path / "out"
     bar = ["--scale-bar", "a,50,36", "b,70,44", "120", "--unit", "cm", "--faces", "all"]
     assert main(line(photos, out, *bar)) == 0
-    told = json.loads((out / "summary.json").read_text())["scale"]
+    message = json.loads((out / "summary.json").read_text())["scale"]
     job = parse("reconstruct", line(photos, out, *bar)[1:])
     (loaded,) = bars_in_files(job, load_views(photos, max_size_px=60))
     ends = [place_of(mark, reconstruction) for mark in loaded.ends]
     factor = 120 / float((ends[0] - ends[1]).norm())
-    assert told == {
+    assert message == {
         "factor": pytest.approx(factor),
         "unit": "cm",
         "source": "scale bars",
@@ -89,18 +89,18 @@ def test_a_result_is_written_in_the_unit_of_its_scale_bar(photos, reconstruction
     moved = factor * pose[1, :3, 3]
     np.testing.assert_allclose(depth["cam_from_world"][:3, 3], moved, rtol=1e-5, atol=1e-4)
     seen = depth["depth"][np.isfinite(depth["depth"])]
-    assert 0.8 < np.median(seen) / (6 * factor) < 1.2  # the cameras are 6 away
+    assert 0.8 < np.median(seen) / (6 * factor) < 1.2  # the cameras are at distance 6
 
 
 @pytest.mark.usefixtures("chain")
-def test_without_anything_that_tells_it_the_size_is_said_to_be_unknown(photos, tmp_path):
+def test_without_a_reference_length_the_size_is_unknown(photos, tmp_path):
     assert main(line(photos, tmp_path / "out")) == 0
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["scale"] is None
 
 
 @pytest.mark.usefixtures("chain")
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "message"),
     [
         (["--scale-bar", "a,500,40", "b,60,40", "8"], "lies outside .* 120 x 80 pixels"),
         (
@@ -113,26 +113,26 @@ def test_without_anything_that_tells_it_the_size_is_said_to_be_unknown(photos, t
         (["--markers", "some"], "--markers is 'some'; needed: auto.off.MM"),
     ],
 )
-def test_lengths_that_mean_nothing_are_refused(more, told, photos, tmp_path, capsys):
+def test_invalid_lengths_are_refused(more, message, photos, tmp_path, capsys):
     assert main(line(photos, tmp_path / "out", *more)) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert re.search(told, said), said
+    assert re.search(message, said), said
     assert not (tmp_path / "out" / "summary.json").exists()
 
 
 @pytest.mark.parametrize(
-    ("count", "told"),
+    ("count", "message"),
     [
         (1, "Lengths are in m, by one camera distance."),
         (3, "Lengths are in m, by 3 camera distances, which agree to 0.12%."),
     ],
 )
-def test_what_tells_the_size_is_said(count, told):
+def test_the_source_of_the_scale_is_reported(count, message):
     scale = Scale(factor=2.0, unit="m", source="camera distances", residual=0.0012, count=count)
-    assert scale_message(scale) == told
+    assert scale_message(scale) == message
 
 
-def test_a_sheet_is_written_once_and_replaced_where_that_is_asked_for(tmp_path, capsys):
+def test_a_marker_sheet_is_replaced_only_on_request(tmp_path, capsys):
     sheet = tmp_path / "sheet.pdf"
     assert main(["markers", "-o", str(tmp_path / "sheet.png")]) == 2
     assert "needed: a name ending in .pdf" in capsys.readouterr().err

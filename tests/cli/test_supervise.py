@@ -1,4 +1,4 @@
-"""The life of the process: whatever ends it, one message says so, and nothing is left running."""
+"""However a process ends, one message gives the cause, and no process is left running."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from pimper_torch.records import Mesh
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process alone")
 
-# The command line with `config` replaced by what a test wants to happen.
+# The command line with `config` replaced by the code of a test.
 PROGRAM = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started this may ignore it
@@ -33,12 +33,12 @@ READY = "os.write(int(os.environ['READY']), b'ready');"
 
 
 def heard() -> None:
-    """Let the program hear of a terminal that is gone, also where `nohup` runs the tests."""
+    """Handle SIGHUP by default, also if the tests run under `nohup`."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 class Ran:
-    """A run of the program, from when it said that it was ready."""
+    """A run of the program that has printed that it is ready."""
 
     def __init__(self, folder: Path, code: str, *arguments: str):
         (folder / "stand_in.py").write_text(code)
@@ -76,27 +76,27 @@ def at_run(code: str) -> str:
     return f"{head}\ndef run(job, output):\n{lines}\n"
 
 
-# Short sleeps: a signal just before the system's call is heard only after it.
+# Short sleeps: a signal just before a system call is handled only after it.
 WAITS = f"{READY} [time.sleep(0.05) for _ in range(1200)]"
 
 
 @pytest.mark.parametrize(
-    ("code", "number", "told"),
+    ("code", "number", "message"),
     [
         ("os.kill(os.getpid(), 9)", 9, "killed by the system or by somebody (SIGKILL)"),
         ("ctypes.CDLL(None).abort()", 6, "crashed (SIGABRT), most likely because memory ran out"),
     ],
 )
-def test_what_kills_the_work_is_told_in_one_paragraph(tmp_path, code, number, told):
+def test_the_cause_of_a_killed_run_is_one_paragraph(tmp_path, code, number, message):
     given = ["reconstruct", "photos", "-o", "out", "--json"]
     returned, out, err = Ran(tmp_path, at_run(f"{READY}\n{code}"), *given).end()
     assert returned == 128 + number
     *crash, line = err.splitlines()
     assert line.startswith("error: ")
-    assert told in line
+    assert message in line
     assert "--max-size-px" in line
     assert "the same command goes on" in line
-    assert ("stand_in.py" in "".join(crash)) is (number != 9)  # where it crashed
+    assert ("stand_in.py" in "".join(crash)) is (number != 9)  # the place of the crash
     last = json.loads(out.splitlines()[-1])
     assert (last["event"], last["kind"], last["exit_code"]) == ("error", "Killed", returned)
     assert f"error: {last['message']}" == line
@@ -111,8 +111,8 @@ def test_what_kills_the_work_is_told_in_one_paragraph(tmp_path, code, number, to
         (signal.SIGHUP, True, False),
     ],
 )
-def test_a_signal_is_one_message(tmp_path, number, group, importing):
-    """Ctrl-C reaches both processes of a terminal; `kill` the first alone."""
+def test_a_signal_gives_one_message(tmp_path, number, group, importing):
+    """Ctrl-C reaches both processes of a terminal; `kill` only the first."""
     code = f"import os, time; {WAITS}" if importing else at_run(WAITS)
     ran = Ran(tmp_path, code, "config", "--json")
     (os.killpg if group else os.kill)(ran.process.pid, number)
@@ -127,7 +127,7 @@ DEAF = f"while True:\n try:\n  {WAITS}\n except BaseException: pass"
 LEAVES = "from pimper_torch.runtime.scratch import scratch\nheld = scratch()\nheld.__enter__()\n"
 
 
-def test_what_does_not_hear_a_signal_is_killed_within_five_seconds(tmp_path, monkeypatch):
+def test_a_run_that_ignores_a_signal_is_killed_within_five_seconds(tmp_path, monkeypatch):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setenv("TMPDIR", str(temporary))
@@ -136,7 +136,7 @@ def test_what_does_not_hear_a_signal_is_killed_within_five_seconds(tmp_path, mon
     began = time.monotonic()
     ran.process.terminate()
     returned, _, err = ran.end()
-    assert 4 < time.monotonic() - began < 5.5  # half a second for a busy machine
+    assert 4 < time.monotonic() - began < 5.5  # half a second of tolerance for a busy machine
     assert returned == 143
     assert err.startswith("error: killed, as it did not end by itself. No result was written")
     assert not any(temporary.iterdir())
@@ -144,8 +144,8 @@ def test_what_does_not_hear_a_signal_is_killed_within_five_seconds(tmp_path, mon
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("command", "after"), [("evaluate", 8), ("reconstruct", 20)])
-def test_a_command_inside_a_library_ends_within_five_seconds_of_a_signal(tmp_path, command, after):
-    """Ten million samples keep one call of a library busy for longer, as features may."""
+def test_a_library_call_ends_within_five_seconds_of_a_signal(tmp_path, command, after):
+    """Ten million samples keep one library call busy for longer, as feature detection may."""
     vertices, faces = icosphere(7)
     mesh, cloud = tmp_path / "mesh.ply", tmp_path / "cloud.ply"
     write_ply(Mesh(vertices_world=vertices, faces=faces), mesh)
@@ -159,7 +159,7 @@ def test_a_command_inside_a_library_ends_within_five_seconds_of_a_signal(tmp_pat
         stderr=subprocess.PIPE,
         text=True,
     )
-    time.sleep(after)  # inside of the call, for most
+    time.sleep(after)  # in most cases inside the call
     began = time.monotonic()
     ran.terminate()
     _, err = ran.communicate(timeout=30)
@@ -170,7 +170,7 @@ def test_a_command_inside_a_library_ends_within_five_seconds_of_a_signal(tmp_pat
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_a_second_press_ends_what_cannot_be_interrupted(tmp_path, late):
+def test_a_second_ctrl_c_ends_an_uninterruptible_run(tmp_path, late):
     ran = Ran(tmp_path, at_run(DEAF))
     os.killpg(ran.process.pid, signal.SIGINT)
     time.sleep(5 if late else 0.5)
@@ -183,7 +183,7 @@ def test_a_second_press_ends_what_cannot_be_interrupted(tmp_path, late):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others look once a second")
-def test_the_worker_dies_with_the_watcher(tmp_path):
+def test_the_worker_exits_with_its_parent(tmp_path):
     ran = Ran(tmp_path, at_run(WAITS))
     worker = ran.worker
     ran.process.kill()
@@ -195,7 +195,7 @@ def test_the_worker_dies_with_the_watcher(tmp_path):
     assert not Path(f"/proc/{worker}").exists()
 
 
-def test_what_goes_well_goes_well(tmp_path):
+def test_exit_codes_and_output_reach_the_parent(tmp_path):
     code = at_run(f"{READY}\noutput.emit('h\\u00e9')\nsys.stderr.write('shown\\n')")
     returned, out, err = Ran(tmp_path, code).end()
     assert (returned, out, err) == (0, "h\u00e9\n", "shown\n")
@@ -206,7 +206,7 @@ def test_what_goes_well_goes_well(tmp_path):
     Path(report).unlink()
 
 
-def test_a_reader_who_has_read_enough_of_a_table_is_no_crash(tmp_path):
+def test_a_closed_pipe_is_not_a_crash(tmp_path):
     table = "from rich.console import Console\nConsole(file=sys.stdout).print('row\\n' * 9999)"
     ran = Ran(tmp_path, at_run(f"{READY}\nsys.stdin.read()\n{table}"))
     assert ran.process.stdout is not None
@@ -218,7 +218,7 @@ def test_a_reader_who_has_read_enough_of_a_table_is_no_crash(tmp_path):
     assert ran.process.stderr.read() == ""
 
 
-def test_a_character_that_cannot_be_printed_is_written_otherwise(tmp_path, monkeypatch):
+def test_an_unprintable_character_is_escaped(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONIOENCODING", "ascii:strict")
     code = at_run(f"{READY}\noutput.emit('h\\u00e9')\noutput.warning('\\udcff')\noutput.event('a')")
     returned, out, err = Ran(tmp_path, code).end()
@@ -230,7 +230,7 @@ def test_a_character_that_cannot_be_printed_is_written_otherwise(tmp_path, monke
     assert json.loads(out.splitlines()[-1])["message"] == "h\u00e9 \udcff"
 
 
-def test_where_nothing_can_be_forked_one_process_does(monkeypatch, capsys):
+def test_without_fork_one_process_suffices(monkeypatch, capsys):
     monkeypatch.delattr(os, "fork")
     monkeypatch.setattr(sys, "argv", ["pimper", "--help"])
     assert supervise.main() == 0
@@ -245,7 +245,7 @@ def test_the_module_is_the_command():
     assert ran.stderr.startswith("error: nowhere: found nothing")
 
 
-def test_signals_that_are_ignored_stay_ignored():
+def test_ignored_signals_stay_ignored():
     former = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as by nohup
     try:
         with stoppable():

@@ -43,14 +43,14 @@ pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 OBJ = {"mesh.obj", "asset.obj", "asset.mtl", "asset_albedo.png", "asset_normal.png"}
-ASKED_FOR = {"masks", "mesh.stl", "asset.usdz", *OBJ}  # in vain
+ASKED_FOR = {"masks", "mesh.stl", "asset.usdz", *OBJ}  # optional files, not requested here
 
 
 def names(folder: Path):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_everything_is_there_and_nothing_else(reconstruction, tmp_path):
+def test_a_result_has_exactly_the_listed_files(reconstruction, tmp_path):
     heard = []
     with listening(lambda done, total: heard.append(done / total)):
         write_result(reconstruction, Config(), tmp_path / "deep" / "out", about={"preset": "paper"})

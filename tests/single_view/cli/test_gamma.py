@@ -52,7 +52,7 @@ def test_the_mask_is_shrunk_with_the_photographs(fixed, capsys, monkeypatch):
     assert abs(float(given["mask"].double().mean()) - 0.2 * torch.pi) < 0.03  # x^2 + y^2 < 0.8
 
 
-def test_what_the_user_can_mend_is_one_message(fixed, capsys):
+def test_a_user_error_is_one_message(fixed, capsys):
     for path in sorted((fixed / "photos").iterdir())[4:]:
         path.unlink()
     assert main(["gamma", str(fixed / "photos")]) == 2
