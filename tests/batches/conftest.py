@@ -13,7 +13,7 @@ from pimper_torch.cli.batches.many_objects import batch
 
 @dataclass
 class World:
-    """Objects whose runs are small programs."""
+    """Objects with small programs as runs."""
 
     folder: Path
     heard: list = field(default_factory=list)
@@ -32,7 +32,7 @@ class World:
         return self.folder / "out"
 
     def batch(self, **options):
-        """Carry out the batch, and give the outcomes by their names."""
+        """Run the batch, and return the outcomes by object name."""
         found = batch(self.folder / "scans", self.out, listener=self.heard.append, **options)
         return {one.name: one for one in found}
 
@@ -40,7 +40,7 @@ class World:
         return {name: one.status for name, one in self.batch(**options).items()}
 
     def begun(self, name: str) -> int:
-        """Count how often an object's program was begun."""
+        """Count how often an object's program was started."""
         path = self.out / f"{name}.begun"
         return len(path.read_text()) if path.exists() else 0
 

@@ -1,4 +1,4 @@
-"""Real engines on this machine: workers of Dask, jobs of submitit."""
+"""Real engines on the local machine: Dask workers, submitit jobs."""
 
 import os
 import sys
@@ -32,8 +32,8 @@ def cluster():
 
 @pytest.fixture
 def slurm(tmp_path, monkeypatch):
-    """Stand-ins for Slurm's commands, and jobs whose runs are stand-ins, too."""
-    # Jobs are Python processes of their own, which know nothing of this one.
+    """Stand-ins for Slurm's commands and for the runs of its jobs."""
+    # Jobs are separate Python processes without the patches of this one.
     monkeypatch.setenv("PYTHONPATH", children_stand_in(tmp_path))
     write_slurm(tmp_path / "bin")
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
@@ -43,7 +43,7 @@ def slurm(tmp_path, monkeypatch):
 def test_objects_end_on_workers_of_dask(world, cluster, own):
     for name in "abc":
         world.add(name, f"if tries < {name == 'b':d}: os.abort()\nend()")
-    if own:  # as in Python, with any client's executor
+    if own:  # as in Python, with the executor of a client
         from distributed import Client
 
         with Client(cluster.scheduler_address, set_as_default=False) as client:
@@ -56,7 +56,7 @@ def test_objects_end_on_workers_of_dask(world, cluster, own):
 
 
 @pytest.mark.slow
-def test_a_worker_of_dask_that_dies_loses_no_object(world, tmp_path, monkeypatch):
+def test_no_object_is_lost_if_a_dask_worker_dies(world, tmp_path, monkeypatch):
     from distributed import LocalCluster
 
     monkeypatch.setenv("PYTHONPATH", children_stand_in(tmp_path))
@@ -82,7 +82,7 @@ def test_objects_end_as_jobs_of_slurm(world, tmp_path):
 
 
 @pytest.mark.usefixtures("slurm")
-def test_jobs_ask_for_what_a_task_needs_and_are_cancelled_with_the_batch(world, tmp_path):
+def test_jobs_request_the_resources_of_a_task_and_are_cancelled_with_the_batch(world, tmp_path):
     asked, cancelled = [], []
 
     class Job:
@@ -127,7 +127,7 @@ def test_jobs_ask_for_what_a_task_needs_and_are_cancelled_with_the_batch(world, 
         (["--jobs", "0"], "needed: 1 at least"),
     ],
 )
-def test_an_engine_that_is_not_there_is_told(world, given, said, capsys, monkeypatch):
+def test_an_unreachable_engine_is_reported(world, given, said, capsys, monkeypatch):
     import dask
 
     world.add("ball")
@@ -139,7 +139,7 @@ def test_an_engine_that_is_not_there_is_told(world, given, said, capsys, monkeyp
 
 
 @pytest.mark.parametrize(("engine", "extra"), [("distributed", "dask"), ("submitit", "slurm")])
-def test_an_engine_that_is_not_installed_is_told(world, engine, extra, capsys, monkeypatch):
+def test_an_engine_that_is_not_installed_is_reported(world, engine, extra, capsys, monkeypatch):
     world.add("ball")
     monkeypatch.setitem(sys.modules, engine, None)
     given = [str(world.folder / "scans"), "-o", str(world.out), f"--{extra}", "x"]

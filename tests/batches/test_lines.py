@@ -1,4 +1,4 @@
-"""What is shown of a batch: lines, events, and the table."""
+"""Output of a batch: lines, events, and the table."""
 
 import csv
 import json
@@ -13,7 +13,7 @@ from pimper_torch.cli.main import main
 
 
 @pytest.mark.parametrize("failing", [True, False])
-def test_a_line_an_object_is_shown_and_the_exit_code_tells_of_failures(world, capsys, failing):
+def test_each_object_has_a_line_and_failures_set_the_exit_code(world, capsys, failing):
     world.add("ball")
     world.add("cup", "fail('InputError', 2)" if failing else "end()")
     code = main(["batch", str(world.folder / "scans"), "-o", str(world.out), "--jobs", "1"])
@@ -28,7 +28,7 @@ def test_a_line_an_object_is_shown_and_the_exit_code_tells_of_failures(world, ca
         assert "1 of 2 objects have no result, as cup: it is so." in " ".join(told.err.split())
 
 
-def test_events_tell_how_each_object_ended(world, capsys):
+def test_events_have_the_outcome_of_each_object(world, capsys):
     world.add("ball", "if tries < 1: os.abort()\nend()")
     given = [str(world.folder / "scans"), "-o", str(world.out), "--json", "--", "--stl"]
     assert main(["batch", *given]) == 0
@@ -38,7 +38,7 @@ def test_events_tell_how_each_object_ended(world, capsys):
     assert events[-1]["objects"] == 1
 
 
-def test_names_and_messages_are_text_on_the_page(tmp_path):
+def test_names_and_messages_are_escaped_on_the_page(tmp_path):
     name = 'a<b>&"c" #1?'
     folder = tmp_path / name
     folder.mkdir()

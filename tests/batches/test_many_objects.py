@@ -1,4 +1,4 @@
-"""What becomes of objects: with any executor, whatever ends their runs or the workers."""
+"""Outcomes of objects with any executor, however their runs or workers end."""
 
 import csv
 import os
@@ -25,7 +25,7 @@ from pimper_torch.runtime.errors import ConfigError, OutputError
 
 
 class Inline(Executor):
-    """Carries out at once, or raises an error in its place."""
+    """Runs tasks immediately, or raises an error instead."""
 
     def __init__(self, error=None):
         self.error, self.tasks = error, []
@@ -40,11 +40,11 @@ class Inline(Executor):
         return future
 
 
-class KilledWorker(Exception):  # noqa: N818 - as that of dask.distributed
+class KilledWorker(Exception):  # noqa: N818 - named as in dask.distributed
     pass
 
 
-def test_every_object_ends_and_one_that_fails_stops_no_other(world):
+def test_a_failed_object_does_not_stop_the_others(world):
     world.add("good")
     world.add("bad", "fail('InputError', 2)")
     world.add("odd", "fail('KeyError', 1)")
@@ -59,7 +59,7 @@ def test_every_object_ends_and_one_that_fails_stops_no_other(world):
     assert [*found] == sorted(found)  # in the order of the list
     assert {one.name for one in world.heard} == {*found}
     assert found["bad"].message == "it is so."
-    assert world.begun("bad") == world.begun("odd") == 1  # a failure of its own, never again
+    assert world.begun("bad") == world.begun("odd") == 1  # deterministic failures are not retried
     rows = {row["name"]: row for row in csv.DictReader((world.out / "batch.csv").open())}
     assert rows["good"]["faces"] == "99"
     assert rows["bad"]["message"] == "it is so."
@@ -79,7 +79,7 @@ def test_every_object_ends_and_one_that_fails_stops_no_other(world):
         "os._exit(1)",
     ],
 )
-def test_a_run_that_is_killed_or_lacks_memory_is_tried_again(world, ending):
+def test_a_run_that_is_killed_or_lacks_memory_is_retried(world, ending):
     world.add("ball", f"if tries < 1: {ending}\nend()")
     world.add("doomed", ending)
     found = world.batch()
@@ -89,7 +89,7 @@ def test_a_run_that_is_killed_or_lacks_memory_is_tried_again(world, ending):
     assert world.begun("doomed") == 2
 
 
-def test_a_run_that_hangs_is_ended_at_its_limit_and_tried_again(world):
+def test_a_run_that_exceeds_its_time_limit_is_killed_and_retried(world):
     world.add("ball", "if tries < 1: os.kill(os.getpid(), signal.SIGSTOP)\nend()")
     world.add("deaf", "signal.signal(signal.SIGTERM, signal.SIG_IGN)\ntime.sleep(600)")
     found = world.batch(time_limit_min=0.02)
@@ -98,7 +98,7 @@ def test_a_run_that_hangs_is_ended_at_its_limit_and_tried_again(world):
     assert "longer than 0 minutes (`--time-limit`)" in found["deaf"].message
 
 
-def test_what_is_whole_is_passed_over_and_what_changed_is_refused(world):
+def test_complete_results_are_skipped_and_changed_inputs_refused(world):
     photos = world.add("ball")
     world.add("cup", "if tries < 3: fail('InputError', 2)\nend()")
     assert world.statuses() == {"ball": "ended", "cup": "failed"}
@@ -114,7 +114,7 @@ def test_what_is_whole_is_passed_over_and_what_changed_is_refused(world):
     assert world.statuses(overwrite=True) == {"ball": "ended", "cup": "kept"}
 
 
-def test_too_few_photographs_are_a_failed_row_and_not_the_end_of_all(world):
+def test_too_few_photographs_fail_only_their_object(world):
     world.add("ball")
     photos = world.add("cup")
     for name in ("2.png", "3.png"):
@@ -124,7 +124,7 @@ def test_too_few_photographs_are_a_failed_row_and_not_the_end_of_all(world):
     assert "cup: the number of photographs is 2; needed: 4" in found["cup"].message
 
 
-def test_what_changed_since_the_result_is_named(world):
+def test_changes_since_the_result_are_named(world):
     photos, masks = world.add("ball"), world.folder / "masks"
     masks.mkdir()
     for number in range(4):
@@ -132,7 +132,7 @@ def test_what_changed_since_the_result_is_named(world):
     given = ["--masks", str(masks), "--faces", "500", "--cache", str(world.folder / "cache")]
     assert world.statuses(settings=given) == {"ball": "ended"}
     (world.folder / "cache").mkdir()
-    (world.folder / "cache" / "kept").touch()  # of runs, not of what is read
+    (world.folder / "cache" / "kept").touch()  # the cache belongs to runs, not to the inputs
     assert world.statuses(settings=given) == {"ball": "kept"}
     (masks / "0.png").write_bytes((masks / "0.png").read_bytes() + b"more")
     (photos / "1.png").rename(photos / "5.png")
@@ -149,7 +149,7 @@ def test_what_changed_since_the_result_is_named(world):
     assert "An earlier version made it, and did not record its settings" in told.message
 
 
-def test_results_inside_the_list_are_no_objects(world):
+def test_results_inside_the_input_folder_are_not_objects(world):
     world.add("ball")
     out = world.folder / "scans" / "results"
     for status in ("ended", "kept"):
@@ -158,7 +158,7 @@ def test_results_inside_the_list_are_no_objects(world):
 
 
 @pytest.mark.parametrize("change", ["settings", "photographs", "result"])
-def test_a_result_is_whole_for_its_arguments_and_files_and_after_its_run_began(world, change):
+def test_a_result_is_complete_only_for_its_arguments_and_files(world, change):
     photos = world.add("ball")
     recorder = Inline()
     assert world.statuses(executor=recorder) == {"ball": "ended"}
@@ -176,7 +176,7 @@ def test_a_result_is_whole_for_its_arguments_and_files_and_after_its_run_began(w
     assert again.status == "failed"
 
 
-def test_a_try_that_comes_again_takes_the_result_that_its_worker_left(world):
+def test_a_repeated_task_keeps_an_existing_result(world):
     world.add("ball")
     recorder = Inline()
     world.batch(executor=recorder)
@@ -186,7 +186,7 @@ def test_a_try_that_comes_again_takes_the_result_that_its_worker_left(world):
 
 
 @pytest.mark.parametrize("error", [KilledWorker("gone"), CancelledError(), OSError("cut off")])
-def test_what_an_engine_loses_is_told_and_the_same_command_goes_on(world, error):
+def test_objects_lost_by_an_engine_are_reported_and_the_command_resumes(world, error):
     world.add("ball")
     lost = world.batch(executor=Inline(error))["ball"]
     assert lost.status == "lost"
@@ -194,7 +194,7 @@ def test_what_an_engine_loses_is_told_and_the_same_command_goes_on(world, error)
     assert world.statuses() == {"ball": "ended"}
 
 
-def test_an_executor_that_breaks_leaves_what_ended_and_says_so(world):
+def test_a_broken_executor_is_reported_and_keeps_finished_objects(world):
     for name in "abc":
         kills = "if tries < 1: os.kill(os.getppid(), signal.SIGKILL); sys.exit()\nend()"
         world.add(name, kills if name == "b" else "end()")
@@ -209,8 +209,8 @@ def test_an_executor_that_breaks_leaves_what_ended_and_says_so(world):
     assert world.statuses() == {"a": "kept", "b": "ended", "c": "ended"}
 
 
-def test_a_lock_that_another_run_holds_is_told_and_not_taken(world):
-    """Neither is the mark of what its result is made from."""
+def test_the_lock_of_a_running_process_is_reported_and_kept(world):
+    """The marker with the inputs of its result is kept."""
     photos = world.add("ball")
     recorder = Inline()
     world.batch(executor=recorder)
@@ -233,7 +233,7 @@ class Pressed(BaseException):
 
 
 @pytest.mark.parametrize("own", [True, False])
-def test_ctrl_c_ends_the_runs_and_the_same_command_goes_on(world, own):
+def test_ctrl_c_ends_the_runs_and_the_same_command_resumes(world, own):
     world.add("ball", "if tries < 1: time.sleep(600)\nend()")
     world.add("cup")
 
@@ -253,7 +253,7 @@ def test_ctrl_c_ends_the_runs_and_the_same_command_goes_on(world, own):
     assert world.statuses() == {"ball": "ended", "cup": "kept"}
 
 
-def test_a_table_that_is_not_ours_is_not_replaced(world):
+def test_a_foreign_table_is_not_replaced(world):
     world.add("ball")
     world.out.mkdir()
     (world.out / "batch.csv").write_text("mine")
@@ -262,7 +262,7 @@ def test_a_table_that_is_not_ours_is_not_replaced(world):
     assert (world.out / "batch.csv").read_text() == "mine"
 
 
-def test_two_batches_do_not_write_to_one_folder(world):
+def test_a_second_batch_into_the_same_folder_is_refused(world):
     world.add("ball")
     with (
         locked(world.out.resolve(), world.out),

@@ -1,4 +1,4 @@
-"""Which objects a folder, a pattern or a table has."""
+"""Objects of a folder, a pattern or a table."""
 
 import pytest
 
@@ -18,7 +18,7 @@ def names(given):
     return [one.name for one in read_objects(given)]
 
 
-def test_a_folder_of_folders_has_an_object_each(scans):
+def test_each_subfolder_is_an_object(scans):
     (scans / ".hidden").mkdir()
     (scans / "notes.txt").touch()
     (scans / "jar" / "photos").mkdir(parents=True)
@@ -29,13 +29,13 @@ def test_a_folder_of_folders_has_an_object_each(scans):
     ]
 
 
-def test_a_link_has_its_own_name(scans):
+def test_a_symbolic_link_keeps_its_name(scans):
     (scans / "bowl").symlink_to(scans / "cup")
     assert names(scans) == ["ball", "bowl", "cup"]
     assert names([scans / "bowl", scans / "bowl" / ".."]) == ["bowl", "scans"]
 
 
-def test_the_name_in_a_table_wins_over_that_of_the_folder(scans, tmp_path):
+def test_the_name_in_a_table_overrides_that_of_the_folder(scans, tmp_path):
     (scans / ".raw").mkdir()
     table = tmp_path / "list.csv"
     table.write_text("photos,name\nscans/.raw,bowl\nscans/cup,\n")
@@ -46,11 +46,11 @@ def test_a_cell_of_several_values_is_split_as_by_a_shell(scans, tmp_path):
     table = tmp_path / "list.csv"
     table.write_text("photos;scale-bar;masks\nscans/cup;'a b.png,1,2' 1.png,3,4 25;my masks\n")
     (cup,) = read_objects(table)
-    masks = str(tmp_path / "my masks")  # one value is taken as it is
+    masks = str(tmp_path / "my masks")  # a single value is used verbatim
     assert cup.settings == ("--scale-bar", "a b.png,1,2", "1.png,3,4", "25", "--masks", masks)
 
 
-def test_a_table_has_settings_in_every_row(scans, tmp_path):
+def test_rows_of_a_table_have_settings(scans, tmp_path):
     (tmp_path / "mine.yaml").write_text("scales: [0.5]\n")
     table = tmp_path / "list.csv"
     table.write_text(
@@ -75,7 +75,7 @@ def test_a_table_has_settings_in_every_row(scans, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("name,faces\nx,2\n", "columns are name, faces; needed: `photos`"),
         ("photos,photos\nscans/cup,scans/cup\n", "each once"),
@@ -91,12 +91,12 @@ def test_a_table_has_settings_in_every_row(scans, tmp_path):
         ("photos\n", "no objects; needed: a folder of folders"),
     ],
 )
-def test_a_table_that_cannot_be_followed_is_refused(scans, tmp_path, text, told):
+def test_an_invalid_table_is_refused(scans, tmp_path, text, message):
     table = tmp_path / "list.csv"
     table.write_text(text)
     with pytest.raises((InputError, ConfigError)) as refused:
         read_objects(table)
-    assert told in str(refused.value)
+    assert message in str(refused.value)
     assert str(table) in str(refused.value)
 
 
@@ -107,7 +107,7 @@ def test_a_list_without_objects_is_refused(tmp_path, given):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("photos,fases\nscans/cup,5\n", "--fases"),
         ("photos,faces\nscans/cup,\nscans/ball,many\n", "row 3: --faces is 'many'"),
@@ -115,17 +115,17 @@ def test_a_list_without_objects_is_refused(tmp_path, given):
         ("photos,watertight\nscans/cup,maybe\n", "row 2: "),
     ],
 )
-def test_a_wrong_setting_is_refused_by_its_row_before_anything_starts(world, scans, text, told):
+def test_a_wrong_setting_is_refused_by_its_row_before_anything_starts(world, scans, text, message):
     table = world.folder / "list.csv"
     table.write_text(text)
     with pytest.raises(ConfigError) as refused:
         planned_batch(read_objects(table), world.out)
-    assert told in str(refused.value)
+    assert message in str(refused.value)
     assert f"{table}, row" in str(refused.value)
     assert not world.out.exists()
 
 
-def test_settings_of_all_come_before_those_of_a_row(world, scans):
+def test_settings_of_a_row_override_those_of_the_batch(world, scans):
     table = world.folder / "list.csv"
     table.write_text("photos,faces\nscans/cup,500\n")
     (task,) = planned_batch(read_objects(table), world.out, ("--faces", "9", "--stl"))

@@ -225,7 +225,7 @@ def test_a_misspelt_command_suggests_the_nearest(capsys):
     assert "Did you mean `reconstruct`?" in capsys.readouterr().err
 
 
-def test_an_unexpected_error_is_reported_and_saved(
+def test_unexpected_errors_are_reported_and_saved(
     reconstruct, chain, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -252,7 +252,7 @@ def test_an_unexpected_error_is_reported_and_saved(
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 99 bytes"), "memory ran out"),
     ],
 )
-def test_an_error_of_the_system_is_not_reported_as_a_bug(
+def test_system_errors_are_not_reported_as_bugs(
     reconstruct, chain, tmp_path, capsys, error, expected
 ):
     def refuse(_):
@@ -418,7 +418,7 @@ def test_the_coarse_surface_is_a_preview_until_the_run_ends(
     assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == former
     chain.work = show
     assert reconstruct("--overwrite") == 0
-    assert f"{told['path']} shows the coarse surface" in capsys.readouterr().out
+    assert f"{printed['path']} shows the coarse surface" in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} == {path.name for path in former}
 
 

@@ -76,9 +76,7 @@ def test_user_files_in_a_scene_folder_are_not_overwritten(tmp_path, capsys):
         ("bench -o {own} --methods {own}/mine.yaml", "mine.yaml"),
     ],
 )
-def test_an_input_inside_the_output_folder_of_other_commands_is_refused(
-    project, capsys, line, expected
-):
+def test_inputs_inside_the_output_of_other_commands_are_refused(project, capsys, line, expected):
     (project / "mine.yaml").write_text("seed: 3\n")
     assert run(*line.format(own=project, other=project.parent).split(), "--overwrite") == 2
     message = capsys.readouterr().err

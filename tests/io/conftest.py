@@ -48,7 +48,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def s15(*values):
-    """Numbers as profiles hold them."""
+    """Encode numbers as s15Fixed16, as in ICC profiles."""
     return b"".join(struct.pack(">i", round(65536 * value)) for value in values)
 
 

@@ -1,11 +1,11 @@
-"""A minimal DNG, as cameras and converters write it: one directory, one strip, and EXIF."""
+"""Writer of minimal DNG files: one directory, one strip, and EXIF."""
 
 from pathlib import Path
 
 import numpy as np
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-# Of some camera, from XYZ to its colours under D65.
+# Matrix of a camera, from XYZ to its colours under D65.
 XYZ_TO_CAMERA = ((0.6722, -0.0635, -0.0963), (-0.4287, 1.2460, 0.2028), (-0.0908, 0.2162, 0.5668))
 BAYER = np.array([[0, 1], [1, 2]])
 
@@ -24,11 +24,11 @@ def write_dng(
     active: tuple[int, int, int, int] | None = None,
     crop: tuple[int, int, int, int] | None = None,
 ) -> None:
-    """Write a mosaic of red, green; green, blue, or of another pattern, or all colours a pixel.
+    """Write a mosaic (RGGB or a different pattern), or full colour per pixel.
 
-    ``size`` is what the header claims in place of the mosaic's width and height, ``active`` the
-    top, left, bottom and right of what sees light, and ``crop`` the left, top, width and height in
-    it of what cameras and converters show.
+    ``size`` replaces the width and height in the header, ``active`` is the light-sensitive area
+    (top, left, bottom, right), and ``crop`` the displayed area inside it (left, top, width,
+    height).
     """
     height, width = mosaic.shape[:2]
     samples = 1 if mosaic.ndim == 2 else mosaic.shape[2]
@@ -43,7 +43,7 @@ def write_dng(
         262: (3, [32803 if samples == 1 else 34892]),
         271: (2, "Test"),
         272: (2, "Camera"),
-        273: (4, [0]),  # where the file goes on
+        273: (4, [0]),  # offset of the strip
         274: (3, [orientation]),
         277: (3, [samples]),
         278: (4, [height]),

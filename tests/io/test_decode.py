@@ -26,7 +26,7 @@ def as_planes(array, full):
 
 
 def assert_decoded(path, array, full):
-    """Colours and opacity are those of an array, up to rounding of float32."""
+    """Check that colours and alpha equal an array, up to rounding of float32."""
     decoded = decode(path)
     found = [decoded.samples] if decoded.alpha is None else [decoded.samples, decoded.alpha[None]]
     assert_close(torch.cat(found), as_planes(array, full), rtol=0, atol=1e-7)
@@ -34,7 +34,7 @@ def assert_decoded(path, array, full):
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "bmp"])
-def test_eight_bits_come_back_as_they_were(tmp_path, pixels, suffix):
+def test_eight_bits_are_read_unchanged(tmp_path, pixels, suffix):
     for array in (pixels, pixels[..., 0]):
         Image.fromarray(array).save(tmp_path / f"a.{suffix}")
         assert_decoded(tmp_path / f"a.{suffix}", array, 255)
@@ -44,11 +44,11 @@ def test_eight_bits_come_back_as_they_were(tmp_path, pixels, suffix):
 def test_sixteen_bit_png_keeps_its_depth(tmp_path, deep, write_png16, channels):
     array = deep[..., 0] if channels == 1 else deep[..., :channels]
     write_png16(tmp_path / "a.png", array)
-    wanted = deep[..., [0, 0, 0, 1]] if channels == 2 else array  # gray with opacity is colour
+    wanted = deep[..., [0, 0, 0, 1]] if channels == 2 else array  # gray with alpha becomes colour
     assert_decoded(tmp_path / "a.png", wanted, 65535)
 
 
-def test_sixteen_bit_png_is_written_as_it_is_read(tmp_path, deep):
+def test_sixteen_bit_png_survives_a_round_trip(tmp_path, deep):
     write_deep_png(deep[..., :3], tmp_path / "a.png")
     assert_decoded(tmp_path / "a.png", deep[..., :3], 65535)
 
@@ -82,7 +82,7 @@ def test_sixteen_bit_tiff_in_planes_or_packed_keeps_its_depth(tmp_path, deep):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_files_are_turned_as_exif_says(tmp_path, pixels, deep, write_png16, orientation):
+def test_images_are_rotated_by_exif_orientation(tmp_path, pixels, deep, write_png16, orientation):
     exif, rgb = Image.Exif(), deep[..., :3]
     exif[274] = orientation
     more = {"extratags": [(274, "H", 1, orientation, True)]}
@@ -98,7 +98,7 @@ def test_files_are_turned_as_exif_says(tmp_path, pixels, deep, write_png16, orie
         assert decode(path).samples.shape[1:] == (header.height, header.width)
 
 
-def test_a_palette_gives_its_colours_and_its_transparency(tmp_path, pixels):
+def test_a_palette_is_expanded_to_colours_and_alpha(tmp_path, pixels):
     flat = Image.fromarray(pixels // 128 * 255)
     flat.quantize(8).save(tmp_path / "a.png")
     assert_decoded(tmp_path / "a.png", pixels // 128 * 255, 255)
@@ -107,7 +107,7 @@ def test_a_palette_gives_its_colours_and_its_transparency(tmp_path, pixels):
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_transparent_colour_is_alpha(tmp_path, pixels, channels):
+def test_a_transparent_colour_becomes_alpha(tmp_path, pixels, channels):
     array = pixels[..., 0] if channels == 1 else pixels
     array[2:4] = 77
     transparent = 77 if channels == 1 else (77,) * 3
@@ -116,7 +116,7 @@ def test_a_transparent_colour_is_alpha(tmp_path, pixels, channels):
     assert torch.equal(decode(tmp_path / "a.png").alpha, wanted)
 
 
-def test_one_bit_is_gray_and_of_several_pictures_of_a_jpeg_the_first_is_read(tmp_path, pixels):
+def test_one_bit_images_are_gray_and_a_jpeg_gives_its_first_image(tmp_path, pixels):
     Image.fromarray(pixels[..., 0] > 99).save(tmp_path / "a.png")
     assert_decoded(tmp_path / "a.png", pixels[..., 0] > 99, 1)
     small = Image.fromarray(pixels[:4, :6])
@@ -142,15 +142,15 @@ PLANE = {0x920A: 30.0, 0xA20E: 5080.0, 0xA210: 2}
         (PLANE | {0xA20E: 200.0, 0xA210: 4}, (4500, 3000), 6000),
         (PLANE | {0xA002: 4500, 0xA003: 3000}, (900, 600), 1200),
         (PLANE | {0xA002: 4500, 0xA003: 3000}, (600, 900), 1200),
-        # The equivalent contains a digital zoom, as telephones write it (55 mm of a lens of 28),
-        # the focal plane never does; where both are there, the plane is taken.
+        # The equivalent includes a digital zoom in files of telephones (55 mm for a lens of 28),
+        # the focal plane never does; if both exist, the focal plane is used.
         ({0xA404: 1.951, 0xA405: 55, 0x920A: 4.0}, (3600, 2400), 5500),
         (PLANE | {0xA404: 2.5}, (4500, 3000), 15000),
         (PLANE | {0xA404: 2.5, 0xA405: 36}, (4500, 3000), 15000),
         (PLANE | {0xA404: 2.5, 0xA405: 90}, (4500, 3000), 15000),
         *[(PLANE | {0xA404: zoom}, (4500, 3000), 6000) for zoom in (None, 0, 0.6, "two", math.nan)],
         ({0xA404: 0, 0xA405: 28}, (3600, 2400), 2800),
-        # What says nothing useful gives no focal length.
+        # Unusable tags give no focal length.
         ({}, (4500, 3000), math.nan),
         ({0xA405: "fifty"}, (4500, 3000), math.nan),
         ({0x920A: 30.0}, (4500, 3000), math.nan),
@@ -212,7 +212,7 @@ def test_other_formats_are_refused_by_name(tmp_path, pixels):
         ("pimper_torch.doors.io.decode._MAX_BYTES", 10, r"has \d+ bytes"),
     ],
 )
-def test_pictures_too_large_are_refused(tmp_path, monkeypatch, pixels, limit, most, why):
+def test_images_too_large_are_refused(tmp_path, monkeypatch, pixels, limit, most, why):
     Image.fromarray(pixels).save(tmp_path / "bomb.png")
     monkeypatch.setattr(limit, most)
     with pytest.raises(InputError, match=rf"bomb\.png: {why}"):

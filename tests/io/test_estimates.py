@@ -21,7 +21,7 @@ def folder(reconstruction, tmp_path, small_pictures):
     return tmp_path / "out"
 
 
-def test_a_result_is_read_back_as_it_was_written(folder, reconstruction):
+def test_a_result_survives_a_round_trip(folder, reconstruction):
     found = read_estimate(folder)
     assert_close(found.mesh.vertices_world, reconstruction.mesh.vertices_world.double())
     assert torch.equal(found.mesh.faces, reconstruction.mesh.faces)
@@ -34,7 +34,7 @@ def test_a_result_is_read_back_as_it_was_written(folder, reconstruction):
     assert torch.equal(found.cameras.sizes_px, cameras.sizes_px)
 
 
-def test_a_result_says_the_same_from_memory_and_from_its_folder(folder, reconstruction):
+def test_a_result_is_the_same_in_memory_and_from_its_folder(folder, reconstruction):
     said, read = estimate_of(reconstruction), read_estimate(folder)
     assert (said.names, said.reference) == (read.names, read.reference)
     assert_close(
@@ -45,16 +45,16 @@ def test_a_result_says_the_same_from_memory_and_from_its_folder(folder, reconstr
 
 def test_lights_are_paired_by_name_and_unknown_ones_are_nan(folder):
     report = json.loads((folder / "lights.json").read_text())
-    told = {view["name"]: view["light"] for view in report["views"]}
-    assert None in told.values()  # or this test saw nothing
+    lights = {view["name"]: view["light"] for view in report["views"]}
+    assert None in lights.values()  # or the test is void
     report["views"].reverse()
     (folder / "lights.json").write_text(json.dumps(report))
     found = read_estimate(folder)
     for name, light in zip(found.names, found.lights_world, strict=True):
-        if told[name] is None:
+        if lights[name] is None:
             assert light.isnan().all()
         else:
-            assert_close(light, torch.tensor(told[name], dtype=torch.float64))
+            assert_close(light, torch.tensor(lights[name], dtype=torch.float64))
 
 
 def test_a_mesh_alone_is_an_estimate(reconstruction, tmp_path):
@@ -67,7 +67,7 @@ def test_a_mesh_alone_is_an_estimate(reconstruction, tmp_path):
     assert found.reference is None
 
 
-def test_a_folder_with_a_mesh_alone_is_one_too(folder):
+def test_a_folder_with_only_a_mesh_is_an_estimate(folder):
     for name in ("lights.json", "depth.npz"):
         (folder / name).unlink()
     found = read_estimate(folder)
@@ -79,7 +79,7 @@ def test_a_folder_with_a_mesh_alone_is_one_too(folder):
 @pytest.mark.parametrize(
     "text", ["nonsense", "[1, 2]", '{"views": [{"name": "a.png", "light": [1, 2]}]}', "[" * 9999]
 )
-def test_lights_that_are_none_are_refused(folder, text):
+def test_invalid_lights_are_refused(folder, text):
     (folder / "lights.json").write_text(text)
     needed = r"cannot be read as JSON|not the layout .*(a JSON object|4 finite numbers)"
     with pytest.raises(InputError, match=rf"lights\.json: ({needed})"):

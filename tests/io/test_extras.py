@@ -1,4 +1,4 @@
-"""HEIC and camera raw as files of the two extras: absent, damaged, huge, or called otherwise."""
+"""HEIC and camera raw, which need extras: missing, damaged, huge or misnamed files."""
 
 import importlib.util
 
@@ -36,15 +36,15 @@ def test_without_its_package_a_format_is_refused(tmp_path, monkeypatch, pixels, 
         lambda name: None if name.endswith(package) else find(name),
     )
     for read in (load_views, lambda folder: read_header(folder / f"0{suffix}")):
-        told = (
+        message = (
             rf'0\{suffix}: is {kind}, which needs one more .*pip install "pimper_torch\[{extra}\]"'
         )
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             read(tmp_path)
-    for index in range(3):  # with others, it is passed over with a word
+    for index in range(3):  # among other photographs it is skipped with a warning
         Image.fromarray(pixels).save(tmp_path / f"{index}.jpg")
-    told = rf'were not read: .* \(3\).* `pip install "pimper_torch\[{extra}\]"` reads {extra}\.'
-    with pytest.warns(PimperWarning, match=told):
+    message = rf'were not read: .* \(3\).* `pip install "pimper_torch\[{extra}\]"` reads {extra}\.'
+    with pytest.warns(PimperWarning, match=message):
         assert load_views(tmp_path).names == ("0.jpg", "1.jpg", "2.jpg")
 
 
@@ -57,7 +57,7 @@ def test_damaged_and_huge_files_are_refused_by_name(tmp_path, monkeypatch, suffi
         (tmp_path / f"cut{suffix}").write_bytes(whole[: int(fraction * len(whole))])
         with pytest.raises(InputError, match=rf"cut\{suffix}"):
             decode(tmp_path / f"cut{suffix}")
-    if suffix == ".dng":  # more than its bytes hold
+    if suffix == ".dng":  # larger than its data
         write(tmp_path / "huge.dng", size=(30000, 20000))
         with pytest.raises(InputError, match=r"huge\.dng: cannot be read as camera raw"):
             decode(tmp_path / "huge.dng")
@@ -72,8 +72,8 @@ def test_damaged_and_huge_files_are_refused_by_name(tmp_path, monkeypatch, suffi
     ("suffix", "name", "lossy"),
     [(".heic", "TIFF", False), (".cr2", "JPEG", True), (".png", "JPEG", True)],
 )
-def test_images_are_read_whatever_they_are_called(tmp_path, monkeypatch, suffix, name, lossy):
-    monkeypatch.setattr("pimper_torch.doors.io.extras.find_spec", lambda _: None)  # none is needed
+def test_images_are_read_with_any_suffix(tmp_path, monkeypatch, suffix, name, lossy):
+    monkeypatch.setattr("pimper_torch.doors.io.extras.find_spec", lambda _: None)  # not needed
     for index in range(3):
         Image.fromarray(STORED).save(tmp_path / f"{index}{suffix}", format=name)
     decoded = decode(tmp_path / f"0{suffix}")
@@ -93,7 +93,7 @@ def test_images_are_read_whatever_they_are_called(tmp_path, monkeypatch, suffix,
     ],
 )
 @pytest.mark.parametrize("suffix", [".heic", ".dng"])
-def test_what_a_file_of_another_format_is_stands_in_its_refusal(tmp_path, start, name, suffix):
+def test_a_refusal_names_the_actual_format_of_a_file(tmp_path, start, name, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(start)
     with pytest.raises(InputError, match=rf"a\{suffix}: holds no JPEG.*, but {name}\."):

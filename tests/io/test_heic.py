@@ -12,7 +12,7 @@ from pimper_torch.ground.radiometry import Srgb
 from pimper_torch.runtime.errors import PimperWarning
 from tests.io.heic_files import DEEP, STORED, UPRIGHT
 
-# Of a lossy format: a level or three of 255.
+# The format is lossy: one to three levels of 255.
 LOSS = 3.5 / 255
 
 
@@ -27,7 +27,7 @@ def write(path, data):
     return path
 
 
-def test_heic_is_turned_once_and_has_its_focal_length_and_profile(tmp_path):
+def test_heic_is_rotated_once_and_has_its_focal_length_and_profile(tmp_path):
     path = write(tmp_path / "a.HEIC", UPRIGHT)
     header = read_header(path)
     assert (header.width, header.height, header.orientation) == (48, 64, 1)
@@ -41,7 +41,7 @@ def test_heic_is_turned_once_and_has_its_focal_length_and_profile(tmp_path):
     assert (decoded.lossy, decoded.full, decoded.alpha) == (True, 255, None)
 
 
-def test_heic_of_ten_bits_keeps_them(tmp_path):
+def test_ten_bit_heic_keeps_its_depth(tmp_path):
     decoded = decode(write(tmp_path / "a.heif", DEEP))
     assert decoded.full == 1023 << 6
     wanted = torch.from_numpy(STORED / 255).movedim(-1, 0).float()
@@ -49,7 +49,7 @@ def test_heic_of_ten_bits_keeps_them(tmp_path):
     assert len((decoded.samples * 1023).round().unique()) > 200
 
 
-def test_heic_beside_a_jpeg_of_the_same_name_is_passed_over(tmp_path):
+def test_heic_with_a_jpeg_of_the_same_name_is_skipped(tmp_path):
     for index in range(3):
         write(tmp_path / f"{index}.heic", DEEP)
         Image.fromarray(STORED).save(tmp_path / f"{index}.jpg")
@@ -58,7 +58,7 @@ def test_heic_beside_a_jpeg_of_the_same_name_is_passed_over(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".PNG", ".dng"])
-def test_heic_is_read_whatever_it_is_called(tmp_path, suffix):
+def test_heic_is_read_with_any_suffix(tmp_path, suffix):
     wanted = decode(write(tmp_path / "a.heic", DEEP))
     found = decode(write(tmp_path / f"b{suffix}", DEEP))
     assert torch.equal(found.samples, wanted.samples)

@@ -1,4 +1,4 @@
-"""Masks beside photographs: their names, what in them is the object, and how they are turned."""
+"""Masks of photographs: their names, polarity and orientation."""
 
 from contextlib import nullcontext
 
@@ -28,7 +28,7 @@ def box(value=255):
 
 
 def in_alpha(bright=0):
-    """Opaque on the object, and black, or bright in part of it."""
+    """Return RGBA that is opaque on the object, and black, or bright in part of it."""
     drawn = np.zeros((8, 12, 4), dtype=np.uint8)
     drawn[2:5, 3:9, 3], drawn[2:5, 3:6, :3] = 255, bright
     return drawn
@@ -49,11 +49,11 @@ COLOUR = np.stack([box(0), box(200), box(1)], axis=-1)
             {"1.png": in_alpha(), "2.png": in_alpha(bright=255), "10.png": in_alpha()},
             [SHOWN, PART, SHOWN],
         ),
-        # An object that fills its photographs is bright along their borders, too.
+        # An object that fills its photographs is also bright along their borders.
         ({f"{name}.png": FULL.astype(np.uint8) * 255 for name in NAMES}, [FULL] * 3),
     ],
 )
-def test_masks_are_found_by_name_and_mark_what_is_bright_or_opaque(photos, tmp_path, masks, wanted):
+def test_masks_are_found_by_name_and_mark_bright_or_opaque_pixels(photos, tmp_path, masks, wanted):
     for name, array in masks.items():
         save(tmp_path / "masks" / name, array)
     found = load_views(photos, masks=tmp_path / "masks").masks
@@ -63,18 +63,18 @@ def test_masks_are_found_by_name_and_mark_what_is_bright_or_opaque(photos, tmp_p
 
 
 @pytest.mark.parametrize("polarity", ["auto", "dark", "bright"])
-def test_masks_with_a_dark_object_are_turned_round(photos, tmp_path, polarity):
+def test_masks_with_a_dark_object_are_inverted(photos, tmp_path, polarity):
     for name in NAMES:
         save(tmp_path / "masks" / f"{name}_mask.png", 255 - box())
-    told = pytest.warns(PimperWarning, match="masks: the masks are bright.*taken to be dark")
-    with told if polarity == "auto" else nullcontext():
+    warned = pytest.warns(PimperWarning, match="masks: the masks are bright.*taken to be dark")
+    with warned if polarity == "auto" else nullcontext():
         masks = load_views(photos, masks=tmp_path / "masks", mask_object=polarity).masks
     shown = torch.from_numpy((polarity == "bright") != SHOWN)
     assert torch.equal(masks, shown.expand(3, 8, 12))
 
 
 def soft_disc():
-    """Coverage of the pixels by a disc, 0 to 1, and the pixels that it covers by half."""
+    """Return the coverage of pixels by a disc, 0 to 1, and the pixels covered by half."""
     rows, columns = np.mgrid[:384, :512] / 8
     fine = np.hypot(rows - 23, columns - 31) < 15
     coverage = fine.reshape(48, 8, 64, 8).mean(axis=(1, 3))
@@ -88,7 +88,7 @@ def overlap(one, other):
 @pytest.mark.parametrize(
     "form", ["8", "16", "grey", "jpg", "alpha", "cut out", "labels", "0 and 1"]
 )
-def test_masks_mark_what_is_half_covered_in_whatever_files_they_are(tmp_path, form):
+def test_masks_mark_half_covered_pixels_in_any_format(tmp_path, form):
     coverage, truth = soft_disc()
     bytes_ = (255 * coverage).round().astype(np.uint8)
     texture = np.random.default_rng(3).integers(1, 255, (48, 64, 3), dtype=np.uint8)
@@ -105,13 +105,13 @@ def test_masks_mark_what_is_half_covered_in_whatever_files_they_are(tmp_path, fo
         save(tmp_path / "photos" / f"{name}.png", texture)
         save(tmp_path / "masks" / f"{name}.{suffix}", array, **options)
     masks = load_views(tmp_path / "photos", masks=tmp_path / "masks").masks
-    # The border is 94 pixels long; one above zero beside it is 0.88, one of rounding 0.998.
+    # The border has 94 pixels; counting all pixels above zero gives 0.88, rounding 0.998.
     assert overlap(masks[1], truth) > (0.98 if form == "jpg" else 0.995)
     assert torch.equal(read_mask(tmp_path / "masks" / f"10.{suffix}"), masks[2])
 
 
-def test_a_mask_of_faint_levels_is_measured_by_the_brightest_of_all(photos, tmp_path):
-    """A soft edge at the photograph's border is no object of its own."""
+def test_faint_masks_are_scaled_by_the_brightest_level_of_all(photos, tmp_path):
+    """A soft edge at the photograph's border is not a separate object."""
     edge = box(0)
     edge[:, 0], edge[:3, 0] = 100, 200
     for name in NAMES:
@@ -121,7 +121,7 @@ def test_a_mask_of_faint_levels_is_measured_by_the_brightest_of_all(photos, tmp_
     assert torch.equal(masks[0], torch.from_numpy(SHOWN))
 
 
-def test_masks_shrink_with_their_photographs_and_do_not_reach_into_padding(tmp_path):
+def test_masks_are_resized_with_their_photographs_and_exclude_padding(tmp_path):
     drawn = np.zeros((32, 48), dtype=np.uint8)
     drawn[:, :24] = 255
     for name, high in zip(NAMES, (24, 32, 32), strict=True):
@@ -133,10 +133,10 @@ def test_masks_shrink_with_their_photographs_and_do_not_reach_into_padding(tmp_p
     assert not (views.masks & ~views.inside).any()
 
 
-def test_transparency_serves_as_mask_unless_masks_are_given(photos, tmp_path, pixels):
+def test_alpha_is_the_mask_unless_masks_are_given(photos, tmp_path, pixels):
     alpha = np.full((8, 12, 1), 255, dtype=np.uint8)
     save(photos / "2.png", np.concatenate([pixels, alpha], axis=-1))
-    assert load_views(photos).masks is None  # opaque all over says nothing
+    assert load_views(photos).masks is None  # a fully opaque alpha is not a mask
     alpha[:4] = 0
     save(photos / "2.png", np.concatenate([pixels, alpha], axis=-1))
     with pytest.warns(PimperWarning, match=r"1 of 3 photographs.*\(2\.png\).*taken for masks"):
@@ -149,25 +149,25 @@ def test_transparency_serves_as_mask_unless_masks_are_given(photos, tmp_path, pi
 
 
 @pytest.mark.parametrize(
-    ("second", "told"),
+    ("second", "message"),
     [
         (None, r"no mask for 2\.png.*such as 2\.png"),
         (np.full((4, 6), 255, dtype=np.uint8), r"2\.png: is 6 x 4, but the photograph 2\.png is 1"),
         (box(0), r"masks of 2\.png mark no pixel"),
     ],
 )
-def test_masks_that_do_not_match_are_refused_by_name(photos, tmp_path, second, told):
+def test_masks_that_do_not_match_are_refused_by_name(photos, tmp_path, second, message):
     for name, array in zip(NAMES, (box(), second, box()), strict=True):
         if array is not None:
             save(tmp_path / "masks" / f"{name}.png", array)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         load_views(photos, masks=tmp_path / "masks")
     with pytest.raises(InputError, match="nowhere: found nothing"):
         load_views(photos, masks=tmp_path / "nowhere")
 
 
 def disc(width=90, height=60):
-    """An object off the middle."""
+    """Return the mask of an object that is not centred."""
     rows, columns = np.mgrid[:height, :width]
     return (columns - 0.35 * width) ** 2 + (rows - 0.4 * height) ** 2 < (0.22 * height) ** 2
 
@@ -179,7 +179,7 @@ def tagged(orientation):
 
 
 def write_photographs(folder, tags):
-    """Photographs of a disc before something dark, stored with EXIF's tags."""
+    """Write photographs of a disc on a dark background, with EXIF orientations."""
     for number, tag in enumerate(tags):
         noise = np.random.default_rng(number).integers(0, 40, (60, 90, 3))
         picture = (noise + 90 * disc()[..., None]).astype(np.uint8)
@@ -188,8 +188,8 @@ def write_photographs(folder, tags):
 
 @settings(max_examples=15, deadline=None)
 @given(tags=st.lists(st.integers(1, 8), min_size=3, max_size=3), tag=st.integers(1, 8))
-def test_masks_are_turned_by_their_own_exif_or_where_their_sizes_tell(tmp_path_factory, tags, tag):
-    """They are of the photograph as it stands; or of stored pixels, where only that fits."""
+def test_masks_are_rotated_by_their_exif_or_to_match_sizes(tmp_path_factory, tags, tag):
+    """Masks are of the upright photograph, or of stored pixels if only that size matches."""
     shown = disc()
     stored = [rotated(shown, one) for one in tags]
     for way in ("as photographs stand", "by an EXIF of their own", "of stored pixels"):
@@ -218,7 +218,7 @@ def test_masks_are_turned_by_their_own_exif_or_where_their_sizes_tell(tmp_path_f
         ("Fu\u0308\u00df.png", "F\u00fc\u00df.png"),
     ],
 )
-def test_masks_are_found_by_changed_names(photos, tmp_path, pixels, photograph, mask):
+def test_masks_are_found_by_rewritten_names(photos, tmp_path, pixels, photograph, mask):
     for name in ("1.png", "2.png", mask):
         save(tmp_path / "masks" / name, box())
     (photos / "10.png").unlink()
@@ -227,7 +227,7 @@ def test_masks_are_found_by_changed_names(photos, tmp_path, pixels, photograph, 
     assert torch.equal(masks, torch.from_numpy(SHOWN).expand(3, 8, 12))
 
 
-def test_masks_that_fit_a_name_equally_well_are_refused_with_both(photos, tmp_path, pixels):
+def test_masks_that_match_a_name_equally_well_are_refused_with_both(photos, tmp_path, pixels):
     for name in ("1.png", "2.png", "10.png", "A_b.png", "a_B.png"):
         save(tmp_path / "masks" / name, box())
     save(photos / "a b.png", pixels)

@@ -34,7 +34,7 @@ def half_ball() -> Mesh:
     )
 
 
-def test_a_watertight_mesh_says_which_of_it_was_not_measured(reconstruction, tmp_path):
+def test_a_watertight_mesh_marks_faces_that_were_not_measured(reconstruction, tmp_path):
     files = MeshFiles(faces=1000, watertight=True, formats=("stl", "obj"))
     mesh = half_ball()
     write_result(reconstruction.replace(mesh=mesh), Encoding(), tmp_path / "out", files=files)
@@ -46,7 +46,7 @@ def test_a_watertight_mesh_says_which_of_it_was_not_measured(reconstruction, tmp
     assert (~measured).sum() == summary["caps"]["faces"]
     assert measured.sum() == summary["reduced"]["faces"]
     assert summary["caps"]["borders"] == 1
-    # A disk below a half ball: a third of the whole.
+    # A disk below a half ball: a third of the area.
     assert summary["caps"]["area_fraction"] == pytest.approx(1 / 3, abs=0.03)
     assert ply.volume == pytest.approx(2 / 3 * torch.pi, rel=0.1)
     known = np.zeros(len(ply.vertices), bool)
@@ -62,7 +62,7 @@ def test_a_watertight_mesh_says_which_of_it_was_not_measured(reconstruction, tmp
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj"])
-def test_meshes_are_written_as_other_programs_read_them(reconstruction, tmp_path, suffix):
+def test_written_meshes_are_read_by_other_programs(reconstruction, tmp_path, suffix):
     files = MeshFiles(faces="all", formats=(suffix,))
     mesh = half_ball()
     write_result(reconstruction.replace(mesh=mesh), Encoding(), tmp_path / "out", files=files)
@@ -80,7 +80,7 @@ def test_meshes_are_written_as_other_programs_read_them(reconstruction, tmp_path
 
 
 @pytest.mark.parametrize("metric", [False, True])
-def test_far_away_files_say_the_offset_and_the_asset_its_place(reconstruction, tmp_path, metric):
+def test_far_files_have_an_offset_and_the_asset_a_translation(reconstruction, tmp_path, metric):
     offset = (448231.0, 5411923.0, 312.0)
     far = reconstruction.scene.replace(offset_world=offset)
     files = MeshFiles(faces="all", formats=("stl", "obj"))
@@ -107,11 +107,11 @@ def test_far_away_files_say_the_offset_and_the_asset_its_place(reconstruction, t
         assert_close(placed.amin(dim=0)[1], torch.tensor(0.0).double(), atol=1e-5, rtol=0)
         world = transform(back, placed) + shift
         for one, other in zip(world.aminmax(dim=0), obj.aminmax(dim=0), strict=True):
-            assert_close(one, other, atol=0.05, rtol=0)  # of far fewer faces
+            assert_close(one, other, atol=0.05, rtol=0)  # it has far fewer faces
     header = (tmp_path / "out" / "mesh.stl").read_bytes()[:80]
     assert header.rstrip() == b"offset 448231.0 5411923.0 312.0"
 
 
-def test_fewer_faces_than_a_tetrahedron_has_are_refused():
+def test_fewer_than_four_faces_are_refused():
     with pytest.raises(ConfigError, match="faces is 3; needed: all, or at least 4"):
         MeshFiles(faces=3)

@@ -32,13 +32,13 @@ def mesh():
 
 
 @pytest.mark.parametrize(("write", "suffix"), [(write_ply, ".ply"), (write_glb, ".glb")])
-def test_a_mesh_comes_back_from_its_file(mesh, write, suffix, tmp_path):
+def test_a_mesh_survives_a_round_trip_through_its_file(mesh, write, suffix, tmp_path):
     write(mesh, tmp_path / f"mesh{suffix}")
     read = read_mesh(tmp_path / f"mesh{suffix}")
     assert_close(read.vertices_world, mesh.vertices_world, rtol=0, atol=1e-7)  # float32 files
     assert torch.equal(read.faces, mesh.faces)
     assert_close(read.normals_world, mesh.normals_world, rtol=0, atol=1e-6)
-    # The PLY has 8 bits, in sRGB steepest in the light: 2.3 / 255 / 2.
+    # The PLY has 8 bits; sRGB is steepest at bright levels: 2.3 / 255 / 2.
     tolerance = 0.006 if suffix == ".ply" else 1e-6
     albedo = (mesh.albedo * albedo_scale(mesh)).clamp(0, 1)
     assert_close(read.albedo, albedo, rtol=0, atol=tolerance)
@@ -48,7 +48,7 @@ def test_a_mesh_comes_back_from_its_file(mesh, write, suffix, tmp_path):
 
 
 def parts_of(path):
-    """Read a GLB's tree and its data."""
+    """Return the JSON and the binary data of a GLB."""
     data = path.read_bytes()
     (size,) = struct.unpack_from("<I", data, 12)
     return json.loads(data[20 : 20 + size]), data[28 + size :]
@@ -63,7 +63,7 @@ def write_parts(path, tree, data):
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_colours_of_any_kind_that_gltf_has_are_read_as_they_are(kind, mesh, tmp_path):
+def test_all_colour_types_of_gltf_are_read(kind, mesh, tmp_path):
     path = tmp_path / "a.glb"
     write_glb(mesh, path)
     tree, data = parts_of(path)
@@ -82,7 +82,7 @@ def test_colours_of_any_kind_that_gltf_has_are_read_as_they_are(kind, mesh, tmp_
     assert_close(read_mesh(path).albedo, wanted, rtol=0, atol=1e-12)
 
 
-def test_parts_of_a_scene_stand_where_the_scene_puts_them(tmp_path):
+def test_transforms_of_scene_nodes_are_applied(tmp_path):
     box = trimesh.creation.box()
     moved = np.eye(4)
     moved[:3, 3] = [5, 0, 0]
@@ -94,10 +94,10 @@ def test_parts_of_a_scene_stand_where_the_scene_puts_them(tmp_path):
     assert len(read.vertices_world) == 2 * len(box.vertices)
     assert len(read.faces) == 2 * len(box.faces)
     assert_close(read.vertices_world[:, 0].amax(), torch.tensor(5.5).double())
-    assert int(read.faces[12:].min()) == len(box.vertices)  # the second refers to its own
+    assert int(read.faces[12:].min()) == len(box.vertices)  # the second part has its own vertices
 
 
-def test_normals_that_the_file_lacks_are_not_invented(tmp_path):
+def test_missing_normals_stay_missing(tmp_path):
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     read = read_mesh(tmp_path / "one.obj")
     assert (read.normals_world, read.albedo, read.confidence) == (None, None, None)
@@ -151,7 +151,7 @@ DAMAGED, MORE = "cannot be read as a mesh", "says that it holds|seems damaged|ho
         ("a.stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(50), MORE),
     ],
 )
-def test_what_is_no_mesh_is_refused_and_takes_no_memory(name, content, why, tmp_path):
+def test_an_invalid_mesh_is_refused_without_allocation(name, content, why, tmp_path):
     if content is not None:
         (tmp_path / name).write_bytes(content)
     tracemalloc.start()
@@ -170,7 +170,7 @@ def test_what_is_no_mesh_is_refused_and_takes_no_memory(name, content, why, tmp_
         (lambda tree: tree["accessors"][0].update(type="VEC9"), "damaged"),
     ],
 )
-def test_a_scene_that_is_none_is_refused(mesh, change, why, tmp_path):
+def test_an_invalid_scene_graph_is_refused(mesh, change, why, tmp_path):
     write_glb(mesh, tmp_path / "a.glb")
     tree, data = parts_of(tmp_path / "a.glb")
     change(tree)
@@ -179,7 +179,7 @@ def test_a_scene_that_is_none_is_refused(mesh, change, why, tmp_path):
         read_mesh(tmp_path / "a.glb")
 
 
-def test_a_scene_that_places_a_mesh_many_times_is_refused(mesh, tmp_path, monkeypatch):
+def test_a_scene_with_too_many_instances_is_refused(mesh, tmp_path, monkeypatch):
     class Graph(dict):
         nodes_geometry = ("first", "second")
 
@@ -192,14 +192,14 @@ def test_a_scene_that_places_a_mesh_many_times_is_refused(mesh, tmp_path, monkey
         read_mesh(tmp_path / "a.glb")
 
 
-def test_faces_of_vertices_that_are_not_there_are_refused(mesh, tmp_path):
+def test_faces_with_missing_vertices_are_refused(mesh, tmp_path):
     for corner in (5, -1):
         write_ply(mesh.replace(faces=torch.tensor([[0, 1, corner]])), tmp_path / "a.ply")
         with pytest.raises(InputError, match=r"corners of its faces range from .*its 5 vertices"):
             read_mesh(tmp_path / "a.ply")
 
 
-def test_normals_that_are_not_finite_are_dropped_and_the_rest_is_kept(mesh, tmp_path):
+def test_normals_that_are_not_finite_are_dropped(mesh, tmp_path):
     normals = mesh.normals_world.clone()
     normals[3, 1] = torch.nan
     write_ply(mesh.replace(normals_world=normals), tmp_path / "a.ply")
@@ -221,7 +221,7 @@ def fine_mesh(offset=(0.0, 0.0, 0.0), scale=1.0):
 
 @pytest.mark.parametrize("offset", [UTM, (4.2e6, 1.7e5, -4.78e6)])
 @pytest.mark.parametrize(("write", "suffix"), [(write_ply, ".ply"), (write_glb, ".glb")])
-def test_far_from_the_origin_no_digit_is_lost(write, suffix, offset, tmp_path):
+def test_far_from_the_origin_positions_keep_their_precision(write, suffix, offset, tmp_path):
     mesh = fine_mesh()
     local = mesh.replace(vertices_world=mesh.vertices_world.float())
     write(local, tmp_path / f"a{suffix}", offset)
@@ -248,7 +248,7 @@ def without_faces(mesh):
         (without_faces(fine_mesh(UTM)), (0.0, 0.0, 0.0), "double"),
     ],
 )
-def test_positions_are_doubles_only_where_singles_would_move_them(tmp_path, mesh, offset, kind):
+def test_positions_are_doubles_only_if_floats_would_round_them(tmp_path, mesh, offset, kind):
     write_ply(mesh, tmp_path / "a.ply", offset)
     header = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0].decode().splitlines()
     written = [line for line in header if line.split()[-1] in "xyz"]
@@ -259,13 +259,13 @@ def test_positions_are_doubles_only_where_singles_would_move_them(tmp_path, mesh
     assert float((read - placed).abs().max()) < 1e-6 * extent
 
 
-def test_a_glb_has_its_offset_in_its_node_and_nothing_there_without_one(tmp_path):
+def test_the_node_of_a_glb_has_the_offset_if_there_is_one(tmp_path):
     for offset, placed in ((UTM, [{"mesh": 0, "translation": list(UTM)}]), ((0.0,) * 3, None)):
         write_glb(fine_mesh(), tmp_path / "a.glb", offset)
         tree, _ = parts_of(tmp_path / "a.glb")
         nodes = [{key: node[key] for key in node if key != "name"} for node in tree["nodes"]]
         assert [node for node in nodes if "translation" in node] == (placed or [])
         positions = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
-        # Around the origin, as viewers want it; float32.
+        # Around the origin, as viewers require; float32.
         assert max(map(abs, positions["max"])) <= 1 + 1e-6
         assert tree["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0

@@ -24,7 +24,7 @@ def save(path, array, **options):
     Image.fromarray(array).save(path, **options)
 
 
-def test_photographs_come_in_natural_order_as_linear_radiance(photos, pixels):
+def test_photographs_are_read_in_natural_order_as_linear_radiance(photos, pixels):
     views = load_views(photos)
     assert views.names == ("1.png", "2.png", "10.png")
     assert views.images.shape == (3, 3, 8, 12)
@@ -36,20 +36,20 @@ def test_photographs_come_in_natural_order_as_linear_radiance(photos, pixels):
     assert_close(load_views(photos, encoding=LINEAR).images[1].double(), stored, rtol=0, atol=1e-6)
 
 
-def test_filters_of_warnings_are_kept_though_threads_decode(photos):
+def test_warning_filters_survive_decoding_in_threads(photos):
     filters = list(warnings.filters)
     load_views(photos)
     assert warnings.filters == filters
 
 
-def test_other_files_and_hidden_ones_are_passed_over(photos):
+def test_other_and_hidden_files_are_skipped(photos):
     (photos / "notes.txt").write_text("notes")
     (photos / "._1.png").write_bytes(b"what a Mac leaves behind")
     (photos / "settings").mkdir()
     assert load_views(str(photos)).num_views == 3
 
 
-def test_what_looks_like_photographs_and_is_not_read_is_named_and_counted(photos, pixels):
+def test_skipped_photograph_like_files_are_named_and_counted(photos, pixels):
     save(photos / "more" / "4.png", pixels)
     for name in ("5.gif", "1.HEIC", "2.heic", "8.avif", "10.CR2", "11.mp4"):
         (photos / name).write_bytes(b"")
@@ -62,7 +62,7 @@ def test_what_looks_like_photographs_and_is_not_read_is_named_and_counted(photos
     assert all(kind in text for kind in (*kinds, "broken link (1)", "folder of images (1)"))
 
 
-def test_grey_photographs_keep_one_channel_until_a_coloured_one_joins(photos, pixels):
+def test_grey_photographs_have_one_channel_unless_one_is_coloured(photos, pixels):
     for name in ("1.png", "2.png", "10.png"):
         save(photos / name, pixels[..., 0])
     assert load_views(photos).images.shape[1] == 1
@@ -72,7 +72,7 @@ def test_grey_photographs_keep_one_channel_until_a_coloured_one_joins(photos, pi
     assert torch.equal(images[0, 0], images[0, 2])
 
 
-def test_unlike_sizes_are_padded_right_and_below(photos, pixels):
+def test_different_sizes_are_padded_on_the_right_and_below(photos, pixels):
     save(photos / "2.png", pixels.swapaxes(0, 1).copy())
     views = load_views(photos)
     assert views.images.shape[-2:] == (12, 12)
@@ -81,7 +81,7 @@ def test_unlike_sizes_are_padded_right_and_below(photos, pixels):
     assert_close(views.images[1, :, :, :8], views.images[0, :, :8].mT)
 
 
-def test_photographs_of_unlike_digital_zooms_share_no_lens(tmp_path, pixels):
+def test_photographs_of_different_digital_zooms_share_no_camera_model(tmp_path, pixels):
     for number, zoom in enumerate([1, 1, 2, 2]):
         exif = Image.Exif()
         exif[274] = 1
@@ -94,7 +94,7 @@ def test_photographs_of_unlike_digital_zooms_share_no_lens(tmp_path, pixels):
     assert load_views(tmp_path, max_size_px=6).focals_px.tolist() == (views.focals_px / 2).tolist()
 
 
-def test_shrinking_averages_light_not_codes_and_scales_the_focal_length(tmp_path):
+def test_shrinking_averages_radiance_and_scales_the_focal_length(tmp_path):
     stripes = np.zeros((64, 96, 3), dtype=np.uint8)
     stripes[:, ::2] = 200
     exif = Image.Exif()
@@ -104,7 +104,7 @@ def test_shrinking_averages_light_not_codes_and_scales_the_focal_length(tmp_path
         save(tmp_path / f"{number}.png", stripes, exif=exif)
     views = load_views(tmp_path, max_size_px=24)
     assert views.images.shape[-2:] == (16, 24)
-    # Half the light; decimation would give none or all, averaging the codes a fifth.
+    # Half the light; decimation would give 0 or 1, averaging the codes a fifth.
     half = float(linear_from_srgb(torch.tensor(200 / 255)) / 2)
     assert_close(views.images[..., 1:-1], torch.full((3, 3, 16, 22), half), rtol=0, atol=1e-4)
     assert views.focals_px[0].item() == pytest.approx(5000 / 3600 * 24)
@@ -116,16 +116,16 @@ def test_shrinking_keeps_corners_where_they_are(photos):
         save(photos / name, ramp)
     found = load_views(photos, encoding=LINEAR, max_size_px=12).images
     wanted = avg_pool2d(load_views(photos, encoding=LINEAR).images, 4)
-    assert_close(found[..., 1:-1], wanted[..., 1:-1])  # a triangle keeps a ramp; not at borders
+    assert_close(found[..., 1:-1], wanted[..., 1:-1])  # the filter keeps inner ramps
 
 
-def test_small_photographs_are_left_alone(photos):
+def test_small_photographs_are_not_resized(photos):
     assert torch.equal(load_views(photos, max_size_px=12).images, load_views(photos).images)
     with pytest.raises(InputError, match="max_size_px is -1"):
         load_views(photos, max_size_px=-1)
 
 
-def test_reading_tells_how_far_it_has_come(photos):
+def test_reading_reports_progress(photos):
     heard = []
     with listening(lambda done, total: heard.append((done, total))):
         load_views(photos)
@@ -144,7 +144,7 @@ def test_reading_tells_how_far_it_has_come(photos):
         ("photos", "found 2 .*needed: at least 3"),
     ],
 )
-def test_what_is_no_folder_of_photographs_is_refused(tmp_path, photos, name, why):
+def test_an_invalid_folder_of_photographs_is_refused(tmp_path, photos, name, why):
     for file in ("a.png", "gif/a.gif", "clip.MP4", "film/clip.MP4", "empty/.hidden"):
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).write_bytes(b"ftyp")
@@ -153,19 +153,19 @@ def test_what_is_no_folder_of_photographs_is_refused(tmp_path, photos, name, why
         load_views(tmp_path / name)
 
 
-def test_photographs_of_one_stem_are_refused(photos, pixels):
+def test_photographs_with_the_same_stem_are_refused(photos, pixels):
     save(photos / "2.jpg", pixels)
     with pytest.raises(InputError, match=r"2\.(jpg|png) and 2\.(jpg|png) differ only in"):
         load_views(photos)
 
 
-def test_a_photograph_whose_flash_did_not_fire_is_left_out_by_name(photos, pixels):
+def test_a_black_photograph_is_removed_by_name(photos, pixels):
     masks = photos.parent / "masks"
     for name in ("1", "2", "3", "10"):
         save(masks / f"{name}.png", pixels[..., 0])
     save(photos / "3.png", pixels)
     save(photos / "2.png", np.full((16, 12, 3), 2, dtype=np.uint8))
-    save(masks / "2.png", np.zeros((16, 12), np.uint8))  # and no segmenter finds anything in it
+    save(masks / "2.png", np.zeros((16, 12), np.uint8))  # its mask is empty
     with pytest.warns(
         PimperWarning, match=r"1 of 4 photographs \(2\.png\) are black all over.*left out"
     ):
@@ -179,14 +179,14 @@ def test_a_photograph_whose_flash_did_not_fire_is_left_out_by_name(photos, pixel
 
 
 @pytest.mark.parametrize("count", [1, 4])
-def test_a_folder_with_too_few_photographs_that_show_something_is_refused(photos, count):
+def test_a_folder_with_too_few_usable_photographs_is_refused(photos, count):
     for index in range(count):
         save(photos / f"{index + 2}.png", np.full((8, 12, 3), 2, dtype=np.uint8))
     with pytest.raises(InputError, match=r"2\.png.*are black all over; needed: 3 photographs"):
         load_views(photos)
 
 
-def test_links_are_followed_wherever_they_lead(photos, tmp_path, pixels):
+def test_symbolic_links_are_followed(photos, tmp_path, pixels):
     save(tmp_path / "elsewhere.png", 255 - pixels)
     (photos / "3.png").symlink_to(tmp_path / "elsewhere.png")
     views = load_views(photos, encoding=LINEAR)
@@ -196,10 +196,10 @@ def test_links_are_followed_wherever_they_lead(photos, tmp_path, pixels):
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB"])
-def test_one_huge_image_among_small_ones_is_refused_before_it_is_read(photos, mode):
+def test_a_huge_image_among_small_ones_is_refused_before_decoding(photos, mode):
     Image.new(mode, (13_000, 2_000)).save(photos / "3.png")
     data = bytearray((photos / "3.png").read_bytes())
-    data[20:24] = struct.pack(">I", 13_000)  # the header says more than the file holds
+    data[20:24] = struct.pack(">I", 13_000)  # the header claims more than the file contains
     data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
     (photos / "3.png").write_bytes(data)
     tracemalloc.start()
@@ -211,7 +211,7 @@ def test_one_huge_image_among_small_ones_is_refused_before_it_is_read(photos, mo
     tracemalloc.stop()
 
 
-def test_photographs_of_unlike_sizes_are_no_bomb(photos, pixels):
+def test_photographs_of_different_sizes_are_not_refused_as_huge(photos, pixels):
     save(photos / "3.png", np.tile(pixels, (20, 20, 1)))
     assert load_views(photos).num_views == 4
 
@@ -224,7 +224,7 @@ def test_padding_does_not_make_a_photograph_black(photos):
     assert load_views(photos).num_views == 4
 
 
-def test_folders_inside_hold_the_photographs_of_a_pose_each(tmp_path, pixels):
+def test_each_subfolder_has_the_photographs_of_one_pose(tmp_path, pixels):
     names = [f"pose_{pose}/light_{light}.png" for pose in (1, 2, 10) for light in (1, 2)]
     for name in reversed(names):
         save(tmp_path / "photos" / name, pixels)
@@ -243,7 +243,7 @@ def test_folders_inside_hold_the_photographs_of_a_pose_each(tmp_path, pixels):
 
 
 @pytest.mark.parametrize("beside", ["masks", "Mask", "silhouettes", "normals", "depth"])
-def test_a_folder_of_masks_or_maps_beside_those_of_poses_is_no_pose(tmp_path, pixels, beside):
+def test_a_subfolder_of_masks_or_maps_is_not_a_pose(tmp_path, pixels, beside):
     for pose in (1, 2, 3):
         save(tmp_path / f"pose_{pose}" / "1.png", pixels)
         save(tmp_path / beside / f"pose_{pose}.png", pixels[..., 0])
@@ -259,7 +259,7 @@ def test_a_folder_of_masks_or_maps_beside_those_of_poses_is_no_pose(tmp_path, pi
         load_views(tmp_path)
 
 
-def test_two_folders_inside_are_no_poses(tmp_path, pixels):
+def test_two_subfolders_are_not_poses(tmp_path, pixels):
     for name in ("a/1.png", "a/2.png", "b/1.png", "b/2.png"):
         save(tmp_path / name, pixels)
     with pytest.raises(InputError, match=r"no images; it holds .*three folders inside at least"):
@@ -270,7 +270,7 @@ def test_two_folders_inside_are_no_poses(tmp_path, pixels):
         load_views(tmp_path)
 
 
-def test_a_folder_is_known_by_the_path_that_was_given(photos, tmp_path, monkeypatch):
+def test_a_folder_is_named_by_the_given_path(photos, tmp_path, monkeypatch):
     (tmp_path / "cam1").symlink_to(photos)
     monkeypatch.chdir(photos)
     assert load_views(".").folder == photos.as_posix()

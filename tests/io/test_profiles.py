@@ -54,7 +54,7 @@ def stored(pixels):
 
 @pytest.fixture
 def three(tmp_path):
-    """Write one picture three times, and read what comes out."""
+    """Write one image three times, and read it."""
 
     def read(write, suffix, **settings):
         folder = tmp_path / "three"
@@ -80,12 +80,12 @@ def three(tmp_path):
     ],
 )
 @pytest.mark.parametrize("space", [b"RGB ", b"GRAY"])
-def test_standard_responses_are_known(make_profile, curve, response, space):
+def test_standard_responses_are_recognised(make_profile, curve, response, space):
     colour = read_profile(make_profile(curve, SRGB, space=space))
     assert (colour.response, colour.srgb_from_file, colour.trouble) == (response, None, "")
 
 
-def test_littlecms_and_its_srgb_are_understood(make_profile, pixels):
+def test_profiles_of_littlecms_are_read_as_by_littlecms(make_profile, pixels):
     colour = read_profile(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     assert (colour.response, colour.srgb_from_file, colour.trouble) == (Srgb(), None, "")
     profile = make_profile(SRGB_CURVE, P3, name="Display P3")
@@ -100,7 +100,7 @@ def test_littlecms_and_its_srgb_are_understood(make_profile, pixels):
     encoded = torch.from_numpy(dull / 255).movedim(-1, 0)
     found = in_srgb_primaries(linear_from_srgb(encoded), colour.srgb_from_file)
     scale = (oracle / found).median()
-    assert_close(scale * found, oracle, rtol=0, atol=0.006)  # half a level of 255 each way
+    assert_close(scale * found, oracle, rtol=0, atol=0.006)  # half a level of 255, twice
     assert float((linear_from_srgb(encoded) - oracle).abs().max()) > 0.02
 
 
@@ -126,15 +126,15 @@ def test_littlecms_and_its_srgb_are_understood(make_profile, pixels):
         ),
     ],
 )
-def test_curves_are_what_the_standard_says(make_profile, curve, wanted):
+def test_curves_agree_with_the_icc_standard(make_profile, curve, wanted):
     levels = torch.linspace(0, 1, 256, dtype=torch.float64)
     response = read_profile(make_profile(curve, SRGB)).response
     found = response.linear_from_encoded(levels.expand(3, 1, -1))[:, 0]
-    # Rounded to 1/65536; 300 entries of a power of 1.7 are off by 1e-5 between them.
+    # Rounded to 1/65536; interpolation of 300 entries of a power of 1.7 is off by 1e-5.
     assert_close(found, wanted(levels).expand(3, -1), rtol=0, atol=1e-4)
 
 
-def test_the_name_is_told_without_what_a_terminal_obeys(make_profile):
+def test_control_characters_are_removed_from_the_profile_name(make_profile):
     assert read_profile(make_profile(IDENTITY, SRGB, name='a\x1b[31m"b')).source == (
         'the ICC profile "a[31mb"'
     )
@@ -160,12 +160,12 @@ def test_the_name_is_told_without_what_a_terminal_obeys(make_profile):
         ({"columns": ()}, "has no primaries"),
     ],
 )
-def test_what_cannot_be_followed_is_named(make_profile, settings, why):
+def test_unsupported_profiles_are_named(make_profile, settings, why):
     given = {"curve": IDENTITY, "columns": SRGB} | settings
     assert why in read_profile(make_profile(**given)).trouble
 
 
-def test_no_damage_raises(make_profile):
+def test_damaged_profiles_raise_no_error(make_profile):
     profile = make_profile(sampled(np.linspace(0, 1, 64) ** 2), P3)
     generator = np.random.default_rng(5)
     for size in range(0, len(profile), 7):
@@ -192,7 +192,7 @@ NOT_SRGB = "has gAMA .* and cHRM that are not sRGB's"
 @pytest.mark.parametrize(
     ("chunks", "response", "wide"),
     [
-        (gamma(45_455), Srgb(), False),  # what programs without a chunk for sRGB write for it
+        (gamma(45_455), Srgb(), False),  # the gamma that stands for sRGB without its chunk
         (gamma(45_455) | SAME, Srgb(), False),
         (SAME, None, False),
         (gamma(100_000) | WIDE | {"sRGB": b"\0"}, Srgb(), False),
@@ -202,7 +202,7 @@ NOT_SRGB = "has gAMA .* and cHRM that are not sRGB's"
         ({}, None, False),
     ],
 )
-def test_chunks_of_png_are_followed(tmp_path, pixels, png_with, chunks, response, wide):
+def test_colour_chunks_of_png_are_applied(tmp_path, pixels, png_with, chunks, response, wide):
     png_with(tmp_path / "a.png", pixels, **chunks)
     colour = read_header(tmp_path / "a.png").colour
     assert (colour.response, colour.srgb_from_file is not None) == (response, wide)
@@ -233,12 +233,12 @@ def exif_of(colour_space=None, index=None, exponent=None, orientation=None):
         (exif_of(65535), None),
     ],
 )
-def test_a_camera_that_says_adobe_rgb_in_exif_alone_is_believed(tmp_path, pixels, exif, response):
+def test_adobe_rgb_in_exif_is_applied(tmp_path, pixels, exif, response):
     Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif)
     colour = read_header(tmp_path / "a.jpg").colour
     assert colour.response == response
     assert (colour.srgb_from_file is not None) == (response == ADOBE)
-    if response == ADOBE:  # it shares red and blue with sRGB: of its green, red holds nothing
+    if response == ADOBE:  # it shares red and blue with sRGB
         assert float(colour.srgb_from_file[0, 1]) < -0.3
 
 
@@ -259,7 +259,7 @@ def test_a_camera_that_says_adobe_rgb_in_exif_alone_is_believed(tmp_path, pixels
         ({"profile": True}, 'the ICC profile "print" is a table of colours without tone curves'),
     ],
 )
-def test_colours_not_followed_are_refused(
+def test_unsupported_colours_are_refused(
     tmp_path, pixels, stored, png_with, make_profile, write, why
 ):
     for index in range(3):
@@ -290,7 +290,7 @@ def test_the_curve_of_bt_709_is_inverted():
     assert_close(response.linear_from_encoded(encoded), light, rtol=0, atol=1e-4)
 
 
-def test_photographs_of_one_set_have_a_curve_each_whatever_their_format(tmp_path, make_profile):
+def test_each_photograph_has_its_own_curve_in_any_format(tmp_path, make_profile):
     ramp = np.repeat(np.linspace(0, 255, 64).round().astype(np.uint8)[None, :, None], 3, axis=2)
     array = np.repeat(ramp, 16, axis=0)
     stored = torch.from_numpy(array / 255).movedim(-1, 0)
@@ -304,7 +304,7 @@ def test_photographs_of_one_set_have_a_curve_each_whatever_their_format(tmp_path
         assert_close(image.double(), wanted, rtol=0, atol=0.03 if name == "2.jpg" else 1e-6)
 
 
-def test_saturation_is_found_in_files_of_each_profile_by_itself(tmp_path, make_profile):
+def test_saturation_is_found_per_profile(tmp_path, make_profile):
     generator = np.random.default_rng(6)
     for index in range(6):
         exponent, top = ((1.0, 180), (2.0, 220))[index % 2]
@@ -319,7 +319,7 @@ def test_saturation_is_found_in_files_of_each_profile_by_itself(tmp_path, make_p
         assert 0.01 < float((images[index] == 1).float().mean()) < 0.3
 
 
-def test_what_is_given_wins_with_a_warning(three, pixels, stored, make_profile, tmp_path):
+def test_a_given_response_overrides_the_profile(three, pixels, stored, make_profile, tmp_path):
     profile = make_profile(IDENTITY, SRGB, name="mine")
 
     def write(path):
@@ -341,7 +341,7 @@ def test_what_is_given_wins_with_a_warning(three, pixels, stored, make_profile, 
     assert_close(found, stored**2, rtol=0, atol=1e-6)
 
 
-def test_colours_come_in_the_primaries_of_srgb_and_saturation_stays(three, pixels, make_profile):
+def test_colours_are_converted_to_srgb_primaries_and_stay_saturated(three, pixels, make_profile):
     profile = make_profile(IDENTITY, P3)
     array = (pixels // 2 + 50).astype(np.uint8)
     array[2, 3] = (255, 120, 120)
@@ -351,7 +351,7 @@ def test_colours_come_in_the_primaries_of_srgb_and_saturation_stays(three, pixel
 
     found = three(write, "png")
     linear = torch.from_numpy(array / 255).movedim(-1, 0)
-    # Of DCI-P3 with white D65 to BT.709, as SMPTE EG 432-1 and IEC 61966-2-1 give it.
+    # From DCI-P3 with white D65 to BT.709, by SMPTE EG 432-1 and IEC 61966-2-1.
     matrix = torch.tensor(
         [[1.2249, -0.2247, 0.0], [-0.0420, 1.0419, 0.0], [-0.0197, -0.0786, 1.0979]]
     ).double()
@@ -360,13 +360,13 @@ def test_colours_come_in_the_primaries_of_srgb_and_saturation_stays(three, pixel
     usual[2, 3] = False
     inside = usual & (wanted >= 0).all(dim=0)
     assert inside.float().mean() > 0.6
-    assert_close(found[:, inside], wanted[:, inside], rtol=0, atol=2e-3)  # 4 digits; D65's
+    assert_close(found[:, inside], wanted[:, inside], rtol=0, atol=2e-3)  # 4 digits of D65
     assert float(found[:, usual].max()) < 0.98
-    assert (found[:, 2, 3] == 1).all()  # red is mixed into all
+    assert (found[:, 2, 3] == 1).all()  # red contributes to all channels
 
 
-def test_primaries_of_adobe_rgb_and_p3_are_those_of_their_profiles():
-    # Of Adobe's AdobeRGB1998.icc and Apple's Display P3.icc.
+def test_primaries_of_adobe_rgb_and_p3_equal_those_of_their_profiles():
+    # From Adobe's AdobeRGB1998.icc and Apple's Display P3.icc.
     adobe = [[0.60974, 0.20528, 0.14919], [0.31111, 0.62567, 0.06322], [0.01947, 0.06087, 0.74457]]
     p3 = [[0.51512, 0.29198, 0.15710], [0.24120, 0.69225, 0.06657], [-0.00105, 0.04189, 0.78407]]
     for chromaticities, wanted in ((ADOBE_RGB, adobe), (DISPLAY_P3, p3)):
@@ -375,7 +375,7 @@ def test_primaries_of_adobe_rgb_and_p3_are_those_of_their_profiles():
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 200])
-def test_an_unknown_orientation_is_taken_as_upright(three, pixels, stored, orientation):
+def test_an_unknown_orientation_counts_as_upright(three, pixels, stored, orientation):
     def write(path):
         Image.fromarray(pixels).save(path, exif=exif_of(orientation=orientation))
 

@@ -12,7 +12,7 @@ from pimper_torch.runtime.errors import InputError, PimperWarning
 
 @pytest.fixture
 def raw(tmp_path, write_png16):
-    """Three photographs of 16 bits whose sensor saturates at 15000; their true levels."""
+    """Three 16-bit photographs of a sensor that saturates at 15000; their true levels."""
     generator = np.random.default_rng(6)
     folder = tmp_path / "raw"
     folder.mkdir()
@@ -23,7 +23,7 @@ def raw(tmp_path, write_png16):
 
 
 @pytest.mark.parametrize("saturation", [15000.0, 15000 / 65535, (15000, 15000, 15000), "auto"])
-def test_saturation_below_full_scale_is_one(raw, saturation):
+def test_saturation_below_full_scale_is_scaled_to_one(raw, saturation):
     folder, levels = raw
     encoding = Encoding(response="linear", saturation=saturation)
     if saturation == "auto":
@@ -35,32 +35,32 @@ def test_saturation_below_full_scale_is_one(raw, saturation):
     assert torch.equal(images >= SATURATED, levels.round() >= SATURATED * 15000)
 
 
-def test_full_scale_may_be_insisted_on(raw):
+def test_full_scale_can_be_forced(raw):
     folder, _ = raw
     assert float(load_views(folder, encoding=LINEAR).images.max()) == pytest.approx(15000 / 65535)
 
 
-def test_each_colour_may_saturate_at_its_own_level(raw, write_png16):
+def test_channels_saturate_at_different_levels(raw, write_png16):
     folder, levels = raw
     white = torch.tensor([15000, 12000, 9000]).double()[:, None, None]
     for index, one in enumerate(levels):
         array = torch.minimum(one, white).round().movedim(0, -1).numpy().astype(np.uint16)
         write_png16(folder / f"{index}.png", array)
     wanted = (levels / white).clamp(max=1)
-    told = Encoding(response="linear", saturation=(15000, 12000, 9000))
-    assert_close(load_views(folder, encoding=told).images.double(), wanted, rtol=0, atol=1e-4)
+    stated = Encoding(response="linear", saturation=(15000, 12000, 9000))
+    assert_close(load_views(folder, encoding=stated).images.double(), wanted, rtol=0, atol=1e-4)
     with pytest.warns(PimperWarning, match=r"15000, 12000, 9000 \(red, green, blue\)"):
         found = load_views(folder, encoding=Encoding(response="linear")).images
     assert_close(found.double(), wanted, rtol=0, atol=1e-4)
 
 
-def test_a_colour_that_never_saturates_is_scaled_with_the_others(raw, write_png16):
+def test_a_channel_without_saturation_is_scaled_like_the_others(raw, write_png16):
     folder, levels = raw
     for index, one in enumerate(levels):
         array = one.clamp(max=15000).round()
         array[2] = array[2] / 3
         write_png16(folder / f"{index}.png", array.movedim(0, -1).numpy().astype(np.uint16))
-        array[2] = one[2].clamp(max=14000) / 3  # no pile-up in blue: it fades out
+        array[2] = one[2].clamp(max=14000) / 3  # no pixels pile up at a level in blue
         array[2] = array[2] * torch.rand(60, 90, generator=torch.Generator().manual_seed(index))
         write_png16(folder / f"{index}.png", array.movedim(0, -1).numpy().astype(np.uint16))
     with pytest.warns(PimperWarning, match="pile up at 15000 of 65535"):
@@ -77,22 +77,22 @@ def test_black_becomes_zero(raw):
     assert_close(found.double(), wanted, rtol=0, atol=1e-4)
 
 
-def test_saturation_is_a_level_of_the_file_whatever_its_response(photos, pixels):
+def test_the_saturation_level_is_given_in_file_levels(photos, pixels):
     found = load_views(photos, encoding=Encoding(response=2.0, saturation=200.0)).images
     stored = torch.from_numpy(pixels / 255).movedim(-1, 0)
     wanted = (stored**2 / (200 / 255) ** 2).clamp(max=1)
     assert_close(found[0].double(), wanted, rtol=0, atol=1e-6)
 
 
-def test_a_curve_is_applied_to_files_of_its_own_depth_only(photos, pixels, raw, tmp_path):
+def test_a_curve_is_applied_only_to_files_of_its_depth(photos, pixels, raw, tmp_path):
     levels = np.arange(256.0)
     np.save(tmp_path / "a.npy", levels**1.5)
     encoding = Encoding(response=tmp_path / "a.npy")
     stored = torch.from_numpy(pixels / 255).movedim(-1, 0)
     found = load_views(photos, encoding=encoding).images[0]
     assert_close(found.double(), stored**1.5, rtol=0, atol=1e-6)
-    told = r"0\.png: holds 16 bits, levels 0 to 65535, but the response curve ends at level 255"
-    with pytest.raises(InputError, match=told):
+    message = r"0\.png: holds 16 bits, levels 0 to 65535, but the response curve ends at level 255"
+    with pytest.raises(InputError, match=message):
         load_views(raw[0], encoding=encoding)
 
 
@@ -117,13 +117,13 @@ def test_a_curve_of_three_colours_or_levels_is_refused_for_gray_files(photos, pi
         ),
     ],
 )
-def test_levels_that_the_files_do_not_have_are_refused(photos, settings, why):
+def test_levels_outside_the_range_of_the_files_are_refused(photos, settings, why):
     with pytest.raises(InputError, match=why):
         load_views(photos, encoding=Encoding(**settings))
 
 
 @pytest.mark.parametrize("size", [(13, 9), (20, 20), (39, 10)])
-def test_a_pixel_made_of_some_saturated_ones_is_saturated(size):
+def test_a_resized_pixel_with_a_saturated_source_is_saturated(size):
     torch.manual_seed(7)
     radiance = 0.5 * torch.rand(2, 30, 40, dtype=torch.float64)
     radiance[0, 11, 17] = 1.0
@@ -131,14 +131,14 @@ def test_a_pixel_made_of_some_saturated_ones_is_saturated(size):
     found, plain = resized_radiance(radiance, width, height), resized(radiance, width, height)
     lifted = radiance.clone()
     lifted[0, 11, 17] = 2.0
-    touched = resized(lifted, width, height) - plain > 1e-3  # its weight in each new pixel
+    touched = resized(lifted, width, height) - plain > 1e-3  # pixels to which it contributes
     assert 1 <= int(touched.sum()) <= 9
-    assert torch.equal(found >= SATURATED, touched)  # so not in the other colour either
+    assert torch.equal(found >= SATURATED, touched)  # in both channels
     assert torch.equal(found[~touched], plain[~touched])
-    assert plain.max() < 0.9  # unnoticed otherwise
+    assert plain.max() < 0.9  # levels alone do not reveal it
 
 
-def test_saturation_is_sought_before_shrinking(raw, write_png16):
+def test_saturation_is_found_before_shrinking(raw, write_png16):
     folder, levels = raw
     large = levels.clamp(max=15000).repeat_interleave(6, dim=-1).repeat_interleave(6, dim=-2)
     for index, one in enumerate(large):
@@ -150,7 +150,7 @@ def test_saturation_is_sought_before_shrinking(raw, write_png16):
     assert (found < SATURATED).float().mean() > 0.3
 
 
-def test_photographs_saturated_all_over_are_refused_and_nearly_so_are_warned_of(photos, pixels):
+def test_fully_saturated_photographs_are_refused_and_nearly_so_give_a_warning(photos, pixels):
     array = np.full_like(pixels, 255)
     Image.fromarray(array).save(photos / "2.png")
     with pytest.raises(InputError, match=r"2\.png is saturated all over.*photographs\.saturation"):
@@ -174,7 +174,7 @@ def test_saturation_off_the_object_does_not_matter(photos, pixels, tmp_path):
     assert load_views(photos, masks=tmp_path / "masks").num_views == 3
 
 
-def test_files_of_unlike_depth_saturate_each_at_their_own_level(raw, pixels):
+def test_files_of_different_depths_have_separate_saturation_levels(raw, pixels):
     folder, levels = raw
     generator = np.random.default_rng(8)
     shallow = (255 * generator.random((60, 90, 3)) ** 3).round().astype(np.uint8)

@@ -42,21 +42,21 @@ def needs_rawpy():
 
 @pytest.fixture
 def colours():
-    """Radiance in sRGB's primaries that changes linearly, so that interpolation is exact."""
+    """Linearly varying radiance in sRGB primaries, for which interpolation is exact."""
     v, u = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
     planes = torch.stack([0.10 + u / 300, 0.15 + v / 250, 0.12 + (u + v) / 500]).double()
     return planes
 
 
 def sensor_of(colours):
-    """What a camera of this matrix measures, saturation 1, and red and blue weaker than green."""
+    """Return samples of a camera with this matrix: saturation 1, red and blue below green."""
     matrix = torch.tensor(XYZ_TO_CAMERA, dtype=torch.float64) @ SRGB_TO_XYZ
     matrix = matrix / matrix.sum(dim=1, keepdim=True)
     return torch.einsum("ij,jhw->ihw", NEUTRAL[:, None] * matrix, colours)
 
 
 def mosaic_of(sensor):
-    """Take one colour a pixel, as a sensor does."""
+    """Select one colour per pixel, as a sensor does."""
     planes = sensor.clone()
     out = planes[1].clone()
     out[::2, ::2], out[1::2, 1::2] = planes[0, ::2, ::2], planes[2, 1::2, 1::2]
@@ -81,7 +81,7 @@ def test_raw_is_linear_radiance_in_the_primaries_of_srgb(folder, colours):
     assert (colour.response, colour.source) == (Linear(), "camera raw")
 
 
-def test_samples_are_what_the_sensor_saw_between_black_and_saturation(folder, colours):
+def test_samples_are_scaled_from_black_to_saturation(folder, colours):
     decoded = decode(folder / "0.dng")
     assert (decoded.full, decoded.full_scale_given, decoded.lossy) == (65535, True, False)
     inner = (slice(None), slice(3, -3), slice(3, -3))
@@ -97,21 +97,21 @@ def test_a_level_of_saturation_below_full_scale_is_counted_from_black(folder, mo
     assert_close(found[inner], wanted[inner], rtol=0, atol=5e-4)
 
 
-def test_dark_raw_is_not_taken_for_fewer_bits_and_scales_with_exposure(tmp_path, colours):
+def test_dark_raw_keeps_its_depth_and_scales_with_exposure(tmp_path, colours):
     for index, exposure in enumerate((1.0, 0.25, 0.25)):
         write_dng(tmp_path / f"{index}.dng", mosaic_of(exposure * sensor_of(colours)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         images = load_views(tmp_path).images.double()
     inner = (slice(None), slice(3, -3), slice(3, -3))
-    # No brightening, whatever the picture: a quarter of the light is a quarter of the radiance.
+    # No automatic brightening: a quarter of the light is a quarter of the radiance.
     assert_close(images[1][inner], images[0][inner] / 4, rtol=0, atol=5e-4)
 
 
-def test_whatever_a_saturated_sample_reaches_is_saturated(tmp_path, colours):
+def test_pixels_interpolated_from_a_saturated_sample_are_saturated(tmp_path, colours):
     sensor = sensor_of(colours)
     sensor[:, 10:14, 20:24] = 5.0
-    sensor[:, 30, 40] = 5.0  # one sample of red alone
+    sensor[:, 30, 40] = 5.0  # a single red sample
     for index in range(3):
         write_dng(tmp_path / f"{index}.dng", mosaic_of(sensor))
     images = load_views(tmp_path).images
@@ -122,7 +122,7 @@ def test_whatever_a_saturated_sample_reaches_is_saturated(tmp_path, colours):
     assert float(images[0][:, ~wanted].max()) < 0.9
 
 
-def test_other_sensors_and_all_colours_a_pixel_are_read_too(tmp_path, colours):
+def test_other_sensors_and_full_colour_raw_are_read(tmp_path, colours):
     sensor = sensor_of(colours)
     sensor[:, 10:13, 20:23] = 5.0
     whole = (BLACK + (WHITE - BLACK) * sensor).round().clamp(0, WHITE).movedim(0, -1)
@@ -142,7 +142,7 @@ def test_other_sensors_and_all_colours_a_pixel_are_read_too(tmp_path, colours):
 
 
 @pytest.mark.parametrize(("orientation", "size"), [(3, (60, 40)), (6, (40, 60))])
-def test_raw_is_turned_as_its_exif_says(tmp_path, colours, orientation, size):
+def test_raw_is_rotated_by_its_exif_orientation(tmp_path, colours, orientation, size):
     mosaic = mosaic_of(sensor_of(colours))
     write_dng(tmp_path / "a.dng", mosaic)
     write_dng(tmp_path / "b.dng", mosaic, orientation=orientation, equivalent=50)
@@ -156,19 +156,19 @@ def test_raw_is_turned_as_its_exif_says(tmp_path, colours, orientation, size):
     assert np.isnan(read_header(tmp_path / "a.dng").focal_px)
 
 
-def test_raw_is_read_and_the_jpeg_of_the_same_photograph_passed_over(folder, pixels):
+def test_raw_takes_precedence_over_the_jpeg_of_the_same_photograph(folder, pixels):
     raw = load_views(folder)
     for name in ("0.jpg", "1.JPG", "2.jpeg"):
         Image.fromarray(pixels).save(folder / name)
-    told = r"0\.jpg, 1\.JPG, 2\.jpeg were not read, as camera raw of the same names was\."
-    with pytest.warns(PimperWarning, match=told) as warned:
+    message = r"0\.jpg, 1\.JPG, 2\.jpeg were not read, as camera raw of the same names was\."
+    with pytest.warns(PimperWarning, match=message) as warned:
         beside = load_views(folder)
     assert len(warned) == 1
     assert beside.names == ("0.dng", "1.dng", "2.dng")
     assert torch.equal(beside.images, raw.images)
 
 
-def test_what_was_developed_from_raw_is_read_in_its_place(folder, pixels):
+def test_a_developed_file_takes_precedence_over_its_raw(folder, pixels):
     Image.fromarray(pixels).save(folder / "1.tif")
     assert [path.name for path in list_images(folder)] == ["0.dng", "1.tif", "2.dng"]
     Image.fromarray(pixels).save(folder / "1.jpg")
@@ -176,14 +176,14 @@ def test_what_was_developed_from_raw_is_read_in_its_place(folder, pixels):
         list_images(folder)
 
 
-def test_raw_shows_what_the_cameras_own_picture_shows(tmp_path, colours):
+def test_raw_is_cropped_like_the_cameras_image(tmp_path, colours):
     mosaic = mosaic_of(sensor_of(colours))
     write_dng(tmp_path / "whole.dng", mosaic, orientation=6)
-    # Of 60 x 40, what sees light leaves out 2 rows and 4 columns, and the picture some more.
+    # The light-sensitive area of 60 x 40 excludes 2 rows and 4 columns, and the image more.
     margins = {"active": (2, 4, 38, 58), "crop": (4, 2, 48, 30)}
     write_dng(tmp_path / "crop.dng", mosaic, orientation=6, **margins)
     header = read_header(tmp_path / "crop.dng")
     assert (header.width, header.height) == (30, 48)
     whole, crop = (decode(tmp_path / f"{name}.dng").samples for name in ("whole", "crop"))
-    rows, columns = slice(8, 56), slice(40 - 34, 40 - 4)  # what was below is on the left
+    rows, columns = slice(8, 56), slice(40 - 34, 40 - 4)  # the bottom is rotated to the left
     assert torch.equal(crop, whole[:, rows, columns])

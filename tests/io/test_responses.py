@@ -37,7 +37,7 @@ def test_a_table_with_and_without_levels_is_read(tmp_path, suffix, radiance, lev
     assert_close(curve.radiance, torch.from_numpy((radiance / radiance[-1]).T.copy()))
 
 
-def test_names_of_columns_semicolons_and_shares_are_understood(tmp_path):
+def test_column_names_semicolons_and_fractions_are_read(tmp_path):
     rows = [f"{level / 255};{value}" for level, value in zip(LEVELS, CURVE, strict=True)]
     (tmp_path / "a.csv").write_text("level;radiance\n" + "\n".join(rows) + "\n\n")
     curve = read_curve(tmp_path / "a.csv")
@@ -45,7 +45,7 @@ def test_names_of_columns_semicolons_and_shares_are_understood(tmp_path):
     assert_close(curve.radiance[0], torch.from_numpy(CURVE / 7))
 
 
-def test_what_opencv_calibrates_is_read(tmp_path):
+def test_responses_calibrated_by_opencv_are_read(tmp_path):
     np.save(tmp_path / "a.npy", COLOURS[:, None].astype(np.float32))
     curve = read_curve(tmp_path / "a.npy")
     wanted = torch.from_numpy((COLOURS / COLOURS[-1]).T.copy())
@@ -61,7 +61,7 @@ def test_every_choice_gives_its_response(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "told"),
+    ("name", "content", "message"),
     [
         ("a.csv", "1,2\n3\n", r"a\.csv: holds no table .*unlike lengths"),
         ("a.csv", "", "unlike lengths, or there are none"),
@@ -72,9 +72,9 @@ def test_every_choice_gives_its_response(tmp_path):
         ("a.xlsx", "", r"a\.xlsx: is no response .*needed: srgb, linear"),
     ],
 )
-def test_files_without_a_curve_are_refused_by_name(tmp_path, name, content, told):
+def test_files_without_a_curve_are_refused_by_name(tmp_path, name, content, message):
     (tmp_path / name).write_text(content)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         read_curve(tmp_path / name)
 
 

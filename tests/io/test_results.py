@@ -54,7 +54,7 @@ def test_a_result_has_exactly_the_listed_files(reconstruction, tmp_path):
     heard = []
     with listening(lambda done, total: heard.append(done / total)):
         write_result(reconstruction, Config(), tmp_path / "deep" / "out", about={"preset": "paper"})
-    assert heard == sorted(heard)  # one bar, filled once
+    assert heard == sorted(heard)  # one progress bar, filled once
     assert 0 < heard[0] < heard[-1] == 1
     out = tmp_path / "deep" / "out"
     assert names(out) == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
@@ -69,14 +69,14 @@ def test_a_result_has_exactly_the_listed_files(reconstruction, tmp_path):
     assert [view["name"] for view in lights["views"]] == ["a.png", "b.png", "c.png"]
 
 
-def test_depth_leads_back_to_the_surface_with_its_error(reconstruction, tmp_path):
-    told = reconstruction.mesh.replace(expected_error=reconstruction.mesh.vertices_world[:, 2])
+def test_the_depth_map_agrees_with_the_surface_and_has_its_error(reconstruction, tmp_path):
+    estimated = reconstruction.mesh.replace(expected_error=reconstruction.mesh.vertices_world[:, 2])
     found = {}
-    for name, mesh in (("untold", reconstruction.mesh), ("told", told)):
+    for name, mesh in (("plain", reconstruction.mesh), ("estimated", estimated)):
         write_result(reconstruction.replace(mesh=mesh), Config(), tmp_path / name)
         with np.load(tmp_path / name / "depth.npz", allow_pickle=False) as stored:
             assert str(stored["name"]) == "b.png"
-            assert ("expected_error" in stored.files) == (name == "told")
+            assert ("expected_error" in stored.files) == (name == "estimated")
             found |= {key: torch.from_numpy(stored[key]) for key in stored.files if key != "name"}
     assert_close(found["cam_from_world"], reconstruction.cameras.cam_from_world[1])
     rows, columns = torch.nonzero(found["mask"], as_tuple=True)
@@ -84,22 +84,22 @@ def test_depth_leads_back_to_the_surface_with_its_error(reconstruction, tmp_path
     rays = rays_through(pixels, found["cam_from_world"], found["intrinsics"])
     points = reconstruction.cameras.centers_world[1] + found["depth"][rows, columns, None] * rays
     x, y, z = points.unbind(dim=-1)
-    # The mesh's chords lie below or above the bump by up to its curvature over a cell.
+    # The mesh's chords deviate from the bump by up to its curvature over a cell.
     assert (z - 0.5 * torch.exp(-3 * (x**2 + y**2))).abs().max() < 0.02
     assert len(rows) > 500
     assert found["depth"][~found["mask"]].isnan().all()
-    assert 0.45 < found["expected_error"].max() <= 0.5  # blended over the bump, which is so high
+    assert 0.45 < found["expected_error"].max() <= 0.5  # at the bump, interpolated
     assert (found["expected_error"][~found["mask"]] == 0).all()
 
 
-def test_normals_and_albedo_are_pictures_of_the_reference(reconstruction, tmp_path):
+def test_normals_and_albedo_are_images_of_the_reference_view(reconstruction, tmp_path):
     write_result(reconstruction, Config(), tmp_path / "out")
     for name in ("normals.png", "albedo.png"):
         with Image.open(tmp_path / "out" / name) as picture:
             assert (picture.size, picture.mode) == ((60, 40), "RGB")
     colors = np.asarray(Image.open(tmp_path / "out" / "normals.png")).astype(float)
     assert (colors[0, 0] == 0).all()
-    centre = colors[20, 30]  # the top of the bump, seen from straight before it
+    centre = colors[20, 30]  # the top of the bump, viewed frontally
     assert centre[2] > 240
     assert abs(centre[:2] - 127.5).max() < 40
     left, right, up, down = colors[20, 25], colors[20, 35], colors[15, 30], colors[25, 30]
@@ -107,7 +107,7 @@ def test_normals_and_albedo_are_pictures_of_the_reference(reconstruction, tmp_pa
     assert down[1] < 110 < 145 < up[1]
 
 
-def test_lights_in_the_world_shade_as_lights_in_the_patch(reconstruction):
+def test_world_lights_give_the_same_shading_as_patch_lights(reconstruction):
     facets, lights_world, determined = world_lights(reconstruction)
     assert facets.tolist() == [0, 1]
     assert determined.tolist() == [False, True]  # in the order of the facets
@@ -118,31 +118,31 @@ def test_lights_in_the_world_shade_as_lights_in_the_patch(reconstruction):
     normals_patch = (turning @ normal_world.T)[..., 0]
     wanted = lights_patch[..., 0] + (lights_patch[..., 1:] * normals_patch[:, None]).sum(dim=-1)
     found = lights_world[..., 0] + lights_world[..., 1:] @ normal_world[0]
-    assert_close(found.flip(0), wanted)  # the bucket holds facet 1 first
+    assert_close(found.flip(0), wanted)  # facet 1 is first in the bucket
 
 
-def test_the_mean_light_leaves_out_what_is_unknown(reconstruction):
+def test_the_mean_light_excludes_unknown_lights(reconstruction):
     report = lights_report(reconstruction)
     _, lights_world, _ = world_lights(reconstruction)
     # Facet 0 is not determined; view c does not have facet 1.
     assert [view["patches"] for view in report["views"]] == [1, 1, 0]
-    told = torch.tensor(report["views"][0]["light"])
-    assert_close(told, lights_world[1, 0], rtol=1e-5, atol=1e-6)  # lights are about 1
+    mean = torch.tensor(report["views"][0]["light"])
+    assert_close(mean, lights_world[1, 0], rtol=1e-5, atol=1e-6)  # lights are about 1
     assert report["views"][2]["light"] is None
     assert report["patches"][1]["lights"][2] is None
     assert report["patches"][0]["lights"][2] is not None
     assert report["reference"] == "b.png"
 
 
-def test_the_common_light_is_what_the_patches_see_of_one_light(reconstruction):
-    # Each patch's light is the true one, plus anything along what its own normals cannot see.
+def test_the_common_light_combines_the_observed_parts_of_all_patches(reconstruction):
+    # Each patch's light is the true one plus a component orthogonal to its normals.
     photometric = reconstruction.patches.photometric
     truth = torch.tensor([[0.2, 0.3, -0.5, 0.7], [0.1, -0.4, 0.2, 0.9], [0.3, 0.0, 0.6, 0.5]])
     buckets = []
     for templates, found in zip(photometric.patches.buckets, photometric.buckets, strict=True):
         normals = torch.zeros_like(found.normals_patch)
         normals[..., 0] = torch.linspace(-0.6, 0.6, normals.shape[2])
-        normals[..., 2] = -(1 - normals[..., 0].square()).sqrt()  # a cylinder: y is not seen
+        normals[..., 2] = -(1 - normals[..., 0].square()).sqrt()  # a cylinder: y is unobserved
         turning = templates.patch_from_world[:, None, :3, :3]
         directed = (turning @ truth[None, :, 1:, None])[..., 0]
         lights = torch.cat([truth[None, :, :1].expand_as(directed[..., :1]), directed], dim=-1)
@@ -185,13 +185,13 @@ def test_the_summary_counts(reconstruction):
     assert summary["stages"][0]["samples"] == 96
 
 
-def test_numbers_that_json_cannot_hold_become_null(reconstruction):
+def test_numbers_without_json_form_become_null(reconstruction):
     report = reconstruction.report[0].replace(figures={"mean_residual": float("nan")})
     summary = summary_report(reconstruction.replace(report=(report,)), {})
     assert (summary["missing_fraction"], summary["stages"][0]["mean_residual"]) == (None, None)
 
 
-def test_a_failure_in_the_centre_leaves_the_former_result(reconstruction, tmp_path, monkeypatch):
+def test_a_failure_while_writing_keeps_the_former_result(reconstruction, tmp_path, monkeypatch):
     out = tmp_path / "out"
     write_result(reconstruction, Config(zeta=1.0), out)
     with pytest.raises(OutputError, match=r"already holds albedo\.png"):
@@ -207,7 +207,7 @@ def test_a_failure_in_the_centre_leaves_the_former_result(reconstruction, tmp_pa
     assert "1.0" in (out / "config.yaml").read_text()
 
 
-def test_a_page_that_nobody_wants_is_not_written(reconstruction, tmp_path):
+def test_the_report_is_optional(reconstruction, tmp_path):
     write_result(reconstruction, Config(), tmp_path / "out", report=False)
     assert names(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR - {"report.html"})
 
@@ -215,8 +215,8 @@ def test_a_page_that_nobody_wants_is_not_written(reconstruction, tmp_path):
 def test_the_page_shows_the_surface_and_its_layers(reconstruction, tmp_path):
     error = torch.linspace(0.001, 0.002, len(reconstruction.mesh.vertices_world))
     mesh = reconstruction.mesh.replace(expected_error=error)
-    told = {"warnings": ["Two photographs are blurred."]}
-    write_result(reconstruction.replace(mesh=mesh), Config(), tmp_path / "cup", about=told)
+    about = {"warnings": ["Two photographs are blurred."]}
+    write_result(reconstruction.replace(mesh=mesh), Config(), tmp_path / "cup", about=about)
     page = (tmp_path / "cup" / "report.html").read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
     assert data["title"] == "cup"
@@ -224,7 +224,7 @@ def test_the_page_shows_the_surface_and_its_layers(reconstruction, tmp_path):
     assert data["layers"][0]["high"] == pytest.approx(0.002, rel=0.1)
     assert len(data["views"]) == 3
     assert all("prediction" in view and "light" in view for view in data["views"])
-    # `pimper view` reads the file, and has the same colours.
+    # `pimper view` reads the file and shows the same colours.
     layer, _ = surface_layers(read_mesh(tmp_path / "cup" / "mesh.ply"))
     assert data["layers"][0]["high"] == layer.high
     lights = json.loads((tmp_path / "cup" / "lights.json").read_text())["views"]
@@ -246,12 +246,12 @@ def test_the_page_shows_the_surface_and_its_layers(reconstruction, tmp_path):
 def test_a_folder_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch, name, why):
     (tmp_path / "file").write_text("")
     if name == "new":
-        monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere
+        monkeypatch.setattr(os, "access", lambda *_: False)  # root can write to any folder
     with pytest.raises(OutputError, match=why):
         prepare_output(tmp_path / name, "result")
 
 
-def test_the_written_mesh_is_simplified_and_the_summary_says_how_far(reconstruction, tmp_path):
+def test_the_written_mesh_is_simplified_and_the_summary_has_its_deviation(reconstruction, tmp_path):
     vertices, faces = icosphere(4)
     ball = Mesh(
         vertices_world=vertices.float(),
@@ -268,20 +268,20 @@ def test_the_written_mesh_is_simplified_and_the_summary_says_how_far(reconstruct
     ]
     assert [summary["vertices"] for summary in summaries] == [len(vertices)] * 2
     assert "simplified" not in summaries[1]
-    told = summaries[0]["simplified"]
+    figures = summaries[0]["simplified"]
     few, whole = (read_mesh(tmp_path / name / "mesh.ply") for name in ("few", "all"))
-    assert len(few.vertices_world) == told["vertices"] < len(vertices)
-    assert len(few.faces) == told["faces"]
-    assert 0 < told["max_spacings"] <= 0.1
-    assert 0 < told["max_angle_deg"] <= 2.0
+    assert len(few.vertices_world) == figures["vertices"] < len(vertices)
+    assert len(few.faces) == figures["faces"]
+    assert 0 < figures["max_spacings"] <= 0.1
+    assert 0 < figures["max_angle_deg"] <= 2.0
     distance = NearestSurface(few).query(whole.vertices_world).distance
-    assert distance.max() <= 0.1 * told["spacing"] * 1.001
+    assert distance.max() <= 0.1 * figures["spacing"] * 1.001
     assert len(whole.vertices_world) == len(vertices)
     glb = [read_mesh(tmp_path / name / "mesh.glb").faces for name in ("few", "all")]
     assert [len(one) for one in glb] == [len(few.faces), len(faces)]
 
 
-def test_channels_are_in_units_of_what_they_may_be_off(reconstruction):
+def test_channels_are_scaled_by_their_tolerances(reconstruction):
     mesh = reconstruction.mesh.replace(expected_error=torch.full((225,), 0.02))
     channels = written_channels(mesh)
     more = mesh.replace(confidence=mesh.confidence + 0.1, expected_error=torch.full((225,), 0.0221))
@@ -317,7 +317,7 @@ def test_a_far_result_is_written_in_the_frame_of_its_cameras(reconstruction, tmp
     pose = placed.cameras.cam_from_world[index].numpy()
     np.testing.assert_allclose(arrays[1]["cam_from_world"], pose, rtol=0, atol=1e-7)
     np.testing.assert_array_equal(arrays[0]["depth"], arrays[1]["depth"])
-    # What a run says of itself is in the same frame.
+    # The run's own records are in the same frame.
     own = estimate_of(far)
     assert_close(own.mesh.vertices_world, placed.mesh.vertices_world, rtol=0, atol=2e-7)
     assert_close(own.cameras.centers_world, placed.cameras.centers_world, rtol=0, atol=1e-7)

@@ -1,4 +1,4 @@
-"""Photographs are known again by thumbnails, whatever their size and padding."""
+"""Photographs are recognised by thumbnails, independent of their size and padding."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ def images():
     return torch.rand(3, 3, 24, 40, generator=torch.Generator().manual_seed(71))
 
 
-def test_an_even_photograph_is_its_grey_level_everywhere():
+def test_the_thumbnail_of_a_uniform_photograph_is_its_grey_level():
     color = torch.tensor([0.1, 0.2, 0.3])[:, None, None].expand(1, 3, 24, 40)
     (found,) = thumbnails(views_of(color)).values()
     assert bytes.fromhex(found) == bytes([int(to_bytes(torch.tensor(0.2)))] * 64)
@@ -37,7 +37,7 @@ def test_neither_a_resize_nor_padding_changes_thumbnails(images):
     assert thumbnails(views_of(images)) == thumbnails(views_of(larger)) == thumbnails(padded)
 
 
-def test_photographs_in_another_order_are_refused_and_those_unlike_all_are_not(images):
+def test_reordered_photographs_are_refused_and_new_ones_are_not(images):
     known = thumbnails(views_of(images))
     with pytest.raises(InputError, match=r"0\.png shows 2\.png, 2\.png shows 0\.png; needed"):
         compare_thumbnails(views_of(images.flip(0)), known, "photographs")

@@ -12,7 +12,7 @@ from pimper_torch.runtime.errors import InputError, PimperWarning
 
 @pytest.fixture
 def both(tmp_path):
-    """Write a TIFF of 8 bits and the same of 16, and read both."""
+    """Write the same TIFF with 8 and 16 bits, and read both."""
 
     def read(array, **options):
         found = []
@@ -55,17 +55,17 @@ def test_samples_are_the_same_at_either_depth(both, pixels, array, wanted, optio
         assert_close(found, planes(wanted(pixels)), rtol=0, atol=1e-6)
 
 
-def test_samples_of_unknown_meaning_are_left_out_with_a_word(pixels, tmp_path):
+def test_extra_samples_are_ignored_with_a_warning(pixels, tmp_path):
     options = {"photometric": "rgb", "extrasamples": ["unspecified"]}
     for index in range(3):
         tifffile.imwrite(tmp_path / f"{index}.tif", with_more(pixels), **options)
-    told = r"3 of 3 .* has samples besides its colours whose meaning it does not tell"
-    with pytest.warns(PimperWarning, match=told):
+    message = r"3 of 3 .* has samples besides its colours whose meaning it does not tell"
+    with pytest.warns(PimperWarning, match=message):
         assert load_views(tmp_path).masks is None
 
 
 @pytest.mark.parametrize("factor", [np.uint8(1), np.uint16(257)])
-def test_small_copies_beside_a_photograph_are_passed_over(tmp_path, pixels, factor):
+def test_thumbnails_in_a_tiff_are_skipped(tmp_path, pixels, factor):
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         file.write(pixels * factor, photometric="rgb")
         for step, marked in ((1, 1), (2, 0)):
@@ -116,22 +116,22 @@ def test_other_samples_are_refused_by_name(tmp_path, pixels, kind, options, why)
 
 
 @pytest.mark.parametrize("bits", [10, 14])
-def test_sixteen_bits_that_hold_fewer_are_warned_of(tmp_path, pixels, write_png16, bits):
+def test_sixteen_bit_files_of_fewer_bits_give_a_warning(tmp_path, pixels, write_png16, bits):
     levels = (pixels.astype(np.uint16) * 257) >> (16 - bits)
     for index in range(3):
         write_png16(tmp_path / f"{index}.png", levels)
-    told = rf"no value of its files of 16 bits is above \d+ of 65535.*{bits} bits.*{2**bits - 1}"
-    with pytest.warns(PimperWarning, match=told):
+    message = rf"no value of its files of 16 bits is above \d+ of 65535.*{bits} bits.*{2**bits - 1}"
+    with pytest.warns(PimperWarning, match=message):
         load_views(tmp_path)
     given = Encoding(response="linear", saturation=float(2**bits - 1))
     found = load_views(tmp_path, encoding=given).images[0]
     assert_close(found.double(), torch.from_numpy(levels / (2**bits - 1)).movedim(-1, 0))
-    load_views(tmp_path, encoding=LINEAR)  # full scale is insisted on
+    load_views(tmp_path, encoding=LINEAR)  # full scale is forced
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.0005])
-def test_saturation_is_found_alike_at_either_depth(tmp_path, noise):
-    """A sensor that saturates at 0.8 of full scale, then noise as of a dark frame taken away."""
+def test_saturation_is_found_equally_at_either_depth(tmp_path, noise):
+    """A sensor that saturates at 0.8 of full scale, with noise as of a subtracted dark frame."""
     generator = np.random.default_rng(6)
     found = []
     light = 1.3 * generator.random((4, 60, 90, 3)) ** 3

@@ -1,13 +1,13 @@
-"""Kill runs at random moments, and see that nothing is lost and that each goes on to the same bits.
+"""Kill runs at random moments; check that no result is lost and that each resumes to the same bits.
 
     python tests/kill/runs.py 50 0
 
-for 50 runs of seed 0. A run is ended by SIGKILL, by files that may grow no further, as on a full
-disk, or by too little memory, as often into a folder that is new as into one that holds a former
-result. Then: the former result is whole, or the new one; the same command, undisturbed, ends with
-the files of a run that never was disturbed, byte for byte; and nothing is left beside it.
+for 50 runs of seed 0. A run ends by SIGKILL, by a limit on file sizes (as on a full disk), or by
+too little memory; half of them write to a new folder, half to one with a former result. Then the
+former or the new result must be complete; the same command, repeated, must give the files of an
+uninterrupted run, byte for byte; and no other file may remain.
 
-Runs are forked from a process that has everything loaded; they take a second or two.
+Runs are forked from a process with everything loaded; they take a second or two.
 """
 
 import hashlib
@@ -22,17 +22,17 @@ import time
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[name] = "1"  # a process that is forked must have one thread
+    os.environ[name] = "1"  # a forking process must have one thread
 
-# What tells times, and so differs from run to run.
+# Files with times, which differ between runs.
 TIMED = ("summary.json", "overview.png", "report.html", ".pimper.json")
 SETTINGS = ("--preset", "fast")
 FORMER = (*SETTINGS, "--faces", "all", "--factorize.light-prior", "3")
-LONGEST = 300.0  # seconds, after which a run hangs
+LONGEST = 300.0  # seconds, after which a run counts as hanging
 
 
 def main(folder: Path, count: int, seed: int) -> None:
-    """Run once undisturbed, then end runs at random moments, with a line for each."""
+    """Run once without interruption, then end runs at random moments; print a line for each."""
     import pycolmap  # noqa: F401
 
     import pimper_bench.cli.render_command  # noqa: F401
@@ -46,7 +46,7 @@ def main(folder: Path, count: int, seed: int) -> None:
     # An asset has the name of its result's folder.
     whole, former = folder / "whole" / "out", folder / "former" / "out"
     assert forked([*command, "-o", str(former), *FORMER]) == 0
-    forked([*command, "-o", str(folder / "first" / "out"), *SETTINGS])  # what is loaded once
+    forked([*command, "-o", str(folder / "first" / "out"), *SETTINGS])  # loads modules once
     began = time.perf_counter()
     assert forked([*command, "-o", str(whole), *SETTINGS]) == 0
     seconds = time.perf_counter() - began
@@ -66,14 +66,14 @@ def main(folder: Path, count: int, seed: int) -> None:
             assert not over_former, "the former result is gone"
         elif ".pimper.json" in found or not (out / ".stages" / "new" / ".pimper.json").exists():
             assert found in (hashes(whole), hashes(former) if over_former else None)
-        # Else it is on its way: the next run brings the rest.
+        # Otherwise it is partly moved: the next run completes it.
         assert forked([*line, "--overwrite"]) == 0
         assert hashes(out) == hashes(whole)
         assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
 def forked(line: list[str], ending: str = "", moment: float = 1.0, seconds: float = LONGEST) -> int:
-    """Carry out a command in a process of its own; minus a signal's number where one ended it."""
+    """Run a command in a forked process; return its exit code, or minus the signal's number."""
     from pimper_torch.cli.main import main as pimper
 
     sys.stdout.flush()
@@ -84,7 +84,7 @@ def forked(line: list[str], ending: str = "", moment: float = 1.0, seconds: floa
             os.dup2(quiet, stream)
         code = 70
         try:
-            if ending == "memory":  # of what the stages take on top of what is loaded
+            if ending == "memory":  # limits the stages' memory beyond that of the parent
                 pages = int(Path("/proc/self/statm").read_text().split()[0])
                 most = pages * resource.getpagesize() + int(moment * 400e6)
                 resource.setrlimit(resource.RLIMIT_AS, (most, most))
@@ -107,7 +107,7 @@ def forked(line: list[str], ending: str = "", moment: float = 1.0, seconds: floa
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """Hash every file of a result; those that tell times count as being there."""
+    """Hash every file of a result; for files with times only check existence."""
     return {
         name: "" if name in TIMED else hashlib.sha256(path.read_bytes()).hexdigest()
         for path in folder.rglob("*")

@@ -1,4 +1,4 @@
-"""Six of the runs that `tests/kill/runs.py` ends at random moments."""
+"""Six runs of `tests/kill/runs.py`, ended at random moments."""
 
 import subprocess
 import sys
@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-# In a process of its own: one that has threads cannot be forked.
+# In a new process: one with threads cannot be forked.
 RUNS = Path(__file__).with_name("runs.py")
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs fork and /proc")
-def test_nothing_is_lost_whatever_ends_a_run():
+def test_no_result_is_lost_however_a_run_ends():
     line = [sys.executable, str(RUNS), "6", "45"]
     ran = subprocess.run(line, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert "exit   -9" in ran.stdout  # or nothing was ended
+    assert "exit   -9" in ran.stdout  # or no run was killed

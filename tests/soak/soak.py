@@ -1,10 +1,10 @@
-"""Run the chain many times in one process, and see that it holds no more at the end.
+"""Run the chain many times in one process, and check that its memory does not grow.
 
     python tests/soak/soak.py 20
     python tests/soak/soak.py 20 demo
 
-for 20 runs of a small rendered scene, or of the skull of `pimper demo`, by the command line's own
-function. Memory is what the process holds after garbage was collected.
+for 20 runs of a small rendered scene, or of the skull of `pimper demo`, by the function of the
+command line. Memory is measured after garbage collection.
 """
 
 import gc
@@ -17,12 +17,12 @@ from pimper_torch.cli.main import main as pimper
 from pimper_torch.runtime.memory import release_memory, resident_bytes
 
 _SIZE = "--num-views 8 --width 240 --height 180 --processes 1 --supersample 1 -q"
-# Of memory, after the first two runs, which load modules and kernels and fill pools.
+# Growth of memory after the first two runs, which load modules and kernels and fill pools.
 MOST_GROWTH = 0.03
 
 
 def held() -> dict[str, float]:
-    """Count what this process holds, and what its folder of temporary files does."""
+    """Measure the resources of this process and of its folder of temporary files."""
     gc.collect()
     release_memory()
     return {
@@ -34,7 +34,7 @@ def held() -> dict[str, float]:
 
 
 def soak(folder: Path, runs: int, command: list[str]) -> None:
-    """Run a command so many times, and look after each; its result is replaced every time."""
+    """Run a command ``runs`` times, and measure after each; its result is replaced every time."""
     tempfile.tempdir = os.environ["TMPDIR"] = str(folder / "tmp")
     (folder / "tmp").mkdir()
     if not command:

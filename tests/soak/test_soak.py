@@ -7,7 +7,7 @@ import pytest
 
 
 @pytest.mark.slow
-def test_a_process_holds_no_more_after_four_runs_than_after_two():
+def test_memory_after_four_runs_equals_that_after_two():
     soak = Path(__file__).with_name("soak.py")
     environment = {**os.environ, "PYTHONPATH": str(soak.parents[2])}
     line = [sys.executable, str(soak), "4"]
