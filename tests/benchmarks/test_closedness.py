@@ -16,7 +16,7 @@ def mesh_of(vertices, faces):
 
 
 def without(mesh, corner):
-    """The same mesh without the faces round a vertex."""
+    """Return the mesh without the faces around a vertex."""
     return mesh.replace(faces=mesh.faces[(mesh.faces != corner).all(dim=1)])
 
 
@@ -46,8 +46,8 @@ def test_every_opening_is_one_loop_with_its_length(sphere):
     assert (found.euler, found.handles) == (0, 0)
 
 
-def test_openings_that_meet_in_a_vertex_are_one(sphere):
-    """Nothing holds the surface together there."""
+def test_openings_that_share_a_vertex_count_as_one(sphere):
+    """The surface is not connected at that vertex."""
     around = sphere.faces[(sphere.faces == 100).any(dim=1)].unique()
     for other in range(len(sphere.vertices_world)):
         its = sphere.faces[(sphere.faces == other).any(dim=1)].unique()
@@ -64,14 +64,14 @@ def test_a_torus_has_a_handle():
     assert (found.euler, found.handles) == (0, 1)
 
 
-def test_a_box_turns_by_a_right_angle_at_its_twelve_edges():
+def test_a_box_has_twelve_right_angled_edges():
     box = trimesh.creation.box((1.0, 2.0, 3.0))
     mesh = mesh_of(box.vertices.copy(), box.faces.copy())
     assert closedness(mesh, fold_deg=89.0).folds == 12
     assert closedness(mesh, fold_deg=91.0).folds == 0
 
 
-def test_three_faces_at_an_edge_or_two_that_disagree_are_told():
+def test_non_manifold_and_inconsistent_edges_are_reported():
     corners = torch.eye(5)[:, :3] + torch.arange(5)[:, None] * 0.1
     fan = closedness(mesh_of(corners, [[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
     assert (fan.crowded, fan.twisted, fan.closed) == (1, 0, False)

@@ -1,4 +1,4 @@
-"""The judge of guards knows right from wrong, and every stand-in stands in for something."""
+"""The evaluation of guards separates right from wrong removals, and its targets exist."""
 
 import pkgutil
 
@@ -34,18 +34,18 @@ def fractions(judge, guard, *given, **more):
     return [judge.right(*entry) for entry in heard.entries]
 
 
-def test_photographs_are_right_unless_spoilt():
+def test_removing_an_unspoilt_photograph_is_a_wrong_removal():
     both = torch.tensor([True, True])
     assert fractions(judge(), "sfm.sound_views", both, names=("a", "b")) == [0.5]
     assert fractions(judge(), "sfm.weak_views", both) == [None]
 
 
 @pytest.mark.parametrize("good", [True, False])
-def test_a_doubt_takes_what_is_right_where_cameras_are_good(good):
+def test_a_diagnosis_with_good_cameras_is_a_wrong_removal(good):
     assert fractions(judge(good=good), "sfm.diagnosis", 1) == [float(good)]
 
 
-def test_places_are_right_near_the_true_surface_in_its_frame():
+def test_points_near_the_true_surface_are_wrong_removals():
     places = torch.tensor([[0.2, 0.2, 0.0], [0.4, 0.4, 0.01], [0.2, 0.2, 1], [0.9, 0.2, 0]])
     taken = torch.tensor([True, True, True, False])
     (fraction,) = fractions(judge(), "repair", taken, at=places)
@@ -53,13 +53,13 @@ def test_places_are_right_near_the_true_surface_in_its_frame():
     assert fractions(judge(surface=None), "repair", taken, at=places) == [None]
 
 
-def test_pixels_are_right_where_the_object_is_seen():
+def test_pixels_of_the_object_are_wrong_removals():
     taken = torch.zeros(2, 8, 8, dtype=torch.bool)
     taken[:, :, 3:5] = True
     assert fractions(judge(), "silhouettes.shadows", taken) == [0.5]
 
 
-def test_every_guard_and_what_stands_in_for_it_exists():
+def test_every_guard_and_its_replacement_exists():
     names = {*PATCHES, *CHANGES, *(guard for one in SETS.values() for guard in one.guards)}
     assert names <= set(GUARDS)
     for patches in PATCHES.values():
@@ -70,7 +70,7 @@ def test_every_guard_and_what_stands_in_for_it_exists():
     assert sum(not one.guards for one in SETS.values()) >= 20
 
 
-def test_the_table_adds_up_plain_sets_alone():
+def test_the_table_sums_only_plain_sets():
     row = {"count": 2, "total": 10, "judged": 2, "right": 1.0}
     run = {"seconds": 1.0, "failure": "", "registered": [8, 8], "guards": {"extract.borders": row}}
     keys = ("mug-arc", "jar-arc", "flaps")

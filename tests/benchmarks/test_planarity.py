@@ -32,7 +32,7 @@ def test_an_exact_box_has_six_flat_sides_at_right_angles(generator):
     mesh = box(generator)
     sides = planar_faces(mesh, generator)
     assert len(sides) == 6
-    # All but a line along the edges, where smoothed normals are those of both sides.
+    # Except a line along the edges, where smoothed normals mix both sides.
     assert 0.97 * len(mesh.faces) < sum(len(side.faces) for side in sides) <= len(mesh.faces)
     assert max(side.rms for side in sides) < 1e-9
     found = sorted(side.sides for side in sides)
@@ -46,7 +46,7 @@ def test_an_exact_box_has_six_flat_sides_at_right_angles(generator):
     assert all((side.point - centre) @ side.normal > 0 for side in sides)
 
 
-def test_noise_is_measured_as_it_was_made(generator):
+def test_noise_is_measured_as_generated(generator):
     noise = 0.004
     sides = planar_faces(box(generator, noise=noise), generator)
     assert len(sides) == 6
@@ -56,7 +56,7 @@ def test_noise_is_measured_as_it_was_made(generator):
         assert side.edge == pytest.approx(math.prod(side.sides) ** 0.5)
 
 
-def test_a_bulge_is_found_in_the_side_that_has_it(generator):
+def test_a_bulge_is_found_on_its_side(generator):
     mesh = box(generator)
     vertices = mesh.vertices_world.clone()
     top = vertices[:, 2] > SIZE[2] - 1e-9
@@ -65,11 +65,11 @@ def test_a_bulge_is_found_in_the_side_that_has_it(generator):
     sides = planar_faces(mesh.replace(vertices_world=vertices), generator)
     (bulged,) = [side for side in sides if side.normal[2] > 0.9]
     others = [side.rms for side in sides if side.normal[2] < 0.9]
-    assert 0.003 < bulged.rms < 0.006  # the bulge's own spread is 0.0057, its rim left out
+    assert 0.003 < bulged.rms < 0.006  # the bulge's spread is 0.0057 with its rim
     assert max(others) < 1e-9
 
 
-def test_a_ball_has_no_flat_sides_to_speak_of(generator):
+def test_a_ball_has_no_flat_sides(generator):
     vertices, faces = icosphere(4)
     sides = planar_faces(
         Mesh(vertices_world=vertices, faces=faces), generator, band=0.002, min_fraction=0.04

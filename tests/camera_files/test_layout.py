@@ -18,7 +18,7 @@ def toy(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (lambda toy: toy.expect(False, "a spoon"), r"not the layout of a toy.*a spoon.*one\.txt"),
         (lambda toy: file_in(toy.path, ("b.txt", "c.txt"), "a toy"), r"a file b\.txt or c\.txt"),
@@ -34,14 +34,14 @@ def toy(tmp_path):
         ),
     ],
 )
-def test_what_is_not_as_needed_is_refused_shortly(toy, call, told):
-    with pytest.raises(InputError, match=told) as refusal:
+def test_invalid_values_are_refused_with_a_short_message(toy, call, message):
+    with pytest.raises(InputError, match=message) as refusal:
         call(toy)
     assert str(toy.path) in str(refusal.value)
     assert len(str(refusal.value)) < 1000
 
 
-def test_links_in_the_folder_are_followed_and_not_left_by_dots(tmp_path):
+def test_links_are_followed_and_dots_do_not_leave_the_folder(tmp_path):
     folder, elsewhere = tmp_path / "set", tmp_path / "far" / "photographs"
     folder.mkdir()
     elsewhere.mkdir(parents=True)
@@ -51,13 +51,13 @@ def test_links_in_the_folder_are_followed_and_not_left_by_dots(tmp_path):
     place = DataSetPath(folder, "a toy")
     assert place.inside("images/x.png").is_file()
     assert place.inside("a/../b.png").resolve() == folder / "b.png"
-    # To the system, images/.. is the folder that the link's end lies in.
+    # For the system, images/.. is the parent of the link's target.
     assert (folder / "images" / ".." / "secret.png").is_file()
     assert not place.inside("images/../secret.png").exists()
 
 
 @pytest.mark.parametrize("value", ["1 2.5 -3e1", ["1", "2.5", "-30"], [[1, 2.5, -30]]])
-def test_numbers_come_as_texts_or_lists(toy, value):
+def test_numbers_are_read_from_texts_or_lists(toy, value):
     expected = torch.tensor([1.0, 2.5, -30.0], dtype=torch.float64)
     assert torch.equal(toy.numbers(value, 3, "x"), expected)
 
@@ -71,7 +71,7 @@ def test_json_of_anything_but_an_object_is_refused(toy, content):
 
 @pytest.mark.parametrize("reader", [read_npy, read_npz])
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut short", "pickle"])
-def test_whatever_a_reader_says_of_a_damaged_file_names_the_file(toy, reader, content):
+def test_errors_of_readers_name_the_damaged_file(toy, reader, content):
     path = toy.path / ("a.npy" if reader is read_npy else "a.npz")
     if content == "pickle":
         save = np.save if reader is read_npy else np.savez

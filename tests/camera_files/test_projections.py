@@ -9,8 +9,8 @@ from pimper_torch.doors.camera_files.posed_camera import decompose_projections
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31))
-def test_a_projection_is_split_into_a_camera_that_projects_the_same(seed):
-    """Which is unique: so it is the camera that a projection was made of, whatever the factor."""
+def test_a_projection_is_decomposed_into_its_camera(seed):
+    """The decomposition is unique, independent of the projection's factor."""
     generator = torch.Generator().manual_seed(seed)
     P = torch.randn(3, 3, 4, generator=generator, dtype=torch.float64)
     P = P * torch.tensor([1.0, -250.0, 3e-4]).double()[:, None, None]
@@ -26,7 +26,7 @@ def test_a_projection_is_split_into_a_camera_that_projects_the_same(seed):
     assert_close(again / again[:, 2:, 3:], P / P[:, 2:, 3:], rtol=1e-8, atol=1e-8)
 
 
-def test_a_projection_of_no_camera_is_an_error():
+def test_an_invalid_projection_is_an_error():
     P = torch.stack([torch.eye(3, 4), torch.ones(3, 4)]).double()
     with pytest.raises(ValueError, match="number 1 has no inverse"):
         decompose_projections(P)

@@ -1,4 +1,4 @@
-"""One rig in the words of every program: the cameras that `--sparse` takes are the same."""
+"""One rig in every supported format: `--sparse` reads the same cameras."""
 
 import json
 from pathlib import Path
@@ -43,7 +43,7 @@ WAYS = [
 @settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 2**31))
 @pytest.mark.parametrize("write", WAYS)
-def test_every_file_gives_the_cameras_that_were_written(write, seed):
+def test_every_format_gives_the_written_cameras(write, seed):
     rig = rigs.rig_of(seed)
     with TemporaryDirectory() as folder:
         found = existing_model(rigs.views_of(), write(rig, Path(folder)))
@@ -51,7 +51,7 @@ def test_every_file_gives_the_cameras_that_were_written(write, seed):
     order = torch.tensor(
         np.argsort(rigs.NAMES) if write in (rigs.of_matrices, rigs.of_projections) else range(3)
     )
-    # Arrays without names go by the order of the names: those of the rig were written in another.
+    # Arrays without names have the order of sorted names, which is not that of the rig.
     expected = rig.take(torch.argsort(order))
     assert_close(found.cam_from_world, expected.cam_from_world, rtol=0, atol=1e-6)
     assert_close(pinholes_for(found.lenses), expected.intrinsics, rtol=0, atol=1e-6)
@@ -59,16 +59,16 @@ def test_every_file_gives_the_cameras_that_were_written(write, seed):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_of_several_models_in_a_folder_the_largest_is_read(rig, text, tmp_path):
+def test_the_largest_of_several_models_is_read(rig, text, tmp_path):
     for number, names in (("0", ("2.png",)), ("1", rigs.NAMES), ("10", ("x.png", "10.png"))):
         cameras = rig.take(torch.arange(len(names)))
         rigs.of_colmap(cameras, tmp_path, text=text, names=names).rename(tmp_path / number)
-    told = r"3 COLMAP models, .* read is 1, the largest, not 0, 10\. Point to"
-    with pytest.warns(PimperWarning, match=told):
+    message = r"3 COLMAP models, .* read is 1, the largest, not 0, 10\. Point to"
+    with pytest.warns(PimperWarning, match=message):
         found = existing_model(rigs.views_of(), tmp_path)
     assert found.names == rigs.NAMES
     assert_close(found.cam_from_world, rig.cam_from_world, rtol=0, atol=1e-6)
-    # One alone is read without a word: in its folder, beside others in it, and around it.
+    # A single model is read without a warning, from its folder or one above.
     (tmp_path / "0").rename(tmp_path / "1" / "old")
     assert existing_model(rigs.views_of(), tmp_path / "1").names == rigs.NAMES
     (tmp_path / "10").rename(tmp_path / "1" / "older")
@@ -78,7 +78,7 @@ def test_of_several_models_in_a_folder_the_largest_is_read(rig, text, tmp_path):
 @pytest.mark.parametrize(
     "write", [rigs.of_colmap, rigs.of_metashape, rigs.of_meshroom, rigs.of_transforms]
 )
-def test_cameras_follow_photographs_that_were_resized(rig, write, tmp_path):
+def test_cameras_are_scaled_with_resized_photographs(rig, write, tmp_path):
     found = existing_model(rigs.views_of(0.5), write(rig, tmp_path))
     K = pinholes_for(found.lenses)
     assert_close(K[:, :2], rig.intrinsics[:, :2] / 2, rtol=0, atol=1e-6)
@@ -92,7 +92,7 @@ def test_cameras_follow_photographs_that_were_resized(rig, write, tmp_path):
         lambda rig, folder: rigs.of_transforms(rig, folder, sizes=False),
     ],
 )
-def test_a_file_without_sizes_is_for_the_photographs_as_their_files_are(rig, write, tmp_path):
+def test_a_file_without_sizes_refers_to_the_sizes_of_the_photograph_files(rig, write, tmp_path):
     photographs = tmp_path / "photos"
     photographs.mkdir()
     for name in rigs.NAMES:
@@ -102,15 +102,15 @@ def test_a_file_without_sizes_is_for_the_photographs_as_their_files_are(rig, wri
     assert_close(K[:, :2], rig.intrinsics[:, :2] / 2, rtol=0, atol=1e-6)
 
 
-def test_a_file_without_sizes_is_not_for_the_preview_in_raw(rig, tmp_path):
-    for name in rigs.NAMES:  # Pillow reads of a NEF its first picture, of 160 x 120
+def test_a_file_without_sizes_does_not_refer_to_raw_previews(rig, tmp_path):
+    for name in rigs.NAMES:  # Pillow reads the first image of a NEF, of 160 x 120
         Image.new("L", (rigs.WIDTH // 4, rigs.HEIGHT // 4)).save(tmp_path / name)
     found = existing_model(rigs.views_of(1.0, tmp_path), rigs.of_matrices(rig, tmp_path))
     assert_close(pinholes_for(found.lenses), rig.intrinsics, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("suffix", [".CR2", ".dng", ".heic"])
-def test_a_model_of_jpegs_is_that_of_raw_photographs_of_the_same_names(rig, suffix, tmp_path):
+def test_a_model_of_jpegs_matches_raw_photographs_of_the_same_names(rig, suffix, tmp_path):
     jpegs = tuple(name.replace(".png", ".JPG") for name in rigs.NAMES)
     views = rigs.views_of().replace(
         names=tuple(name.replace(".png", suffix) for name in rigs.NAMES)
@@ -121,7 +121,7 @@ def test_a_model_of_jpegs_is_that_of_raw_photographs_of_the_same_names(rig, suff
 
 
 def of_poses() -> Views:
-    """Photographs in folders that are called as the rig's, under two lights each."""
+    """Photographs under two lights each, in folders named like those of the rig."""
     views = rigs.views_of()
     poses = torch.arange(3).repeat_interleave(2)
     names = [
@@ -131,7 +131,7 @@ def of_poses() -> Views:
 
 
 @pytest.mark.parametrize("write", WAYS)
-def test_one_camera_a_folder_is_that_of_every_light_of_the_pose(rig, write, tmp_path):
+def test_one_camera_per_folder_applies_to_every_light_of_the_pose(rig, write, tmp_path):
     found = existing_model(of_poses(), write(rig, tmp_path))
     assert found.names == of_poses().names
     every = rig.take(torch.arange(3).repeat_interleave(2))
@@ -147,7 +147,7 @@ def test_one_camera_a_folder_is_that_of_every_light_of_the_pose(rig, write, tmp_
         ("10/light x.png", "2.jpg", "A B/sum.png"),
     ],
 )
-def test_a_camera_of_any_picture_of_a_pose_is_that_of_its_lights(rig, names, tmp_path):
+def test_the_camera_of_any_image_of_a_pose_applies_to_all_its_lights(rig, names, tmp_path):
     found = existing_model(of_poses(), rigs.of_colmap(rig, tmp_path, names=names))
     every = rig.cam_from_world.repeat_interleave(2, dim=0)
     assert_close(found.cam_from_world, every, rtol=0, atol=1e-6)
@@ -164,7 +164,7 @@ def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arrays", "told"),
+    ("arrays", "message"),
     [
         ({"K": np.eye(3)}, "projections.*Found: K"),
         ({}, "no arrays"),
@@ -178,13 +178,13 @@ def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
         ({"world_mat_0": np.eye(4), "world_mat_1": np.eye(4)}, "3 photographs.*2 cameras"),
     ],
 )
-def test_arrays_that_are_no_cameras_are_refused(arrays, told, tmp_path):
-    with pytest.raises(InputError, match=told):
+def test_invalid_camera_arrays_are_refused(arrays, message, tmp_path):
+    with pytest.raises(InputError, match=message):
         existing_model(rigs.views_of(), rigs.saved(tmp_path, **arrays))
 
 
 @pytest.mark.parametrize("name", ["cameras.txt", "cameras.json", "cameras.xml", "cameras.npz"])
-def test_another_file_is_refused(name, tmp_path):
+def test_an_unknown_file_is_refused(name, tmp_path):
     (tmp_path / name).write_text("nothing of the kind")
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
         existing_model(rigs.views_of(), tmp_path / name)
@@ -197,7 +197,7 @@ def test_two_cameras_of_one_photograph_are_refused(rig, tmp_path):
         existing_model(rigs.views_of(), path)
 
 
-def test_the_cloud_that_a_file_names_comes_with_its_cameras(rig, tmp_path):
+def test_the_point_cloud_of_a_camera_file_is_read(rig, tmp_path):
     cloud = torch.randn(7, 3, generator=torch.Generator().manual_seed(71)).double()
     write_transforms(rigs.views_of(), rig, tmp_path, points_world=cloud)
     found = existing_model(rigs.views_of(), tmp_path / "transforms.json")
@@ -221,7 +221,7 @@ def test_a_cloud_that_cannot_be_read_is_refused(rig, tmp_path, name, why):
         read_cloud(path)
 
 
-def test_a_cloud_that_is_not_there_is_left_out_with_a_warning(rig, tmp_path):
+def test_a_missing_cloud_gives_a_warning(rig, tmp_path):
     path = rigs.of_transforms(rig, tmp_path)
     assert len(read_cloud(path)) == 0
     path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "gone.ply"}))
@@ -229,7 +229,7 @@ def test_a_cloud_that_is_not_there_is_left_out_with_a_warning(rig, tmp_path):
         assert len(read_cloud(path)) == 0
 
 
-def test_points_that_are_not_finite_are_left_out_of_a_cloud(rig, tmp_path):
+def test_points_that_are_not_finite_are_removed_from_a_cloud(rig, tmp_path):
     cloud = torch.tensor([[1.0, 2, 3], [torch.nan, 0, 0], [4, 5, 6]]).double()
     write_transforms(rigs.views_of(), rig, tmp_path, points_world=cloud)
     assert read_cloud(tmp_path / "transforms.json").tolist() == [[1, 2, 3], [4, 5, 6]]

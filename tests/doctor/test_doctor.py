@@ -1,4 +1,4 @@
-"""Each check finds what was put into the photographs, and nothing where all is well."""
+"""Each check finds the introduced defects, and reports none in good photographs."""
 
 import math
 
@@ -46,7 +46,7 @@ def photograph(**changes):
 
 
 def squares(side=400, cell=40):
-    """Bright and dark squares, turned so that edges have every orientation."""
+    """Bright and dark squares, rotated for various edge orientations."""
     v, u = torch.meshgrid(torch.arange(side) + 0.5, torch.arange(side) + 0.5, indexing="ij")
     turned = torch.stack([0.9 * u + 0.4 * v, 0.9 * v - 0.4 * u])
     upright = torch.stack([u, v])
@@ -58,18 +58,18 @@ def squares(side=400, cell=40):
 def test_the_blur_of_edges_is_found_in_pixels(sigma, generator):
     image = torch.from_numpy(gaussian_filter(squares().numpy(), sigma))
     noise = 0.003 * torch.randn(image.shape, generator=generator)
-    # A pixel's own square adds a twelfth to the variance, and staircases of turned edges some.
+    # A pixel's area adds a twelfth to the variance; aliased edges add a little.
     assert edge_blur_px(image + noise) == pytest.approx(sigma, rel=0.15)
 
 
-def test_motion_counts_though_it_blurs_edges_across_it_alone():
+def test_motion_blur_is_measured_in_its_direction():
     moved = torch.from_numpy(uniform_filter1d(squares().numpy(), 9, axis=1))
-    assert edge_blur_px(moved) > 2.0  # a box of 9 has a deviation of 2.6
+    assert edge_blur_px(moved) > 2.0  # a box of 9 has a standard deviation of 2.6
     assert edge_blur_px(moved) == pytest.approx(edge_blur_px(moved.T.contiguous()), rel=0.1)
     assert edge_blur_px(squares()) < 0.6
 
 
-def test_where_there_are_no_edges_no_blur_is_told():
+def test_an_image_without_edges_has_no_blur_figure():
     assert math.isnan(edge_blur_px(torch.full((50, 50), 0.5)))
     assert blur([photograph(blur_px=math.nan)]) is None
 
@@ -84,7 +84,7 @@ def test_blurred_photographs_are_named():
 
 def test_saturated_and_dark_photographs_are_named():
     image = 0.3 * torch.rand(3, 40, 50, generator=torch.Generator().manual_seed(1))
-    image[0, :4] = 1.0  # a tenth, in one colour
+    image[0, :4] = 1.0  # a tenth of the pixels, in one channel
     burnt = summarize("burnt.png", image)
     assert burnt.saturated == pytest.approx(0.1)
     assert (
@@ -99,12 +99,12 @@ def test_saturated_and_dark_photographs_are_named():
     assert saturation([photograph()]).severity == exposure([photograph()]).severity == "ok"
 
 
-def test_too_few_photographs_are_told():
+def test_too_few_photographs_are_reported():
     assert number([photograph()] * 5).severity == "warning"
     assert number([photograph()] * 12).severity == "ok"
 
 
-def test_photographs_that_nothing_connects_are_named():
+def test_photographs_without_matches_are_named():
     def match(*pair):
         return VerifiedPair(views=pair, first=torch.zeros(1, 2), second=torch.zeros(1, 2))
 
@@ -123,19 +123,19 @@ RUNS = (
 
 
 @pytest.mark.parametrize(("megapixels", "views", "seconds", "gigabytes"), RUNS)
-def test_the_cost_is_that_of_measured_runs_within_half(megapixels, views, seconds, gigabytes):
+def test_estimated_costs_are_within_half_of_measured_runs(megapixels, views, seconds, gigabytes):
     for found, measured in zip(estimate(megapixels, views), (seconds, gigabytes), strict=True):
         assert 1 / 1.5 < found / measured < 1.5
 
 
-def test_memory_is_that_of_the_surface_or_of_many_photographs():
+def test_memory_depends_on_the_surface_and_on_many_photographs():
     assert estimate(576.0, 300)[1] < 4 < estimate(576.0, 500)[1]
     large = [photograph(width=4000, height=3000)] * 30
     assert cost(large, 100.0).severity == cost(large, None).severity == "ok"
     assert "10.1 GB with `default`, an estimate; 8.0 GB are free" in cost(large, 8.0).found
 
 
-def test_the_machine_is_told():
+def test_the_machine_is_described():
     found = {one.check: one for one in machine()}
     assert torch.__version__ in found["installed"].found
     assert f"{torch.get_num_threads()} threads" in found["device"].found
@@ -154,14 +154,14 @@ def photos(tmp_path_factory):
     return folder / "a" / "photos"
 
 
-def test_every_check_of_a_folder_tells_once(photos):
+def test_every_check_of_a_folder_reports_once(photos):
     found = {one.check: one for one in examine_folder(photos)}
     assert found["overlap"].severity == "ok"
     checks = ["number", "blur", "saturation", "exposure", "overlap", "cost"]
     assert list(found) == checks
 
 
-def test_a_run_hears_what_the_folder_tells(photos):
+def test_a_run_has_the_findings_of_its_folder(photos):
     cheap = examine_views(load_views(photos))
     whole = {one.check: one for one in examine_folder(photos)}
     assert [one for one in cheap if one.check != "cost"] == [
@@ -169,8 +169,8 @@ def test_a_run_hears_what_the_folder_tells(photos):
     ]
 
 
-def test_matches_lie_on_the_same_points(photos):
-    """Of a photograph and itself, shifted, every match is off by the shift."""
+def test_matches_are_of_the_same_points(photos):
+    """All matches between a photograph and its shifted copy differ by the shift."""
     one = of_views(load_views(photos))[0]
     shifted = one.replace(small=one.small.roll((3, 5), dims=(0, 1)))
     (match,) = match_copies([one.small, shifted.small])
@@ -187,7 +187,7 @@ def test_a_file_that_cannot_be_read_is_refused_as_by_a_run(photos, tmp_path, cap
     assert "broken.png: holds no JPEG, PNG or TIFF image" in capsys.readouterr().err
 
 
-def test_the_machine_alone_is_examined_without_photographs(capsys):
+def test_without_photographs_only_the_machine_is_examined(capsys):
     assert main(["doctor"]) == 0
     assert "threads" in capsys.readouterr().out
     assert main(["doctor", "nowhere"]) == 2

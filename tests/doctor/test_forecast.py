@@ -1,4 +1,4 @@
-"""The time left for a run, on a clock that tests set."""
+"""Remaining time of a run, with a simulated clock."""
 
 import pytest
 
@@ -38,23 +38,23 @@ def ran(forecast, clock, name, seconds, kept=False):
     forecast.finished(report)
 
 
-def test_a_machine_that_is_slower_by_a_factor_takes_the_plan_times_it(forecast, clock):
+def test_a_slower_machine_scales_the_plan(forecast, clock):
     assert forecast.seconds_left() == 25.0
     ran(forecast, clock, "find", 30.0)
-    # The plan weighs 1.25 s beside the 10 that ended.
+    # The plan has a weight of 1.25 s against the finished 10 s.
     assert forecast.seconds_left() == pytest.approx(15 * 31.25 / 11.25)
     ran(forecast, clock, "pass", 6.0)
     ran(forecast, clock, "end", 3.0)
     assert forecast.seconds_left() == pytest.approx(12 * 3.0)
 
 
-def test_a_later_pass_is_scaled_by_the_one_before(forecast, clock):
+def test_a_later_pass_is_scaled_by_the_previous_one(forecast, clock):
     for name, seconds in (("find", 10.0), ("pass", 10.0), ("end", 1.0)):
         ran(forecast, clock, name, seconds)
     assert forecast.seconds_left() == pytest.approx(5 * 8 + 4)
 
 
-def test_the_stage_under_way_counts_down(forecast, clock):
+def test_the_running_stage_counts_down(forecast, clock):
     forecast.started("find")
     clock.now = 4.0
     assert forecast.seconds_left() == 21.0
@@ -64,32 +64,32 @@ def test_the_stage_under_way_counts_down(forecast, clock):
     assert forecast.seconds_left() == 15.0
 
 
-def test_a_stage_that_takes_longer_than_planned_scales_those_to_come(forecast, clock):
+def test_a_slow_stage_scales_the_remaining_ones(forecast, clock):
     forecast.started("find")
     forecast.progressed(1, 4)
     clock.now = 40.0
     assert forecast.seconds_left() == pytest.approx(0.75 * 40 + 15 * 41.25 / 11.25)
 
 
-def test_records_that_are_kept_and_stages_left_out_take_no_time(forecast, clock):
+def test_stored_records_and_skipped_stages_take_no_time(forecast, clock):
     ran(forecast, clock, "find", 1000.0, kept=True)
     assert forecast.seconds_left() == 15.0
     ran(forecast, clock, "unknown", 3.0)
     assert forecast.seconds_left() == 15.0
-    ran(forecast, clock, "end", 1.0)  # without the pass before it
+    ran(forecast, clock, "end", 1.0)  # without the previous pass
     assert forecast.seconds_left() == 12.0
     ran(forecast, clock, "pass", 8.0)
     ran(forecast, clock, "end", 4.0)
     assert forecast.seconds_left() == 0.0
 
 
-def test_nothing_is_told_without_a_plan(clock):
+def test_without_a_plan_there_is_no_forecast(clock):
     forecast = Forecast()
     ran(forecast, clock, "warp", 3.0)
     assert forecast.seconds_left() is None
 
 
-def test_what_is_given_is_not_planned_for():
+def test_given_inputs_reduce_the_plan():
     def seconds(**given):
         return sum(seconds for _, seconds in planned(10.0, 20, **given))
 

@@ -23,7 +23,7 @@ ENCODING = Encoding(response="linear")
 
 @pytest.fixture
 def photographs(reconstruction, tmp_path):
-    """Files of photographs, one of which finds no place in the model."""
+    """Files of photographs, one of which is not registered."""
     folder = tmp_path / "photos"
     folder.mkdir()
     images = to_bytes(reconstruction.scene.views.images)
@@ -35,7 +35,7 @@ def photographs(reconstruction, tmp_path):
 
 @pytest.fixture
 def run(reconstruction, photographs):
-    """A run on these photographs, taken through a lens that bends straight lines."""
+    """A run on these photographs, which have lens distortion."""
     scene = reconstruction.scene
     lens = CameraModel(
         camera=1, model="SIMPLE_RADIAL", params=(90.0, 31.0, 19.0, 0.1), width=60, height=40
@@ -70,14 +70,14 @@ def run(reconstruction, photographs):
 
 @pytest.fixture
 def without_pictures(monkeypatch, lit_before):
-    """Draw nothing: pictures are not read back, and take longer than all else."""
+    """Skip images: they are not read back, and take most of the time."""
     for draw in ("draw_overview", "draw_turn"):
         monkeypatch.setattr(results, draw, lambda *given: given[-1].write_bytes(b""))
 
 
 @pytest.fixture
 def folder(run, photographs, tmp_path, tmp_path_factory, without_pictures):
-    """The folder of results of that run, a copy of one that is written once."""
+    """The result folder of that run, copied from one that is written once."""
     kept, out = tmp_path_factory.getbasetemp() / "exchange", tmp_path / "out"
     if not kept.exists():
         config = CoarseToFineConfig(photographs=ENCODING)
@@ -90,7 +90,7 @@ def folder(run, photographs, tmp_path, tmp_path_factory, without_pictures):
 
 @pytest.fixture
 def result(folder):
-    """That folder, read back."""
+    """The result read from that folder."""
     return read_result(folder)
 
 

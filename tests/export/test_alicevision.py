@@ -14,7 +14,7 @@ def parsed(path):
     return json.loads(path.read_text())
 
 
-def test_what_is_written_is_read_back(result, tmp_path, same_cameras):
+def test_an_export_survives_a_round_trip(result, tmp_path, same_cameras):
     write_alicevision(result, tmp_path)
     found = read_camera_file(tmp_path / "cameras.sfm", masks=tmp_path / "masks")
     same_cameras(found.cameras, result.cameras)
@@ -22,7 +22,7 @@ def test_what_is_written_is_read_back(result, tmp_path, same_cameras):
     assert torch.equal(found.views.masks, result.silhouettes.masks)
 
 
-def test_pinholes_of_unlike_focal_lengths_and_sizes_are_read_back(result, tmp_path):
+def test_pinholes_of_different_focal_lengths_and_sizes_are_read_back(result, tmp_path):
     K = torch.tensor(
         [[[20.0, 0, 7], [0, 30, 5], [0, 0, 1]], [[21, 0, 6.25], [0, 19, 4.5], [0, 0, 1]]]
     )
@@ -35,7 +35,7 @@ def test_pinholes_of_unlike_focal_lengths_and_sizes_are_read_back(result, tmp_pa
     assert [[one.lens.width, one.lens.height] for one in found] == sizes.tolist()
 
 
-def test_maps_go_by_the_views_of_the_photographs(result, tmp_path):
+def test_maps_are_named_by_the_views(result, tmp_path):
     write_alicevision(result, tmp_path)
     cameras = parsed(tmp_path / "cameras.sfm")
     for name in ("normalMaps", "albedoMaps", "masks"):
@@ -46,8 +46,8 @@ def test_maps_go_by_the_views_of_the_photographs(result, tmp_path):
         assert all((tmp_path / one["path"]).is_file() for one in other["views"])
 
 
-def test_normals_turn_to_the_world_as_open_rnb_turns_them(result, tmp_path, read_exr):
-    """Its world is AliceVision's with y and z negated, and so are the camera's axes."""
+def test_normals_are_rotated_to_the_world_of_open_rnb(result, tmp_path, read_exr):
+    """Its world and camera axes are those of AliceVision with y and z negated."""
     write_alicevision(result, tmp_path)
     whole = parsed(tmp_path / "normalMaps.sfm")
     flip = torch.tensor([1.0, -1, -1])
@@ -62,7 +62,7 @@ def test_normals_turn_to_the_world_as_open_rnb_turns_them(result, tmp_path, read
         assert (found[maps.seen][:, 2] > 0).all()  # the bump faces up
 
 
-def test_albedo_is_linear_and_one_at_most(result, tmp_path, read_exr):
+def test_albedo_is_linear_and_at_most_one(result, tmp_path, read_exr):
     write_alicevision(result, tmp_path)
     maps = view_maps(result.mesh, result.scene.cameras, 1)
     found = torch.from_numpy(read_exr(tmp_path / "albedos" / "b.exr"))
@@ -71,12 +71,12 @@ def test_albedo_is_linear_and_one_at_most(result, tmp_path, read_exr):
     assert_close(ratio[found[maps.seen] < 1].std(), torch.tensor(0.0), rtol=0, atol=1e-5)
 
 
-def test_an_intrinsic_has_the_fields_of_alicevisions_own(result, tmp_path):
+def test_an_intrinsic_has_the_fields_of_alicevision(result, tmp_path):
     write_alicevision(result, tmp_path)
     whole = parsed(tmp_path / "cameras.sfm")
     assert whole["version"] == ["1", "2", "8"]
     (first, *_) = whole["intrinsics"]
-    # Those of `compatibilityData/scene_v1.2.8.json` in AliceVision's sources.
+    # From `compatibilityData/scene_v1.2.8.json` in AliceVision's sources.
     assert set(first) == {
         *("intrinsicId", "width", "height", "sensorWidth", "sensorHeight", "serialNumber", "type"),
         *("initializationMode", "initialFocalLength", "focalLength", "pixelRatio", "locked"),

@@ -26,28 +26,28 @@ def test_photographs_masks_and_cameras_are_read_back(workspace, result, same_cam
     same_cameras(found.cameras, result.cameras)
     assert found.views.names == FILES
     assert torch.equal(found.views.masks, result.silhouettes.masks)
-    half_a_level = 0.5 / 255 * 2.3  # the steepest of sRGB's curve
+    half_a_level = 0.5 / 255 * 2.3  # the maximum slope of sRGB
     assert_close(found.views.images, result.scene.views.images, rtol=0, atol=half_a_level)
 
 
-def test_tracks_are_where_the_pinholes_see_their_points(workspace, result):
+def test_tracks_are_projections_of_their_points(workspace, result):
     model = read_model(workspace / "sparse")
     seen, _ = project(model.points_world, result.cameras.cam_from_world, result.cameras.intrinsics)
     expected = seen[model.observation_view, model.observation_point]
     assert len(expected) == len(result.scene.observation_view)
-    assert_close(model.observation_pixels, expected, rtol=0, atol=1e-3)  # the scene has float32
+    assert_close(model.observation_pixels, expected, rtol=0, atol=1e-3)  # the scene is float32
 
 
-def test_colmap_reads_depths_and_normals_as_they_were_written(workspace, result):
+def test_colmap_reads_the_written_depths_and_normals(workspace, result):
     for view, file in enumerate(FILES):
         maps = view_maps(result.mesh, result.scene.cameras, view)
         assert maps.seen.any()
-        assert not maps.seen.all()  # or 0 for nothing is not tested
+        assert not maps.seen.all()  # or the value 0 for no data is not tested
         depth, normals = pycolmap.DepthMap(), pycolmap.NormalMap()
         depth.read(workspace / "stereo" / "depth_maps" / f"{file}.geometric.bin")
         normals.read(workspace / "stereo" / "normal_maps" / f"{file}.geometric.bin")
         assert np.array_equal(depth.to_array(), maps.depth.nan_to_num(0).numpy())
-        # pycolmap hands out COLMAP's three planes as if they were pixel after pixel.
+        # pycolmap returns COLMAP's three planes as if they were interleaved.
         planes = normals.to_array().reshape(3, 40, 60)
         assert np.array_equal(planes, maps.normals_cam.movedim(-1, 0).numpy())
 
@@ -57,7 +57,7 @@ def test_colmap_fuses_the_maps_to_points_on_the_surface(workspace, tmp_path):
     model.read(workspace, "COLMAP")
     assert [model.get_image_name(index) for index in range(3)] == list(FILES)
     options = pycolmap.StereoFusionOptions()
-    # Three views, whose pixels are as wide as a tenth of the bump.
+    # Three views with pixels a tenth as wide as the bump.
     options.min_num_pixels, options.num_threads, options.max_normal_error = 2, 1, 30
     options.max_reproj_error = 1.0
     pycolmap.stereo_fusion(tmp_path / "f.ply", workspace, options=options, output_type="PLY")

@@ -11,14 +11,14 @@ def contents(folder):
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.*")}
 
 
-def test_each_format_has_a_folder_of_its_name(folder, tmp_path, capsys):
+def test_each_format_has_a_folder_with_its_name(folder, tmp_path, capsys):
     out = tmp_path / "more"
     assert run("export", folder, "-o", out, "--format", "rti", "maps", "rti") == 0
     assert {path.name for path in out.iterdir()} == {".pimper.json", "rti", "maps"}
     assert f"{out / 'maps'} is the result as maps" in capsys.readouterr().out
 
 
-def test_a_former_export_is_replaced_if_nothing_else_is_there(folder, tmp_path, capsys):
+def test_a_former_export_is_replaced_unless_there_are_other_files(folder, tmp_path, capsys):
     out = tmp_path / "more"
     assert run("export", folder, "-o", out, "--format", "maps") == 0
     before = contents(out)
@@ -33,9 +33,7 @@ def test_a_former_export_is_replaced_if_nothing_else_is_there(folder, tmp_path, 
 
 
 @pytest.mark.parametrize("format", ["colmap", "nerfstudio", "alicevision"])
-def test_where_photographs_moved_a_format_with_them_is_not_written(
-    folder, photographs, tmp_path, capsys, format
-):
+def test_formats_with_photographs_need_them(folder, photographs, tmp_path, capsys, format):
     moved = photographs.rename(tmp_path / "moved")
     out = tmp_path / "more"
     assert run("export", folder, "-o", out, "--format", "maps", format) == 2
@@ -44,9 +42,7 @@ def test_where_photographs_moved_a_format_with_them_is_not_written(
     assert run("export", folder, "-o", out, "--format", format, "--photos", moved) == 0
 
 
-def test_formats_without_photographs_are_the_same_where_these_are_gone(
-    folder, photographs, tmp_path
-):
+def test_formats_without_photographs_do_not_need_them(folder, photographs, tmp_path):
     formats = ("--format", "maps", "rti", "nerfstudio")
     assert run("export", folder, "-o", tmp_path / "with", *formats) == 0
     photographs.rename(tmp_path / "moved")
@@ -65,6 +61,6 @@ def test_an_export_into_the_result_itself_is_refused(folder, tmp_path, capsys, i
 
 
 @pytest.mark.parametrize(("formats", "needed"), [(["gif"], "colmap"), ([], "one format or more")])
-def test_formats_that_there_are_not_are_refused(folder, tmp_path, capsys, formats, needed):
+def test_unknown_formats_are_refused(folder, tmp_path, capsys, formats, needed):
     assert run("export", folder, "-o", tmp_path / "more", "--format", *formats) == 2
     assert needed in capsys.readouterr().err

@@ -13,9 +13,9 @@ from pimper_torch.runtime.numpy_files import read_npz
 
 
 @pytest.mark.parametrize("shape", [(37, 53, 3), (37, 53, 1), (1, 1, 1), (16, 5, 3), (33, 4, 1)])
-def test_maps_of_exr_are_read_back_bit_for_bit(shape, tmp_path, read_exr):
+def test_exr_maps_are_read_back_bit_for_bit(shape, tmp_path, read_exr):
     values = np.random.default_rng(7).normal(size=shape).astype(np.float32)
-    values[: shape[0] // 2] = 0  # which packs, as the noise does not
+    values[: shape[0] // 2] = 0  # compressible, unlike the noise
     write_exr(values, tmp_path / "x.exr", "what it means")
     assert np.array_equal(read_exr(tmp_path / "x.exr").reshape(shape), values)
     assert b"what it means" in (tmp_path / "x.exr").read_bytes()
@@ -29,13 +29,13 @@ def test_maps_of_exr_are_read_back_bit_for_bit(shape, tmp_path, read_exr):
         ("lub", [-1, 0, 0], [0, -1, 0], [0, 0, 1]),
     ],
 )
-def test_axes_are_as_they_are_called(axes, right, down, facing):
+def test_axes_agree_with_their_names(axes, right, down, facing):
     ours = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]])
     assert with_axes(ours, axes).tolist() == [[right, down, facing]]
 
 
 @pytest.mark.parametrize("axes", ["opencv", "opengl", "lub"])
-def test_every_file_has_what_the_view_shows(axes, result, tmp_path, read_exr):
+def test_every_file_has_the_maps_of_its_view(axes, result, tmp_path, read_exr):
     write_maps(result, tmp_path, axes)
     assert json.loads((tmp_path / "README.json").read_text())["axes"] == axes
     for view, stem in enumerate("abc"):
@@ -45,7 +45,7 @@ def test_every_file_has_what_the_view_shows(axes, result, tmp_path, read_exr):
         depth = read_exr(tmp_path / "depth" / f"{stem}.exr")
         assert np.array_equal(depth, maps.depth.nan_to_num(0).numpy())
         assert np.array_equal(read_exr(tmp_path / "albedo" / f"{stem}.exr"), maps.albedo.numpy())
-        arrays = read_npz(tmp_path / "arrays" / f"{stem}.npz")  # opens no pickle
+        arrays = read_npz(tmp_path / "arrays" / f"{stem}.npz")  # does not load pickles
         assert np.array_equal(arrays["normals"], normals)
         assert np.array_equal(arrays["depth"], maps.depth.numpy(), equal_nan=True)
         assert np.array_equal(arrays["mask"], maps.seen.numpy())
@@ -54,13 +54,13 @@ def test_every_file_has_what_the_view_shows(axes, result, tmp_path, read_exr):
         assert (str(arrays["axes"]), str(arrays["name"])) == (axes, f"{stem}.png")
 
 
-def test_sixteen_bits_of_a_normal_tell_it_to_half_a_level(result, tmp_path):
+def test_sixteen_bit_normals_are_exact_to_half_a_level(result, tmp_path):
     write_maps(result, tmp_path, "opengl")
     png = decode(tmp_path / "normals" / "b.png")
     assert png.bits == 16
     maps = view_maps(result.mesh, result.scene.cameras, 1)
     found = (2 * png.samples - 1).movedim(0, -1)[maps.seen]
     expected = torch.from_numpy(with_axes(maps.normals_cam, "opengl"))[maps.seen]
-    # Half a level of 65,535 for two units, and float32's rounding on the way there and back.
+    # Half a level of 65,535 for a range of two, and float32's rounding in both directions.
     assert_close(found, expected, rtol=0, atol=1.02 / 65535)
     assert (png.samples[:, ~maps.seen] == 0).all()

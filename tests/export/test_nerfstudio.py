@@ -15,7 +15,7 @@ from pimper_torch.result.viz.maps import view_maps
 from pimper_torch.runtime.errors import PimperWarning
 
 
-def test_what_is_written_is_read_back(result, tmp_path, same_cameras):
+def test_an_export_survives_a_round_trip(result, tmp_path, same_cameras):
     write_nerfstudio(result, tmp_path)
     found = read_transforms(tmp_path)
     same_cameras(found.cameras, result.cameras)
@@ -23,7 +23,7 @@ def test_what_is_written_is_read_back(result, tmp_path, same_cameras):
     assert torch.equal(found.views.masks, result.silhouettes.masks)
 
 
-def test_splats_start_at_the_surface_in_its_colours(result, tmp_path):
+def test_splats_are_initialized_on_the_surface_with_its_colours(result, tmp_path):
     write_nerfstudio(result, tmp_path)
     name = json.loads((tmp_path / "transforms.json").read_text())["ply_file_path"]
     found = read_mesh(tmp_path / name)
@@ -61,7 +61,7 @@ def test_depths_are_read_back_to_half_a_millimetre_of_the_default_unit(result, t
         assert np.abs(depth - maps.depth.nan_to_num(0).numpy()).max() < 0.00051
 
 
-def test_depths_beyond_sixteen_bits_have_a_unit_of_their_own_and_its_option(result, tmp_path):
+def test_depths_beyond_sixteen_bits_have_a_different_unit_and_its_option(result, tmp_path):
     size = 100.0
     poses = result.cameras.cam_from_world
     cameras = result.cameras.replace(cam_from_world=rigid(poses[:, :3, :3], size * poses[:, :3, 3]))

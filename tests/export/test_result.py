@@ -20,7 +20,7 @@ from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 
-def test_a_folder_of_results_is_read_back_as_the_run_had_it(folder, run):
+def test_a_result_folder_is_read_back_as_in_the_run(folder, run):
     found = read_result(folder)
     scene = run.scene
     assert found.scene.views.names == scene.views.names == ("a.png", "b.png", "c.png")
@@ -50,7 +50,7 @@ def test_a_folder_of_results_is_read_back_as_the_run_had_it(folder, run):
     )
 
 
-def test_photographs_that_moved_are_named(folder, photographs, tmp_path):
+def test_moved_photographs_are_named(folder, photographs, tmp_path):
     there = read_result(folder)
     moved = photographs.rename(tmp_path / "moved")
     with pytest.raises(
@@ -67,16 +67,14 @@ def swap(first, second, aside):
     aside.rename(second)
 
 
-def test_photographs_under_each_others_names_are_refused(folder, photographs):
+def test_photographs_with_exchanged_names_are_refused(folder, photographs):
     swap(photographs / "a.png", photographs / "b.png", photographs.parent / "aside")
     why = r"other names now: a\.png shows b\.png, b\.png shows a\.png; needed"
     with pytest.raises(InputError, match=why):
         read_result(folder)
 
 
-def test_converted_photographs_are_read_with_a_warning_and_under_their_old_names(
-    folder, photographs
-):
+def test_converted_photographs_keep_their_names_and_give_a_warning(folder, photographs):
     there = read_result(folder)
     with Image.open(photographs / "a.png") as picture:
         picture.save(photographs / "a.tif")
@@ -109,7 +107,7 @@ def test_a_photograph_that_looks_different_is_named(folder, photographs):
 
 
 @pytest.mark.parametrize("known", [None, [], {"a.png": "xy", "b.png": 3, "d.png": "00" * 64}])
-def test_results_without_thumbnails_take_any_photographs_of_the_names(folder, photographs, known):
+def test_without_thumbnails_photographs_are_matched_by_name_only(folder, photographs, known):
     swap(photographs / "a.png", photographs / "b.png", photographs.parent / "aside")
     summary = json.loads((folder / "summary.json").read_text())
     (folder / "summary.json").write_text(json.dumps({**summary, "thumbnails": known}))
@@ -118,7 +116,7 @@ def test_results_without_thumbnails_take_any_photographs_of_the_names(folder, ph
         read_result(folder)
 
 
-def test_a_result_is_read_without_photographs_as_with_them(folder, photographs, tmp_path):
+def test_a_result_is_the_same_with_and_without_photographs(folder, photographs, tmp_path):
     there = read_result(folder)
     photographs.rename(tmp_path / "moved")
     found = read_written(folder)
@@ -145,13 +143,13 @@ def grey(path):
         (lambda out, photos: out.rename(out.parent / "away"), "is no folder"),
     ],
 )
-def test_what_is_no_result_of_these_photographs_is_refused(folder, photographs, change, why):
+def test_a_damaged_or_mismatching_result_is_refused(folder, photographs, change, why):
     change(folder, photographs)
     with pytest.raises(InputError, match=why):
         read_result(folder)
 
 
-def test_a_result_without_silhouettes_takes_everything_for_the_object(folder):
+def test_a_result_without_silhouettes_counts_everything_as_object(folder):
     for path in (folder / "masks").iterdir():
         path.unlink()
     (folder / "masks").rmdir()
@@ -160,7 +158,7 @@ def test_a_result_without_silhouettes_takes_everything_for_the_object(folder):
     assert found.masks.all()
 
 
-def test_a_summary_that_names_no_photographs_asks_for_them(folder, photographs):
+def test_a_summary_without_photographs_asks_for_them(folder, photographs):
     summary = json.loads((folder / "summary.json").read_text())
     del summary["photographs"]
     (folder / "summary.json").write_text(json.dumps(summary))
@@ -174,7 +172,7 @@ def test_larger_photographs_are_shrunk_to_those_of_the_run(folder, photographs):
     for path in photographs.iterdir():
         with Image.open(path) as picture:
             picture.resize((120, 80), Image.Resampling.NEAREST).save(path)
-    # They are noise, in which saturation spreads over a third of the pixels when it is shrunk.
+    # They are noise, in which saturation spreads to a third of the pixels when resized.
     with pytest.warns(PimperWarning, match=r"look different now: a\.png, b\.png, c\.png"):
         found = read_result(folder)
     assert torch.equal(found.scene.views.sizes_px, there.scene.views.sizes_px)
@@ -182,7 +180,7 @@ def test_larger_photographs_are_shrunk_to_those_of_the_run(folder, photographs):
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_a_result_far_from_its_origin_is_read_near_it(run, photographs, tmp_path):
+def test_a_result_far_from_the_origin_is_read_near_it(run, photographs, tmp_path):
     far = (500_000.0, -3.0, 0.0)
     scene = run.scene.replace(offset_world=far)
     about = {"photographs": str(photographs)}

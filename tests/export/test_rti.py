@@ -18,7 +18,7 @@ def matte(result):
 
 
 def read_lp(folder):
-    """Read a folder as relight does: a count, lines of four words, JPEG files in their order."""
+    """Read a folder as relight does: a count, lines of four words, JPEG files in that order."""
     first, *lines = (folder / "lights.lp").read_text().splitlines()
     assert int(first) == len(lines)
     words = [line.split() for line in lines]
@@ -29,7 +29,7 @@ def read_lp(folder):
     return lights, linear_from_srgb(torch.from_numpy(stack) / 255)
 
 
-def test_lights_are_unit_and_on_the_viewers_side_all_around(matte, tmp_path):
+def test_lights_are_unit_vectors_all_around_on_the_viewers_side(matte, tmp_path):
     write_rti(matte, tmp_path / "rti")
     lights, stack = read_lp(tmp_path / "rti")
     assert_close(lights.norm(dim=1), torch.ones(60))
@@ -38,8 +38,8 @@ def test_lights_are_unit_and_on_the_viewers_side_all_around(matte, tmp_path):
     assert stack.shape == (60, 40, 60, 3)
 
 
-def test_photometric_stereo_of_the_stack_finds_the_normals_of_its_view(matte, tmp_path):
-    """Least squares of Lambert's law, of each pixel under the lights that reach it."""
+def test_photometric_stereo_on_the_stack_gives_the_normals_of_its_view(matte, tmp_path):
+    """Solve Lambert's law by least squares for each pixel, with the lights that reach it."""
     write_rti(matte, tmp_path / "rti")
     lights, stack = read_lp(tmp_path / "rti")
     maps = view_maps(matte.mesh, matte.mesh_cameras, 1)
@@ -56,7 +56,7 @@ def test_photometric_stereo_of_the_stack_finds_the_normals_of_its_view(matte, tm
     assert bool((stack[:, ~maps.seen] < 0.01).float().mean() > 0.99)
 
 
-def test_an_object_of_one_material_shines_and_one_of_several_does_not(matte, tmp_path):
+def test_only_an_object_of_one_material_has_highlights(matte, tmp_path):
     shiny = {"metallic": 0.0, "roughness": 0.2, "specular": 1.0, "vertices": 1.0}
 
     def brightest(materials):
@@ -70,14 +70,14 @@ def test_an_object_of_one_material_shines_and_one_of_several_does_not(matte, tmp
 
 
 @pytest.mark.parametrize("value", [None, "rough", float("nan")])
-def test_a_material_that_is_none_is_refused(matte, tmp_path, value):
+def test_an_invalid_material_is_refused(matte, tmp_path, value):
     bad = {"metallic": 0.0, "roughness": value, "specular": 1.0}
     summary = {"relighting": {"materials": [bad]}}
     with pytest.raises(InputError, match="3 finite numbers as metallic, roughness and specular"):
         write_rti(matte.replace(summary=summary), tmp_path / "rti")
 
 
-def test_a_grey_surface_gives_grey_pictures(matte, tmp_path):
+def test_a_grey_surface_gives_grey_images(matte, tmp_path):
     mesh = matte.mesh.replace(albedo=matte.mesh.albedo[:, :1])
     write_rti(matte.replace(mesh=mesh), tmp_path / "rti")
     _, stack = read_lp(tmp_path / "rti")

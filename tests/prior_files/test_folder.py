@@ -1,4 +1,4 @@
-"""Which file of a folder is the map of which photograph."""
+"""Matching of map files to photographs."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def views_of(names):
 
 
 def numbers_of(folder, names, kind="depth"):
-    """Return for each photograph that has a map the number that the map holds."""
+    """Return the number in the map of each photograph that has one."""
     maps = read_maps(
         folder, views_of(names), KINDS[kind], lambda _, layer: layer.values, undistorted=False
     )
@@ -31,15 +31,15 @@ def numbers_of(folder, names, kind="depth"):
 
 
 def write(folder, files):
-    """Write maps that hold their numbers in the list."""
+    """Write maps that contain their index in the list."""
     for number, file in enumerate(files):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         np.save(folder / file, np.full((4, 6), number, np.float32), allow_pickle=False)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_of_maps_of_several_kinds_in_one_folder_the_wanted_kind_is_read(kind, tmp_path):
-    """As of MoGe (a folder a photograph), and of estimators that append what it is."""
+def test_the_requested_kind_of_maps_is_read_from_a_mixed_folder(kind, tmp_path):
+    """As written by MoGe (a folder per photograph) and by programs that append the kind."""
     kinds = ("depth", "depth_vis", "mask", "normal")
     layouts = "cup_{}/{}.npy", "cup_{}_{}.npy", "{1}/cup_{0}.npy", "cup_{}-pred_{}.npy"
     for layout in (*layouts, "cup_{}_pred/{}.npy"):
@@ -49,7 +49,7 @@ def test_of_maps_of_several_kinds_in_one_folder_the_wanted_kind_is_read(kind, tm
         assert numbers_of(folder, FLAT, kind) == dict(zip(FLAT, (number, number + 4), strict=True))
 
 
-def test_what_moge_writes_next_to_a_map_is_not_a_map_without_a_photograph(tmp_path):
+def test_other_files_of_moge_are_not_unmatched_maps(tmp_path):
     write(tmp_path, ["cup_2/depth.npy", "cup_2/image.npy", "cup_2/points.npy"])
     assert numbers_of(tmp_path, FLAT) == {"cup_2.jpg": 0}
     write(tmp_path, ["cup_2/depth.npy", "cup_3/depth.npy"])
@@ -58,7 +58,7 @@ def test_what_moge_writes_next_to_a_map_is_not_a_map_without_a_photograph(tmp_pa
 
 
 ONE_A_PHOTOGRAPH = dict(zip(POSES, range(4), strict=True))
-ONE_A_POSE = {"p_1/a.png": 0, "p_2/a.png": 1}  # the first stands for its pose
+ONE_A_POSE = {"p_1/a.png": 0, "p_2/a.png": 1}  # the first represents its pose
 
 
 @pytest.mark.parametrize(
@@ -78,28 +78,28 @@ ONE_A_POSE = {"p_1/a.png": 0, "p_2/a.png": 1}  # the first stands for its pose
         (["p_2/b.npy"], {"p_2/a.png": 0}),
     ],
 )
-def test_maps_of_poses_are_flat_or_nested_one_a_pose_or_one_a_photograph(files, expected, tmp_path):
+def test_flat_or_nested_maps_are_matched_per_pose_or_photograph(files, expected, tmp_path):
     write(tmp_path, files)
     assert numbers_of(tmp_path, POSES) == expected
 
 
-def test_what_was_read_of_a_plain_folder_does_not_depend_on_folders_in_it(tmp_path):
+def test_subfolders_do_not_change_the_maps_of_a_flat_folder(tmp_path):
     write(tmp_path, ["cup_1.npy", "old/cup_1.npy", "cup_1/depth.npy", "old/cup_2.npy"])
     assert numbers_of(tmp_path, FLAT) == {"cup_1.jpg": 0}
 
 
-def test_photographs_that_are_called_like_maps_keep_their_names(tmp_path):
+def test_photographs_named_like_maps_keep_their_names(tmp_path):
     names = ("a_depth.jpg", "a_normal.jpg", "mask.jpg")
     write(tmp_path, ["a_depth.npy", "a_normal.npy", "mask.npy"])
     assert numbers_of(tmp_path, names) == dict(zip(names, range(3), strict=True))
 
 
-def test_a_folder_of_maps_of_another_kind_alone_is_read_and_left_to_its_content(tmp_path):
+def test_a_folder_with_only_one_kind_of_map_is_read_whatever_its_name(tmp_path):
     write(tmp_path, ["cup_1_normal.npy", "cup_2_normal.npy"])
     assert numbers_of(tmp_path, FLAT) == dict(zip(FLAT, range(2), strict=True))
 
 
-def test_a_stack_of_pages_and_a_file_in_the_place_of_a_folder_are_refused(tmp_path):
+def test_a_multipage_file_and_a_file_instead_of_a_folder_are_refused(tmp_path):
     (tmp_path / "stack.tif").write_bytes(b"pages")
     with pytest.raises(InputError, match=r"one a photograph. It holds stack\.tif. Write pages of"):
         numbers_of(tmp_path, FLAT)

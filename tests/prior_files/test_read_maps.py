@@ -29,7 +29,7 @@ def views():
 
 @pytest.fixture
 def normals():
-    """Normals of a photograph of 32 x 24, the last row of them missing."""
+    """Normals of a photograph of 32 x 24 without its last row."""
     drawn = np.random.default_rng(4).normal(size=(24, 32, 3)).astype(np.float32)
     drawn /= np.linalg.norm(drawn, axis=-1, keepdims=True)
     drawn[-1] = 0
@@ -59,7 +59,7 @@ def save(path, values):
         ("a b.jpg.npy", 1e-6),
     ],
 )
-def test_normals_of_every_format_are_what_was_written(file, tolerance, views, normals, tmp_path):
+def test_normals_of_every_format_are_read(file, tolerance, views, normals, tmp_path):
     save(tmp_path / file, normals)
     found = read_normals(tmp_path, views, "opencv")
     assert found.names == ("a b.jpg",)
@@ -97,13 +97,13 @@ def test_eight_bits_and_arrays_in_unit_range_are_decoded(views, normals, tmp_pat
         ("world", ("opencv", "world")),
     ],
 )
-def test_axes_are_kept_as_they_are_stated(axes, stored, views, normals, tmp_path):
+def test_stated_axes_are_kept(axes, stored, views, normals, tmp_path):
     save(tmp_path / "a b.npy", normals)
     found = read_normals(tmp_path, views, axes)
     assert (found.axes, found.frame) == stored
 
 
-def test_a_variance_beside_a_map_or_in_its_file_counts(views, normals, tmp_path):
+def test_a_variance_file_or_layer_is_read(views, normals, tmp_path):
     variance = np.full((24, 32), 0.5, np.float32)
     variance[0, 0], variance[1, 0], variance[2, 0] = 0, np.inf, np.nan
     np.savez(tmp_path / "a b.npz", normals=normals, variance=variance, allow_pickle=False)
@@ -112,7 +112,7 @@ def test_a_variance_beside_a_map_or_in_its_file_counts(views, normals, tmp_path)
     found = read_normals(tmp_path, views)
     for index, width in ((0, 32), (1, 24)):
         got = found.variance[index, :, :width]
-        assert got[0, 0] == torch.inf  # no error is no variance
+        assert got[0, 0] == torch.inf  # a standard error of 0 is invalid
         assert got[1, 0] == math.radians(NORMALS_ERROR_DEG) ** 2 or got[1, 0].isinf()
         assert (got[3:23] == 0.5).all()
         assert got[23].isinf().all()
@@ -121,7 +121,7 @@ def test_a_variance_beside_a_map_or_in_its_file_counts(views, normals, tmp_path)
         read_normals(tmp_path, views)
 
 
-def test_depth_of_every_format_is_what_was_written(views, tmp_path):
+def test_depth_of_every_format_is_read(views, tmp_path):
     drawn = np.random.default_rng(4).uniform(2, 5, size=(24, 32)).astype(np.float32)
     drawn[0, :3] = 0, np.nan, np.inf
     write_exr(drawn[..., None], tmp_path / "a b_depth.exr")
@@ -138,7 +138,7 @@ def test_depth_of_every_format_is_what_was_written(views, tmp_path):
     with pytest.warns(PimperWarning, match="hold inf"):
         left_open = read_depth(tmp_path, views, error=0.1)
     assert left_open.inverse is None
-    # Where maps have an offset of their own, relative to their range without its ends: 0.96 x 3.
+    # For maps with an offset, relative to their range without its ends: 0.96 x 3.
     span = math.sqrt(float(left_open.variance[0, 5, 5])) / 0.1
     assert span == pytest.approx(0.96 * 3, rel=0.05)
 
@@ -151,7 +151,7 @@ def depth_with(none, *, dtype=np.float32, near=1000, far=9000):
 
 
 @pytest.mark.parametrize(
-    ("none", "dtype", "told"),
+    ("none", "dtype", "message"),
     [
         (65504, np.float32, "65504"),
         (65504, np.float16, "65504"),
@@ -163,9 +163,7 @@ def depth_with(none, *, dtype=np.float32, near=1000, far=9000):
         (np.array([65504, np.inf] * 16), np.float32, "65504, inf"),
     ],
 )
-def test_what_programs_write_where_there_is_no_depth_says_nothing_and_is_counted(
-    none, dtype, told, views, tmp_path
-):
+def test_values_for_missing_depth_are_ignored_and_counted(none, dtype, message, views, tmp_path):
     np.save(tmp_path / "a b.npy", depth_with(none, dtype=dtype), allow_pickle=False)
     with pytest.warns(PimperWarning, match=f": 32 pixels hold {told}, which is taken for no"):
         found = read_depth(tmp_path, views)
@@ -175,10 +173,10 @@ def test_what_programs_write_where_there_is_no_depth_says_nothing_and_is_counted
     plain = read_depth(tmp_path, views)
     span = found.variance[0, 5, 5] / plain.variance[0, 5, 5]
     scale = float(found.depth[0, 5, 5] / plain.depth[0, 5, 5])
-    assert float(span) == pytest.approx(scale**2, rel=2e-3)  # of the other values alone
+    assert float(span) == pytest.approx(scale**2, rel=2e-3)  # only of the other values
 
 
-def test_the_largest_values_of_a_map_that_fills_its_scale_are_depth(views, tmp_path):
+def test_full_scale_values_of_a_gradual_map_are_depth(views, tmp_path):
     levels = depth_with(65535, dtype=np.uint16, near=20_000, far=65_535)
     Image.fromarray(levels).save(tmp_path / "a b.png")
     found = read_depth(tmp_path, views)
@@ -196,7 +194,7 @@ def test_depth_in_levels_of_sixteen_bits_is_up_to_its_scale(views, tmp_path):
 
 
 def test_logarithmic_depth_of_moge_is_metres(views, tmp_path):
-    """As its authors write it: 1 to 65534 are logarithms from near to far, 0 is nothing."""
+    """Its format: 1 to 65534 are logarithms from near to far, 0 is missing."""
     near, far = 0.7, 12.5
     depth = np.random.default_rng(4).uniform(near, far, size=(24, 32))
     levels = (1 + np.round(np.log(depth / near) / np.log(far / near) * 65533)).astype(np.uint16)
@@ -212,8 +210,8 @@ def test_logarithmic_depth_of_moge_is_metres(views, tmp_path):
 
 
 @pytest.mark.parametrize("packing", [0, 2, 3])
-def test_open_exr_of_others_is_read(packing, tmp_path):
-    """Half floats and a window that does not begin at 0, in the order of channels' names."""
+def test_openexr_files_of_other_programs_are_read(packing, tmp_path):
+    """Half floats, a window that does not start at 0, and channels sorted by name."""
     values = np.random.default_rng(4).normal(size=(19, 13, 2))
     half, whole = values[..., 0].astype("<f2"), values[..., 1].astype("<u4")
     listed = b"".join(
@@ -256,7 +254,7 @@ def test_open_exr_of_others_is_read(packing, tmp_path):
             read_exr(path, 1000)
 
 
-def test_open_exr_that_is_not_read_says_what_it_is(tmp_path):
+def test_unsupported_openexr_is_refused_with_its_kind(tmp_path):
     path = tmp_path / "x.exr"
     write_exr(np.ones((4, 4, 1), np.float32), path)
     data = bytearray(path.read_bytes())
@@ -272,20 +270,20 @@ def test_open_exr_that_is_not_read_says_what_it_is(tmp_path):
         read_exr(path, 1000)
 
 
-def test_names_that_match_nothing_are_refused_with_the_nearest(views, normals, tmp_path):
+def test_unmatched_names_are_refused_with_a_suggestion(views, normals, tmp_path):
     save(tmp_path / "a b.npy", normals)
     save(tmp_path / "cupp_1.npy", normals)
     with pytest.raises(InputError, match=r"no map for cup_1.png, .* nearest .* is cupp_1.npy"):
         read_normals(tmp_path, views)
     (tmp_path / "cupp_1.npy").unlink()
     assert read_normals(tmp_path, views).names == ("a b.jpg",)
-    # Maps of photographs that were left out since are no mistake.
+    # Maps of removed photographs are not an error.
     alone = views.take([1])
     save(tmp_path / "cup_1.npy", normals[:, :24])
     assert read_normals(tmp_path, alone).names == ("cup_1.png",)
 
 
-def test_whole_numbers_and_named_layers_are_read(views, normals, tmp_path):
+def test_integers_and_named_layers_are_read(views, normals, tmp_path):
     coded = np.rint(65535 * (normals + 1) / 2).astype(np.uint16)
     np.savez(tmp_path / "a b.npz", **{"View.Normals": coded, "x": coded}, allow_pickle=False)
     found = read_normals(tmp_path, views, "opencv")
@@ -298,7 +296,7 @@ COLOURED = np.where(LABELS[..., None] > 2, [1.0, -1, -1], [-1, 1, 1])
 
 
 @pytest.mark.parametrize(
-    ("read", "name", "values", "told"),
+    ("read", "name", "values", "message"),
     [
         (read_normals, "a b.npy", ONES[..., 0], "has one value a pixel; .* Is it depth"),
         (read_normals, "a b.npy", ONES.swapaxes(0, 1), "is 24 x 32, .* file stores; turn them"),
@@ -321,17 +319,17 @@ COLOURED = np.where(LABELS[..., None] > 2, [1.0, -1, -1], [-1, 1, 1])
         (read_depth, "a b.npz", ONES[0, 0], "holds normals, albedo; .* one array .* called depth"),
     ],
 )
-def test_what_is_no_map_of_these_photographs_is_refused(read, name, values, told, views, tmp_path):
+def test_invalid_or_mismatching_maps_are_refused(read, name, values, message, views, tmp_path):
     if values.dtype.kind in "UO" or name.endswith(".txt"):
         with (tmp_path / name).open("wb") as file:
             np.save(file, values)
     else:
         save(tmp_path / name, values)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         read(tmp_path, views)
 
 
-def test_no_folder_no_archive_and_no_standard_error_are_refused(views, normals, tmp_path):
+def test_missing_folders_archives_and_standard_errors_are_refused(views, normals, tmp_path):
     with pytest.raises(InputError, match="found nothing; needed: a folder of maps"):
         read_normals(tmp_path / "none", views)
     (tmp_path / "a b.npz").write_bytes(b"no archive")

@@ -50,7 +50,7 @@ def write_cut_out(path, values):
         ("b.npy", lambda path, one: np.save(path, (255 * one).round().astype(np.uint8)), 0.5 / 255),
     ],
 )  # fmt: skip
-def test_every_kind_of_file_holds_the_same_mask(views, tmp_path, name, write, error):
+def test_every_file_format_gives_the_same_mask(views, tmp_path, name, write, error):
     write(tmp_path / name, SOFT)
     prior = read_silhouettes(tmp_path, views)
     assert prior.names == ("b.jpg",)
@@ -60,7 +60,7 @@ def test_every_kind_of_file_holds_the_same_mask(views, tmp_path, name, write, er
     assert off <= error + 1e-6  # float32
 
 
-def test_labels_and_what_is_not_known(views, tmp_path):
+def test_labels_and_unknown_pixels_are_read(views, tmp_path):
     Image.fromarray(np.eye(16, 24, dtype=np.uint8)).save(tmp_path / "a.png")
     labels = np.arange(16 * 24).reshape(16, 24) % 4
     Image.fromarray(labels.astype(np.uint16)).save(tmp_path / "b.png")
@@ -87,13 +87,13 @@ def test_labels_and_what_is_not_known(views, tmp_path):
         ("b.npy", np.array(["object"]), "needed: real numbers"),
     ],
 )
-def test_what_is_no_mask_of_these_photographs_is_refused(views, tmp_path, name, values, message):
+def test_masks_of_other_photographs_are_refused(views, tmp_path, name, values, message):
     np.save(tmp_path / name, values)
     with pytest.raises(InputError, match=message):
         read_silhouettes(tmp_path, views)
 
 
-def test_clicks_say_where_the_object_is_and_nothing_else(views):
+def test_clicks_are_read_as_foreground_seeds(views):
     in_files = Mark(pointers=(Pointer(name="c", x=475.0, y=3.0, size_px=(480, 320)),))
     prior = object_at([Mark.read("a.jpg,10.5,20.5"), in_files, in_files], views)
     assert prior.names == ("a.jpg", "c.jpg")
@@ -108,6 +108,6 @@ def test_clicks_say_where_the_object_is_and_nothing_else(views):
 
 
 @pytest.mark.parametrize("given", [["--silhouettes", "soft"], ["--object-at", "a.jpg,3,4"]])
-def test_masks_of_a_person_leave_no_room_for_guesses(given):
+def test_given_masks_exclude_silhouette_priors(given):
     with pytest.raises(ConfigError, match=r"is '(soft|a\.jpg,3,4)'; needed: none beside --masks"):
         parse("reconstruct", ["photos", "-o", "out", "--masks", "drawn", *given])

@@ -1,10 +1,10 @@
-"""ONNX files by hand: a few nodes on one picture of 3 channels."""
+"""Writer of ONNX files: a few nodes on one image of 3 channels."""
 
 import struct
 
 
 def field(number: int, value: int | bytes | str) -> bytes:
-    """Write a field of protocol buffers: a number, or bytes."""
+    """Encode a field of protocol buffers: a number, or bytes."""
     if isinstance(value, int):
         return varint(number << 3) + varint(value)
     data = value.encode() if isinstance(value, str) else value
@@ -12,7 +12,7 @@ def field(number: int, value: int | bytes | str) -> bytes:
 
 
 def varint(value: int) -> bytes:
-    """Write seven bits a byte, lowest first."""
+    """Encode seven bits per byte, lowest first."""
     out = b""
     while value > 127:
         out += bytes([value & 127 | 128])
@@ -21,12 +21,12 @@ def varint(value: int) -> bytes:
 
 
 def model(nodes, constants, outputs) -> bytes:
-    """Write a model.
+    """Encode a model.
 
     Args:
         nodes: Kind, inputs and output of each.
         constants: Shape and numbers by name.
-        outputs: Names; the input is called ``picture``.
+        outputs: Names; the input is named ``picture``.
     """
 
     def port(name: str) -> bytes:

@@ -7,8 +7,8 @@ import pimper_torch as pt
 from pimper_torch.runtime.errors import PimperWarning
 
 
-class Caught(Exception):  # noqa: N818 - no error: it ends the chain where it has been seen enough
-    """What a stage was called with."""
+class Caught(Exception):  # noqa: N818 - not an error: it ends the chain early
+    """Carries the arguments of a stage."""
 
 
 class Catching(nn.Module):
@@ -19,7 +19,7 @@ class Catching(nn.Module):
 
 
 @pytest.mark.parametrize("chain", ["default", "paper"])
-def test_chains_hand_on_normals_in_our_axes_and_undistorted(chain, rendered):
+def test_chains_pass_on_undistorted_normals_in_opencv_axes(chain, rendered):
     """DSINE's normals of distorted photographs; later stages get resolved conventions."""
     scene = rendered.scene
     fx, fy, cx, cy = scene.lenses[0].params
@@ -42,7 +42,7 @@ def test_chains_hand_on_normals_in_our_axes_and_undistorted(chain, rendered):
         made(given)
     (found,) = caught.value.args[0].views.priors
     assert (found.axes, found.frame, found.undistorted) == ("opencv", "camera", True)
-    # The middle of a photograph stays where it is; at its rim the lens moves what it shows.
+    # Undistortion keeps the centre of a photograph and moves its border.
     assert_close(found.normals[:, 60, 80], rendered.camera[:, 60, 80], rtol=0, atol=0.02)
     known = found.variance[:, 10].isfinite()
     assert (found.normals - rendered.camera)[:, 10][known].norm(dim=-1).mean() > 0.005

@@ -1,22 +1,22 @@
-"""When one reading of data is believed: laws of the margins."""
+"""When one hypothesis about data is accepted: properties of the margins."""
 
 import torch
 
 from pimper_torch.priors.choice import surely_better
 
 
-def test_four_standard_errors_are_believed_and_places_that_are_too_few_tell_nothing(generator):
+def test_four_standard_errors_are_significant_and_too_few_samples_are_not(generator):
     differences = torch.randn(400, generator=generator, dtype=torch.float64)
     error = (differences.var() / 400).sqrt()
     for wanted, believed in ((3.99, False), (4.01, True)):
         moved = differences - differences.mean() + wanted * error
-        # Neither the unit of a score counts, nor the order of the places.
+        # The result is independent of the unit of a score and of the order of samples.
         assert surely_better(7 * moved.flip(0), torch.zeros(400)) == believed
     assert surely_better(torch.ones(8), torch.zeros(8))
     assert not surely_better(torch.ones(7), torch.zeros(7))
 
 
-def test_noise_alone_is_not_believed(generator):
+def test_noise_is_not_significant(generator):
     one, other = torch.randn(2, 5000, generator=generator)
     assert not surely_better(one, other)
     assert not surely_better(other, one)

@@ -15,7 +15,7 @@ from pimper_torch.runtime.errors import InputError, PimperWarning
 
 
 def noisy(normals, degrees, seed=1):
-    """Turn unit normals by so much, root mean square; where there are none, leave none."""
+    """Rotate unit normals by ``degrees``, root mean square; missing ones stay missing."""
     generator = torch.Generator().manual_seed(seed)
     off = torch.randn(normals.shape, generator=generator) * torch.deg2rad(torch.tensor(degrees))
     there = normals.norm(dim=-1, keepdim=True) > 0.5
@@ -53,7 +53,7 @@ def settle(scene, prior, silhouettes=None):
 
 @pytest.mark.parametrize(("degrees", "outlines"), [(0.0, False), (20.0, True)])
 @pytest.mark.parametrize("axes", [*AXES, "world"])
-def test_axes_that_are_left_open_are_found_and_told(rendered, axes, degrees, outlines):
+def test_unstated_axes_are_found_and_reported(rendered, axes, degrees, outlines):
     scene, silhouettes = rendered.scene, rendered.silhouettes if outlines else None
     camera = noisy(rendered.camera, degrees)
     given = noisy(rendered.world, degrees)
@@ -81,7 +81,7 @@ def test_axes_that_are_left_open_are_found_and_told(rendered, axes, degrees, out
     ],
 )
 @pytest.mark.parametrize("outlines", [False, True])
-def test_normals_that_mean_something_else_are_refused_by_name(
+def test_normals_of_a_different_convention_are_refused_by_name(
     rendered, stated, given, what, outlines
 ):
     scene, silhouettes = rendered.scene, rendered.silhouettes if outlines else None
@@ -99,10 +99,10 @@ def test_normals_that_mean_something_else_are_refused_by_name(
 @pytest.mark.parametrize("outlines", [False, True])
 @pytest.mark.parametrize("stated", [None, "opengl"])
 @pytest.mark.parametrize("axes", AXES)
-def test_exchanged_channels_are_exchanged_back_and_told(rendered, axes, stated, outlines):
+def test_exchanged_channels_are_corrected_and_reported(rendered, axes, stated, outlines):
     scene, silhouettes = rendered.scene, rendered.silhouettes if outlines else None
     camera = noisy(rendered.camera, 20.0)
-    written = (camera * torch.tensor(AXES[axes][0])).flip(-1)  # as OpenCV writes RGB
+    written = (camera * torch.tensor(AXES[axes][0])).flip(-1)  # BGR, as OpenCV writes RGB
     if stated not in (None, axes):
         with (
             pytest.warns(PimperWarning, match="exchanged"),
@@ -110,16 +110,16 @@ def test_exchanged_channels_are_exchanged_back_and_told(rendered, axes, stated, 
         ):
             settle(scene, of_normals(scene, written, axes=stated), silhouettes)
         return
-    with pytest.warns(PimperWarning) as told:
+    with pytest.warns(PimperWarning) as caught:
         found = settle(scene, of_normals(scene, written, axes=stated), silhouettes)
-    assert "have red and blue exchanged, as OpenCV writes" in str(told[0].message)
-    assert len(told) == 1 + (stated is None)
+    assert "have red and blue exchanged, as OpenCV writes" in str(caught[0].message)
+    assert len(caught) == 1 + (stated is None)
     known = found.variance.isfinite()
     assert_close(found.normals[known], camera[known])
 
 
 def stored(maps, tags):
-    """Return maps as they are before EXIF turns them by half a turn, or mirrors them."""
+    """Return maps as stored, before EXIF rotates them by 180 degrees or mirrors them."""
     flips = {1: (), 2: (1,), 3: (0, 1), 4: (0,)}
     return torch.stack([one.flip(flips[tag]) for one, tag in zip(maps, tags, strict=True)])
 
@@ -132,16 +132,16 @@ TURNED = {
 
 
 @pytest.mark.parametrize("outlines", [False, True])
-@pytest.mark.parametrize("alone", [False, True])  # of the object, without its table
+@pytest.mark.parametrize("alone", [False, True])  # the object without its table
 @pytest.mark.parametrize("what", TURNED)
-def test_normals_that_are_turned_are_refused_with_the_reason(rendered, what, alone, outlines):
+def test_rotated_normal_maps_are_refused_with_the_reason(rendered, what, alone, outlines):
     tags, in_files = TURNED[what]
     scene, silhouettes = rendered.scene, rendered.silhouettes if outlines else None
     camera = noisy(rendered.camera, 20.0)
     if alone:
         camera = camera * (rendered.silhouettes.inside > 0.5)[..., None]
     signs = torch.tensor([[1 - 2 * (tag in (2, 3)), 1 - 2 * (tag in (3, 4)), 1] for tag in tags])
-    found_by_network = stored(camera, tags) * signs[:, None, None]  # of the picture as it lay
+    found_by_network = stored(camera, tags) * signs[:, None, None]  # of the image as stored
     if in_files:
         scene = scene.replace(views=scene.views.replace(orientations=torch.tensor(tags)))
     for given, axes in ((stored(camera, tags), None), (found_by_network, "opencv")):
@@ -149,7 +149,7 @@ def test_normals_that_are_turned_are_refused_with_the_reason(rendered, what, alo
             settle(scene, of_normals(scene, given, axes=axes), silhouettes)
 
 
-def test_stated_axes_that_fit_are_believed_without_a_word(rendered):
+def test_consistent_stated_axes_give_no_warning(rendered):
     scene = rendered.scene
     camera = noisy(rendered.camera, 20.0)
     found = settle(scene, of_normals(scene, -camera, axes="lub"))
@@ -159,7 +159,7 @@ def test_stated_axes_that_fit_are_believed_without_a_word(rendered):
     assert found.frame == "world"
 
 
-def test_where_nothing_tells_axes_are_to_be_stated(rendered):
+def test_undetermined_axes_must_be_stated(rendered):
     scene = rendered.scene
     bare = without_points(scene)
     upside_down = of_normals(bare, -rendered.camera)
@@ -172,13 +172,13 @@ def test_where_nothing_tells_axes_are_to_be_stated(rendered):
     assert torch.equal(settle(bare, depth).depth, depth.depth)
     with pytest.raises(InputError, match=r"too few points of the cloud show .*`inverse`"):
         settle(bare, depth.replace(inverse=None))
-    # Outlines alone tell the axes, too.
+    # Contours alone also determine the axes.
     with pytest.warns(PimperWarning, match="in axes of DSINE"):
         found = settle(bare, upside_down.replace(axes=None), rendered.silhouettes)
     assert_close(found.normals, rendered.camera)
 
 
-def test_maps_of_some_photographs_and_of_another_size_tell_as_well(rendered):
+def test_axes_are_found_from_maps_of_some_photographs_and_of_a_different_size(rendered):
     scene = rendered.scene
     small = interpolate(rendered.camera.movedim(-1, 1), (60, 80), mode="area").movedim(1, -1)
     there = small.norm(dim=-1, keepdim=True) > 0.9
@@ -215,11 +215,11 @@ DEPTHS = {
 
 
 @pytest.mark.parametrize("kind", DEPTHS)
-def test_depth_that_is_left_open_is_found_told_and_turned_to_scene_units(rendered, kind):
+def test_unstated_depth_conventions_are_found_reported_and_converted(rendered, kind):
     values, what = DEPTHS[kind]
     given = values(rendered.depth, lengths_of_rays(rendered.scene))
     given = torch.where(rendered.depth.isfinite(), given, torch.inf)
-    # 1 % of depth: of values that are proportional to depth, or to one over it, 1 % as well.
+    # 1 % of depth is also 1 % of values proportional to depth or to its inverse.
     spread = {"affine": 0.3 * rendered.depth, "disparity": 4 / rendered.depth}.get(kind, given)
     prior = of_depth(rendered.scene, given, inverse=None)
     known = prior.variance.isfinite()
@@ -238,7 +238,7 @@ def test_depth_that_is_left_open_is_found_told_and_turned_to_scene_units(rendere
     assert again.variance is found.variance
 
 
-def test_a_standard_error_is_at_least_what_a_map_is_off_at_the_cloud(rendered):
+def test_a_standard_error_is_at_least_the_error_at_the_cloud(rendered):
     generator = torch.Generator().manual_seed(6)
     noise = 1 + 0.04 * torch.randn(rendered.depth.shape, generator=generator)
     prior = of_depth(rendered.scene, rendered.depth * noise, gauge="scale")
@@ -249,7 +249,7 @@ def test_a_standard_error_is_at_least_what_a_map_is_off_at_the_cloud(rendered):
     assert errors.max() < 0.055
 
 
-def test_maps_of_photographs_that_were_left_out_since_are_not_looked_at(rendered):
+def test_maps_of_removed_photographs_are_ignored(rendered):
     scene = rendered.scene
     ray = 2 * rendered.depth * lengths_of_rays(scene)
     depth = of_depth(scene, ray, along="ray", gauge="scale").replace(undistorted=True)
@@ -266,7 +266,7 @@ def test_maps_of_photographs_that_were_left_out_since_are_not_looked_at(rendered
     assert resolve_prior_conventions(rendered.scene) is rendered.scene
 
 
-def test_a_map_before_which_no_points_are_seen_is_left_out(rendered):
+def test_a_depth_map_without_observed_points_is_ignored(rendered):
     scene = rendered.scene
     there = scene.observation_view != 4
     scene = observing(scene, there)
@@ -290,7 +290,7 @@ def test_a_map_before_which_no_points_are_seen_is_left_out(rendered):
         ("metres", {"gauge": "scene"}, "is not depth in the scene's unit"),
     ],
 )
-def test_depth_that_means_something_else_is_refused_by_name(rendered, kind, stated, what):
+def test_depth_of_a_different_convention_is_refused_by_name(rendered, kind, stated, what):
     given = DEPTHS[kind][0](rendered.depth, lengths_of_rays(rendered.scene))
     with pytest.raises(InputError, match=what):
         settle(rendered.scene, of_depth(rendered.scene, given, **stated))
@@ -299,7 +299,7 @@ def test_depth_that_means_something_else_is_refused_by_name(rendered, kind, stat
 @pytest.mark.parametrize("kind", ["metres", "disparity"])
 @pytest.mark.parametrize("alone", [False, True])
 @pytest.mark.parametrize("what", TURNED)
-def test_depth_that_is_turned_is_refused_with_the_reason(rendered, what, alone, kind):
+def test_rotated_depth_maps_are_refused_with_the_reason(rendered, what, alone, kind):
     tags, in_files = TURNED[what]
     scene = rendered.scene
     given = DEPTHS[kind][0](rendered.depth, lengths_of_rays(scene))
@@ -313,9 +313,7 @@ def test_depth_that_is_turned_is_refused_with_the_reason(rendered, what, alone, 
 
 
 @pytest.mark.parametrize("tag", range(1, 9))
-def test_places_in_maps_that_are_to_be_turned_are_those_that_turning_them_moves_there(
-    rendered, tag
-):
+def test_pixels_and_vectors_are_transformed_like_rotated_maps(rendered, tag):
     width = 5 if tag < 5 else 4
     maps = torch.arange(2 * 4 * width).reshape(2, 4, width)
     upright = torch.stack([torch.from_numpy(rotated(one.numpy(), tag)) for one in maps])
@@ -324,7 +322,7 @@ def test_places_in_maps_that_are_to_be_turned_are_those_that_turning_them_moves_
     place = torch.cartesian_prod(torch.arange(2), torch.arange(4), torch.arange(width))
     found = turned(place, prior, torch.tensor([tag, tag]))
     assert torch.equal(maps[found.unbind(dim=1)], upright[place.unbind(dim=1)])
-    # Vectors are those of the pixels: what a step to the right, or down, becomes.
+    # Vectors in pixels: the transformed steps to the right and down.
     corners = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 1, 0]])
     row, column = (
         torch.stack([(upright[0] == maps[tuple(one)]).nonzero()[0] for one in corners])
@@ -335,8 +333,8 @@ def test_places_in_maps_that_are_to_be_turned_are_those_that_turning_them_moves_
 
 
 @pytest.mark.parametrize("inverse", [None, False, True])
-def test_depth_that_knows_nothing_of_the_scene_is_refused(rendered, inverse):
-    """Such as maps of half the photograph that were stretched over all of it, upside down."""
+def test_depth_unrelated_to_the_scene_is_refused(rendered, inverse):
+    """For example maps of half the photograph, stretched over all of it and upside down."""
     generator = torch.Generator().manual_seed(8)
     noise = torch.rand(12, 1, 6, 8, generator=generator)
     given = 1 + interpolate(noise, (120, 160), mode="bilinear", align_corners=False)[:, 0]
@@ -344,8 +342,8 @@ def test_depth_that_knows_nothing_of_the_scene_is_refused(rendered, inverse):
         settle(rendered.scene, of_depth(rendered.scene, given, inverse=inverse))
 
 
-def test_a_relief_too_flat_to_tell_depth_is_believed_as_stated(rendered):
-    """Such as a wall from the front, of which the cloud has one depth."""
+def test_on_a_flat_relief_stated_depth_conventions_are_used(rendered):
+    """For example a frontal wall: all points have the same depth."""
     scene = rendered.scene
     points = scene.points_world
     pose = scene.cameras.cam_from_world[5]
@@ -367,8 +365,8 @@ def test_a_relief_too_flat_to_tell_depth_is_believed_as_stated(rendered):
         settle(wall, prior.replace(inverse=None))
 
 
-def test_normals_that_know_nothing_of_the_scene_are_doubted(rendered):
-    """Stated axes are believed with a warning; to find them is refused."""
+def test_normals_unrelated_to_the_scene_give_a_warning_or_error(rendered):
+    """Stated axes give a warning; unstated ones an error."""
     generator = torch.Generator().manual_seed(8)
     coarse = torch.randn(12, 3, 6, 8, generator=generator)
     random = interpolate(coarse, (120, 160), mode="bilinear", align_corners=False)
@@ -380,7 +378,7 @@ def test_normals_that_know_nothing_of_the_scene_are_doubted(rendered):
         settle(rendered.scene, of_normals(rendered.scene, normals, axes=None))
 
 
-def test_gradients_reach_what_was_given(rendered):
+def test_gradients_reach_the_given_maps(rendered):
     normals = (-rendered.camera).requires_grad_()
     found = settle(rendered.scene, of_normals(rendered.scene, normals, axes="lub"))
     found.normals.sum().backward()

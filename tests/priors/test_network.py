@@ -13,7 +13,7 @@ from tests.priors.onnx_files import model
 
 @pytest.fixture
 def views():
-    """Two photographs of unlike sizes."""
+    """Two photographs of different sizes."""
     generator = torch.Generator().manual_seed(2)
     images = torch.rand(2, 3, 20, 30, generator=generator)
     sizes = torch.tensor([[30, 20], [16, 12]])
@@ -27,7 +27,7 @@ def views():
 
 
 class Coarse(nn.Module):
-    """Normals and their variance at half the size, by one convolution."""
+    """Predicts normals and their variance at half the size, by one convolution."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ class Coarse(nn.Module):
         return normalize(found[:, :3], dim=1), 0.01 + found[:, 3:].square()
 
 
-def test_a_module_sees_each_photograph_and_its_guess_becomes_a_prior(views):
+def test_a_network_predicts_a_prior_from_each_photograph(views):
     seen = []
 
     def network(picture):
@@ -62,7 +62,7 @@ def test_a_module_sees_each_photograph_and_its_guess_becomes_a_prior(views):
     found.check("test")
 
 
-def test_pictures_are_as_the_network_wants_them(views):
+def test_images_are_normalized_as_requested_by_the_network(views):
     seen = []
 
     def network(picture):
@@ -78,14 +78,14 @@ def test_pictures_are_as_the_network_wants_them(views):
     expected = (whole[0] - torch.tensor(mean)[:, None, None]) / torch.tensor(std)[:, None, None]
     assert_close(seen[1][0], expected)
     assert found.inverse
-    # One standard error for all: relative to the range of values, without its ends.
+    # One standard error for all, relative to the range of values without its ends.
     known = found.variance[0].isfinite()
     ends = found.depth[0][known].quantile(torch.tensor([0.02, 0.98]))
     error = (DEPTH_ERROR * ends.diff()) ** 2
     assert_close(found.variance[0][known], error.expand(int(known.sum())))
 
 
-def test_grey_photographs_are_shown_in_three_channels(views):
+def test_grey_photographs_are_passed_with_three_channels(views):
     grey = views.replace(images=views.images[:, :1])
     found = pt.priors_of(lambda picture: picture, grey, "albedo", linear=True, error=0.1)
     assert_close(found.albedo[0], views.images[0, :1].expand(3, -1, -1))
@@ -95,13 +95,13 @@ def test_grey_photographs_are_shown_in_three_channels(views):
 
 
 @pytest.mark.parametrize(("kind", "field"), [("inliers", "probability"), ("silhouettes", "inside")])
-def test_probabilities_become_what_they_are_of(kind, field, views):
+def test_probabilities_become_inlier_and_silhouette_priors(kind, field, views):
     found = pt.priors_of(lambda picture: picture[:, :1], views, kind, linear=True)
     assert_close(getattr(found, field)[0], views.images[0, 0])
     found.check("test")
 
 
-def test_guesses_about_a_scene_are_of_its_undistorted_photographs(reconstruction):
+def test_predictions_for_a_scene_use_its_undistorted_photographs(reconstruction):
     scene = reconstruction.scene
     found = pt.priors_of(lambda picture: picture[:, :1], scene, "silhouettes")
     assert found.undistorted
@@ -109,7 +109,7 @@ def test_guesses_about_a_scene_are_of_its_undistorted_photographs(reconstruction
     assert pt.resolve_prior_conventions(given) == given
 
 
-def test_gradients_of_the_parameters_are_those_of_finite_differences(views):
+def test_gradients_of_the_parameters_agree_with_finite_differences(views):
     network = Coarse().double()
     exact = views.to(torch.float64)
     parameters = dict(network.named_parameters())
@@ -130,8 +130,8 @@ ONE, TWO = {"one": ((), (1.0,))}, {"two": ((), (2.0,))}
 GREY = {"grey": ((1, 3, 1, 1), (0.25, 0.5, 0.25))}
 
 
-def test_an_onnx_file_gives_what_its_nodes_compute(views, tmp_path):
-    """The map is 2 x - 1; there is another output, which is not looked at."""
+def test_an_onnx_file_gives_the_output_of_its_nodes(views, tmp_path):
+    """The map is 2 x - 1; a second output is ignored."""
     pytest.importorskip("onnxruntime")
     nodes = [
         ("Mul", ("picture", "two"), "double"),
@@ -153,7 +153,7 @@ def test_an_onnx_file_gives_what_its_nodes_compute(views, tmp_path):
         pt.priors_of(path, views, "depth")
 
 
-def test_an_output_called_variance_is_one(views, tmp_path):
+def test_an_output_named_variance_is_the_variance(views, tmp_path):
     pytest.importorskip("onnxruntime")
     path = tmp_path / "net.onnx"
     nodes = [
@@ -175,7 +175,7 @@ def test_files_that_hold_pickles_are_refused(name, views, tmp_path):
         pt.priors_of(tmp_path / name, views, "depth")
 
 
-def test_a_damaged_onnx_file_and_a_missing_package_are_told(views, tmp_path, monkeypatch):
+def test_a_damaged_onnx_file_and_a_missing_package_are_reported(views, tmp_path, monkeypatch):
     pytest.importorskip("onnxruntime")
     path = tmp_path / "net.onnx"
     path.write_bytes(b"none")
@@ -195,6 +195,6 @@ def test_a_damaged_onnx_file_and_a_missing_package_are_told(views, tmp_path, mon
         (lambda picture: (picture, picture[..., 1:]), r"\(1, 3, 20, 30\)"),
     ],
 )
-def test_what_is_no_map_is_refused(network, found, views):
+def test_an_invalid_network_output_is_refused(network, found, views):
     with pytest.raises(InputError, match=f"The network returns {found}; needed for normals: a map"):
         pt.priors_of(network, views, "normals")

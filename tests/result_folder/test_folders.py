@@ -1,4 +1,4 @@
-"""Folders of results: nothing is lost, nothing is half there, and two runs do not meet."""
+"""Result folders: no file is lost or incomplete, and two runs do not write to one folder."""
 
 import errno
 import json
@@ -31,7 +31,7 @@ def held(folder: Path) -> list[str]:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Every file of a result and what is in it, but not the list of them."""
+    """Return the content of every file of a result, without the marker."""
     return {
         path.relative_to(folder).as_posix(): path.read_text()
         for path in sorted(folder.rglob("*"))
@@ -49,7 +49,7 @@ def write(folder: Path, files: dict[str, str], *, overwrite: bool = False) -> No
 
 
 def fill(folder: Path, files: dict[str, str], error: BaseException | None = None) -> None:
-    """Write files, and fail then."""
+    """Write files, then raise the error, if any."""
     for name, text in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -60,20 +60,20 @@ def fill(folder: Path, files: dict[str, str], error: BaseException | None = None
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """A folder with a result, in a folder of its own."""
+    """A folder with a result, inside an otherwise empty folder."""
     folder = tmp_path / "all" / "out"
     write(folder, result("first", "masks/a.png"))
     return folder
 
 
-def test_the_marker_lists_what_was_written(out):
+def test_the_marker_lists_the_written_files(out):
     marker = read_marker(out)
     assert marker.kind == "result"
     assert marker.files == {"mesh.ply", "sparse/cameras.bin", "masks/a.png"}
     assert held(out) == [MARKER, "masks", "mesh.ply", "sparse"]
 
 
-def test_a_result_is_replaced_on_demand_alone(out):
+def test_a_result_is_replaced_only_on_request(out):
     with pytest.raises(OutputError, match=r"already holds masks, mesh\.ply, sparse"):
         write(out, result("second"))
     write(out, result("second"), overwrite=True)
@@ -89,7 +89,7 @@ def change(path: Path) -> None:
 
 
 def link(path: Path) -> None:
-    """Put a link in the place of a file or a folder."""
+    """Replace a file or folder by a symbolic link."""
     path.rename(path.parents[2] / path.name)
     path.symlink_to(path.parents[2] / path.name)
 
@@ -107,7 +107,7 @@ SPOILED = {
 
 
 @pytest.mark.parametrize("message", SPOILED)
-def test_what_is_no_part_of_a_result_is_named_and_stays(out, message):
+def test_files_outside_a_result_are_named_and_kept(out, message):
     SPOILED[message](out)
     before = contents(out), held(out)
     with pytest.raises(OutputError, match=message):
@@ -121,7 +121,7 @@ def test_a_copy_of_a_result_is_a_result(out, tmp_path):
     assert contents(tmp_path / "copy") == result("second")
 
 
-def test_a_list_of_a_former_version_is_read(out):
+def test_the_marker_of_a_former_version_is_read(out):
     content = json.loads((out / MARKER).read_text())
     files = {name: [9, 0, "hash"] for name in content["files"]}
     (out / MARKER).write_text(json.dumps(content | {"format_version": 1, "files": files}))
@@ -129,7 +129,7 @@ def test_a_list_of_a_former_version_is_read(out):
     assert contents(out) == result("second")
 
 
-def test_a_folder_of_another_kind_is_not_replaced(out):
+def test_an_output_folder_of_a_different_kind_is_not_replaced(out):
     with pytest.raises(OutputError, match="holds a result, and is not overwritten by a scene"):
         prepare_output(out, "scene", overwrite=True)
 
@@ -144,7 +144,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize("change", [*WRONG, "", "{", "[" * 100_000, "\udcff"])
-def test_a_marker_that_is_wrong_is_not_believed(out, change):
+def test_an_invalid_marker_is_not_trusted(out, change):
     if not isinstance(change, str):
         change = json.dumps(change(json.loads((out / MARKER).read_text())))
     (out / MARKER).write_bytes(change.encode("utf-8", "surrogateescape"))
@@ -155,7 +155,7 @@ def test_a_marker_that_is_wrong_is_not_believed(out, change):
 @pytest.mark.parametrize(
     "name", ["../mine.txt", "sparse/../../mine.txt", "{}/mine.txt", ".stages/lock"]
 )
-def test_a_list_that_leads_elsewhere_removes_nothing_there(out, name):
+def test_a_marker_cannot_remove_files_outside_its_folder(out, name):
     mine, content = out.parent / "mine.txt", json.loads((out / MARKER).read_text())
     mine.write_text("years of work")
     listed = [*content["files"], name.format(out.parent)]
@@ -165,7 +165,7 @@ def test_a_list_that_leads_elsewhere_removes_nothing_there(out, name):
     assert mine.read_text() == "years of work"
 
 
-def test_kept_stages_survive_a_replacement_without_a_copy(out):
+def test_stored_stages_survive_a_replacement_without_a_copy(out):
     for overwrite in (False, True):
         folder = out if overwrite else out.with_name("fresh")
         (folder / STAGES).mkdir(parents=True)
@@ -177,7 +177,7 @@ def test_kept_stages_survive_a_replacement_without_a_copy(out):
     assert held(out.parent) == ["fresh", "out"]
 
 
-def test_a_folder_of_stages_that_is_not_ours_is_refused(tmp_path):
+def test_a_foreign_folder_of_stages_is_refused(tmp_path):
     fill(tmp_path / "out" / STAGES, {"act_one.txt": "a play"})
     with pytest.raises(OutputError, match="which pimper did not make"):
         prepare_output(tmp_path / "out", "result", overwrite=True)
@@ -188,7 +188,7 @@ def test_a_folder_of_stages_that_is_not_ours_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
-def test_what_fails_leaves_the_former_result_and_nothing_else(out, tmp_path, error):
+def test_a_failed_run_leaves_only_the_former_result(out, tmp_path, error):
     for folder, overwrite in ((out, True), (tmp_path / "new" / "deep", False)):
         with (
             pytest.raises((OutputError, KeyboardInterrupt)) as raised,
@@ -265,8 +265,8 @@ for overwrite in (False, True):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_run_killed_before_any_step_leaves_a_whole_result(tmp_path):
-    """A folder with its list is whole; where the list is missing, the next run brings the rest."""
+def test_a_run_killed_at_any_step_leaves_a_complete_result(tmp_path):
+    """A folder with its marker is complete; if the marker is missing, the next run completes it."""
     line = [sys.executable, "-c", KILLED_AT_EVERY_STEP, str(tmp_path / "out")]
     ran = subprocess.run(line, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
@@ -275,7 +275,7 @@ def test_a_run_killed_before_any_step_leaves_a_whole_result(tmp_path):
     assert seen == ("on its way second", "first on its way second")
 
 
-def test_the_folder_where_one_is_stays_the_folder_where_one_is(out, monkeypatch):
+def test_the_current_directory_survives_a_replacement(out, monkeypatch):
     monkeypatch.chdir(out)
     write(Path(), result("second"), overwrite=True)
     assert contents(Path()) == contents(out) == result("second")
@@ -297,7 +297,7 @@ with held_output(folder, "result", overwrite=True):
 
 @contextmanager
 def run_that_holds(folder: Path) -> Iterator[int]:
-    """Start a run that has written half of its result, and kill it at the end of the block."""
+    """Start a run that writes half of its result, and kill it at the end of the block."""
     line = [sys.executable, "-c", HOLDS, str(folder)]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -307,7 +307,7 @@ def run_that_holds(folder: Path) -> Iterator[int]:
             process.kill()
 
 
-def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(out, tmp_path):
+def test_a_second_run_is_refused_and_a_killed_one_leaves_no_lock(out, tmp_path):
     for folder in (out, tmp_path / "fresh"):
         with (
             run_that_holds(folder) as number,
@@ -324,7 +324,7 @@ def test_a_second_run_is_refused_and_a_killed_one_holds_nothing(out, tmp_path):
 
 
 @pytest.mark.parametrize("former", [True, False])
-def test_what_a_killed_run_kept_and_left_is_cleaned(out, tmp_path, capsys, former):
+def test_remains_of_a_killed_run_are_cleaned(out, tmp_path, capsys, former):
     folder = out if former else tmp_path / "fresh"
     with run_that_holds(folder), pytest.raises(OutputError, match="another run writes there"):
         clean_output(folder)
@@ -334,11 +334,11 @@ def test_what_a_killed_run_kept_and_left_is_cleaned(out, tmp_path, capsys, forme
     assert contents(folder) == (result("first", "masks/a.png") if former else {})
     assert STAGES not in held(folder)
     if former:
-        assert clean_output(folder) == 0  # again: there is nothing to remove
+        assert clean_output(folder) == 0  # a second time: no file is left to remove
 
 
 @pytest.mark.parametrize("name", ["mine", "nowhere", "file", "mine/.stages", "empty"])
-def test_cleaning_refuses_a_folder_that_is_not_ours(tmp_path, name):
+def test_cleaning_refuses_a_foreign_folder(tmp_path, name):
     (tmp_path / "empty" / STAGES).mkdir(parents=True)
     fill(tmp_path, {f"mine/{STAGES}/act_one.txt": "a play", "file": ""})
     with pytest.raises(OutputError, match="needed: the folder"):
@@ -347,7 +347,7 @@ def test_cleaning_refuses_a_folder_that_is_not_ours(tmp_path, name):
     assert (tmp_path / "empty" / STAGES).exists()
 
 
-def test_another_thread_is_refused_and_a_block_inside_is_not(tmp_path):
+def test_a_second_thread_is_refused_and_a_nested_block_is_not(tmp_path):
     refused = []
 
     def other():
@@ -365,7 +365,7 @@ def test_another_thread_is_refused_and_a_block_inside_is_not(tmp_path):
     assert contents(tmp_path / "out") == result("first")
 
 
-def test_a_file_that_comes_during_the_run_does_not_cost_the_result(out):
+def test_a_file_added_during_the_run_does_not_lose_the_result(out):
     with (
         pytest.raises(OutputError, match=rf"letter\.txt.* The new result is in .*{STAGES}/new\."),
         written_whole(out, "result", overwrite=True) as filled,
@@ -380,7 +380,7 @@ def test_a_file_that_comes_during_the_run_does_not_cost_the_result(out):
     assert held(out) == [MARKER, "mesh.ply", "sparse"]
 
 
-def test_a_folder_that_was_made_for_a_run_that_wrote_nothing_is_removed(tmp_path):
+def test_the_new_folder_of_a_run_without_files_is_removed(tmp_path):
     with pytest.raises(ZeroDivisionError), held_output(tmp_path / "a" / "out", "result"):
         raise ZeroDivisionError
     assert held(tmp_path) == []
@@ -391,7 +391,7 @@ def test_a_folder_that_was_made_for_a_run_that_wrote_nothing_is_removed(tmp_path
     assert held(tmp_path / "mine") == []
 
 
-def test_a_run_that_kept_something_says_where_it_goes_on(tmp_path):
+def test_an_interrupted_run_names_the_folder_of_its_stages(tmp_path):
     with pytest.raises(KeyboardInterrupt) as raised, held_output(tmp_path / "out", "result"):
         fill(tmp_path / "out" / STAGES, {"mesh.pt": "kept"}, KeyboardInterrupt())
     assert f"What was finished is kept in {tmp_path}/out/{STAGES}" in raised.value.__notes__[0]
@@ -400,7 +400,7 @@ def test_a_run_that_kept_something_says_where_it_goes_on(tmp_path):
     assert contents(tmp_path / "out") == result("first")
 
 
-def test_inputs_in_the_folder_of_the_result_are_refused(out, tmp_path):
+def test_inputs_in_the_result_folder_are_refused(out, tmp_path):
     (tmp_path / "link").symlink_to(out.parent)
     for path in (out, out / "sparse", out / "mesh.ply", tmp_path / "link" / "out" / "masks"):
         with pytest.raises(InputError, match="--sparse"):
@@ -418,7 +418,7 @@ def test_a_name_that_is_not_utf_8_is_refused(tmp_path):
         prepare_output(tmp_path / "out\udcff", "result")
 
 
-def test_what_a_run_left_that_was_killed_in_its_first_moment_is_ours(tmp_path):
+def test_remains_of_a_run_killed_at_its_start_are_replaced(tmp_path):
     (tmp_path / "out" / STAGES).mkdir(parents=True)
     write(tmp_path / "out", result("first"))
     fill(tmp_path / "other" / STAGES, {"lock": "", "new/mesh.ply": "half"})

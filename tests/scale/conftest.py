@@ -12,7 +12,7 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
 
 @pytest.fixture
 def ball(reconstruction):
-    """A ball of radius 1 at the origin before five photographs through a lens that bulges."""
+    """A ball of radius 1 at the origin in five photographs with barrel distortion."""
     lens = CameraModel(
         camera=1,
         model="OPENCV",

@@ -1,4 +1,4 @@
-"""Printed markers in photographs: a sheet drawn by homographies, aliased as little as by a lens."""
+"""Printed markers in photographs: a sheet rendered by homographies with antialiasing."""
 
 import io
 
@@ -22,15 +22,15 @@ from pimper_torch.ground.geometry.pixels import scale_intrinsics
 from pimper_torch.result.viz.marker_sheet import draw_sheet
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
-FINE = 4  # of the pictures that are averaged
+FINE = 4  # oversampling
 DPI = 25.4 * 6
-MM = 0.01  # of a scene unit, by choice
+MM = 0.01  # in scene units, arbitrary
 
 
 def picture_of(side_mm, paper="a4"):
-    """Draw a sheet as a printer does, six pixels a millimetre."""
+    """Rasterize a sheet with six pixels per millimetre."""
     file = io.BytesIO()
-    with matplotlib.rc_context({"path.snap": False}):  # edges stay between pixels
+    with matplotlib.rc_context({"path.snap": False}):  # keep edges between pixels
         draw_sheet(side_mm, paper).savefig(file, format="png", dpi=DPI)
     drawn = np.asarray(Image.open(file).convert("L"), dtype=np.float32) / 255
     return torch.from_numpy(drawn.copy())
@@ -51,7 +51,7 @@ def world_from_picture(paper="a4"):
 
 
 def photographed(picture, cameras, paper="a4"):
-    """Photograph a sheet that lies on a grey table: pixels are means of linear radiance."""
+    """Render a sheet on a grey table: pixels are means of linear radiance."""
     images = []
     for K, pose in zip(cameras.intrinsics, cameras.cam_from_world, strict=True):
         pinhole = scale_intrinsics(K, FINE, FINE) @ pose[:3]
@@ -89,7 +89,7 @@ def scene(images):
     return scene_of(images, cameras_of())
 
 
-def test_a_photographed_sheet_tells_the_size(scene):
+def test_a_photographed_sheet_gives_the_scale(scene):
     scale = scale_of_markers(scene)
     assert scale.factor * MM == pytest.approx(1, rel=1e-3)
     assert scale.residual < 1e-3
@@ -97,7 +97,7 @@ def test_a_photographed_sheet_tells_the_size(scene):
     assert (scale.unit, scale.source) == ("mm", "markers")
 
 
-def test_markers_are_where_they_were_printed(scene):
+def test_markers_are_triangulated_at_their_printed_positions(scene):
     printed = layout(30)
     width, height = PAPERS_MM["a4"]
     for marker in find_markers(scene):
@@ -109,13 +109,13 @@ def test_markers_are_where_they_were_printed(scene):
         assert float(off.max()) < 0.1  # a seventh of a pixel
 
 
-def test_sides_that_a_printer_changed_can_be_told_and_units_chosen(scene):
+def test_measured_marker_sides_and_units_can_be_given(scene):
     plain = scale_of_markers(scene)
     assert scale_of_markers(scene, side_mm=27.0).factor == pytest.approx(0.9 * plain.factor)
     assert scale_of_markers(scene, unit="in").factor == pytest.approx(plain.factor / 25.4)
 
 
-def test_numbers_tell_the_sides_of_a_sheet():
+def test_marker_ids_give_the_sides_of_a_sheet():
     assert side_of(min(layout(20))) == 20
     cameras = cameras_of(3, 40.0)
     scene = scene_of(photographed(picture_of(36, "letter"), cameras, "letter"), cameras)
@@ -123,7 +123,7 @@ def test_numbers_tell_the_sides_of_a_sheet():
 
 
 @pytest.mark.parametrize("paper", PAPERS_MM)
-def test_markers_of_a_sheet_lie_on_it_apart_from_each_other_and_have_their_own_numbers(paper):
+def test_markers_of_a_sheet_are_separate_and_have_unique_ids(paper):
     codes = []
     for side in range(MIN_SIDE_MM, MAX_SIDE_MM + 1):
         markers = layout(side, paper)
@@ -134,31 +134,31 @@ def test_markers_of_a_sheet_lie_on_it_apart_from_each_other_and_have_their_own_n
         assert bool((corners >= 10).all())
         assert bool((corners + side + 10 <= torch.tensor(PAPERS_MM[paper])).all())
         apart = (corners[:, None] - corners).abs().amax(dim=-1).fill_diagonal_(torch.inf)
-        assert float(apart.min()) >= side + side / 8  # a cell of white
+        assert float(apart.min()) >= side + side / 8  # a white cell
     assert len(set(codes)) == len(codes)
     with pytest.raises(pt.ConfigError, match="side_mm is 37; needed: 10 to 36 whole millimetres"):
         layout(37, paper)
 
 
-def test_one_photograph_alone_tells_nothing(images):
+def test_a_single_photograph_gives_no_scale(images):
     one = torch.stack([images[0], torch.full_like(images[0], 0.2)])
     assert scale_of_markers(scene_of(one, cameras_of().take([0, 1]))) is None
 
 
-def test_markers_that_stand_still_before_an_object_that_turns_are_left_out(images):
+def test_static_markers_are_excluded_for_a_turning_object(images):
     still = images[:1].expand(6, -1, -1, -1)
     assert scale_of_markers(scene_of(still, cameras_of())) is None
 
 
-def test_a_photograph_that_shows_a_marker_elsewhere_is_outvoted(images):
+def test_a_photograph_with_a_moved_marker_is_an_outlier(images):
     shifted = images.clone()
     shifted[2] = images[2].roll(25, dims=2)
     scale = scale_of_markers(scene_of(shifted, cameras_of()))
     assert scale.factor * MM == pytest.approx(1, rel=2e-3)
 
 
-def test_overexposed_paper_makes_no_marker_smaller(images):
-    """Blurred edges of saturated paper move into the black: 2 % of these markers."""
+def test_overexposed_paper_does_not_shrink_markers(images):
+    """Blurred edges of saturated paper move into the black, by 2 % of these markers."""
     cameras = cameras_of()
     soft = torch.nn.functional.avg_pool2d(images, 3, stride=1, padding=1)
     soft[[0, 2, 4, 5]] = (2.5 * soft[[0, 2, 4, 5]]).clamp(max=1)
@@ -174,7 +174,7 @@ def square(code, side):
 
 
 @pytest.mark.parametrize(("wrong", "known"), [(1, True), (2, False)])
-def test_the_size_is_that_of_most_markers_or_none(scene, monkeypatch, wrong, known):
+def test_the_scale_is_that_of_the_majority_of_markers_or_none(scene, monkeypatch, wrong, known):
     found = [square(320 + number, 2.0 if number < wrong else 3.0) for number in range(4)]
     monkeypatch.setattr(marker_scale, "find_markers", lambda _: found)
     scale = scale_of_markers(scene)
@@ -182,13 +182,13 @@ def test_the_size_is_that_of_most_markers_or_none(scene, monkeypatch, wrong, kno
     assert scale is None or scale.factor == pytest.approx(10)
 
 
-def test_a_marker_that_is_on_no_sheet_tells_a_size_only_if_its_side_is_told(scene, monkeypatch):
+def test_an_unknown_marker_needs_a_given_side(scene, monkeypatch):
     monkeypatch.setattr(marker_scale, "find_markers", lambda _: [square(586, 2.0)])
     assert scale_of_markers(scene) is None
     assert scale_of_markers(scene, side_mm=50.0).factor == pytest.approx(25)
 
 
-def test_a_number_that_stands_twice_in_a_photograph_is_left_out(sheet):
+def test_a_duplicate_marker_id_in_a_photograph_is_ignored(sheet):
     picture = (255 * sheet[:1000, :600]).to(torch.uint8)
     once = find_squares(picture)
     twice = find_squares(torch.cat([picture, picture], dim=1))
@@ -204,20 +204,20 @@ def test_the_bundled_photographs_show_no_marker():
         assert not find_squares(grey)
 
 
-def test_cameras_in_a_frame_of_their_own_are_not_scaled_by_markers_alone(scene, reconstruction):
+def test_given_cameras_are_not_scaled_by_markers_alone(scene, reconstruction):
     result = reconstruction.replace(scene=scene)
     assert find_scale(result, own_frame=True) is None
     assert find_scale(result, own_frame=True, markers=30.0).factor * MM == pytest.approx(1, 2e-3)
     assert find_scale(result, markers="off") is None
 
 
-def test_markers_that_were_asked_for_and_are_not_there_are_missed(reconstruction):
+def test_requested_markers_that_are_missing_give_a_warning(reconstruction):
     with pytest.warns(pt.PimperWarning, match="No marker was found that two photographs show"):
         assert find_scale(reconstruction, markers=25.0) is None
     assert find_scale(reconstruction) is None
 
 
-def test_sources_that_disagree_are_told_and_the_most_accurate_is_taken(scene, reconstruction):
+def test_disagreeing_sources_give_a_warning_and_the_most_accurate_is_used(scene, reconstruction):
     centers = scene.cameras.centers_world
     true = float((centers[0] - centers[5]).norm()) / MM
     result = reconstruction.replace(scene=scene)

@@ -1,4 +1,4 @@
-"""Places that a person points at, in photographs through a lens that bulges."""
+"""Marks by a user, in photographs with barrel distortion."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def direction(*values):
 
 
 def pointer(result, view, point_world, digits=6):
-    """Click where a view shows a point, in the photograph before undistortion."""
+    """Return the pixel of a point in a view's photograph before undistortion."""
     cameras = result.cameras.to(torch.float64)
     point_cam = transform(cameras.cam_from_world[view], point_world[None])
     x, y = distort(result.scene.lenses[view], point_cam)[0].tolist()
@@ -30,7 +30,7 @@ def mark(result, point_world, *views, digits=6):
 
 
 @pytest.mark.parametrize("digits", [6, 0])
-def test_two_clicks_on_the_surface_tell_its_size(ball, digits):
+def test_two_marks_on_the_surface_give_the_scale(ball, digits):
     first, second = direction(-0.6, 0.4, 0.7), direction(0.5, 0.1, 0.8)
     true = float((first - second).norm())
     ends = mark(ball, first, 2, digits=digits), mark(ball, second, 3, digits=digits)
@@ -42,21 +42,21 @@ def test_two_clicks_on_the_surface_tell_its_size(ball, digits):
     assert (scale.unit, scale.count) == ("mm", 1)
 
 
-def test_a_place_is_on_the_surface_where_the_lens_images_it(ball):
+def test_a_mark_is_undistorted_and_intersected_with_the_surface(ball):
     wanted = direction(-0.6, 0.5, 0.6)
     found = place_of(mark(ball, wanted, 1), ball)
-    # An icosphere of 20,480 faces lies 3e-4 inside; without undistortion it is 0.02 off.
+    # An icosphere of 20,480 faces is 3e-4 inside; without undistortion the error is 0.02.
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-3)
 
 
-def test_a_place_in_two_photographs_may_be_anywhere(ball):
+def test_a_mark_in_two_photographs_is_triangulated(ball):
     wanted = torch.tensor([0.7, 0.6, 1.2], dtype=torch.float64)
     found = place_of(mark(ball, wanted, 0, 4), ball)
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
 
 
-def test_the_tip_of_the_object_is_told_from_the_table_behind_it(ball):
-    """A surface ends a little inside of what it shows: one click beside it is the surface."""
+def test_a_mark_at_the_contour_is_on_the_object_and_not_on_the_table(ball):
+    """A mesh ends slightly inside the contour: a mark just outside is snapped to it."""
     plane = torch.tensor([0.0, 1.0, 0.0, 1.0])  # y = -1 and above
     ball = ball.replace(silhouettes=Silhouettes.everything(ball.scene.views, plane[None]))
     eye = ball.cameras.to(torch.float64).centers_world[2]
@@ -72,7 +72,7 @@ def test_the_tip_of_the_object_is_told_from_the_table_behind_it(ball):
     assert float(place_of(far, ball)[1]) == pytest.approx(-1, abs=1e-5)  # on the table
 
 
-def test_a_ruler_beside_the_object_lies_on_the_plane_of_the_cloud(ball):
+def test_a_mark_next_to_the_object_is_on_the_supporting_plane(ball):
     generator = torch.Generator().manual_seed(5)
     flat = 6 * torch.rand(200, 3, generator=generator) - 3
     flat[:, 1] = -1.0
@@ -90,7 +90,7 @@ def test_a_ruler_beside_the_object_lies_on_the_plane_of_the_cloud(ball):
         torch.testing.assert_close(place_of(mark(ball, end, 2), ball), end, rtol=0, atol=1e-4)
 
 
-def test_where_the_silhouette_shows_the_object_the_table_is_not_taken(ball):
+def test_a_mark_inside_the_silhouette_is_not_on_the_table(ball):
     plane = torch.tensor([0.0, 1.0, 0.0, 1.0])
     inside = torch.ones(5, 480, 640)
     silhouettes = Silhouettes(
@@ -101,7 +101,7 @@ def test_where_the_silhouette_shows_the_object_the_table_is_not_taken(ball):
         place_of(place, ball.replace(silhouettes=silhouettes))
 
 
-def test_a_ray_through_an_opening_meets_no_back_side(ball):
+def test_a_mark_does_not_hit_back_faces(ball):
     mesh = ball.mesh
     front = mesh.vertices_world[mesh.faces].mean(dim=1)[:, 2] > 0
     halved = ball.replace(mesh=mesh.replace(faces=mesh.faces[~front]))
@@ -109,14 +109,14 @@ def test_a_ray_through_an_opening_meets_no_back_side(ball):
         place_of(Mark.read("IMG_2,320,240"), halved)
 
 
-def test_a_place_where_the_surface_is_hardly_determined_is_warned_of(ball):
+def test_a_mark_on_uncertain_surface_gives_a_warning(ball):
     low = ball.mesh.replace(confidence=torch.full((len(ball.mesh.vertices_world),), 0.3))
     with pytest.warns(UserWarning, match=r"hardly determine the surface there: .* is 0\.30"):
         place_of(Mark.read("IMG_2,320,240"), ball.replace(mesh=low))
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("IMG_7,3,4", "'IMG_7': none of the photographs is named so; needed: one of IMG_0.jpg"),
         ("IMG_9.jpg,3,4", "IMG_9.jpg: has no place among the cameras that were found"),
@@ -126,18 +126,18 @@ def test_a_place_where_the_surface_is_hardly_determined_is_warned_of(ball):
         ("IMG_0,300,200+IMG_4,300,400", r"IMG_0,300,200 is \d+ pixels from where the others"),
     ],
 )
-def test_a_place_that_cannot_be_found_is_named(ball, text, told):
-    with pytest.raises(InputError, match=told):
+def test_a_mark_that_cannot_be_located_is_named(ball, text, message):
+    with pytest.raises(InputError, match=message):
         place_of(Mark.read(text), ball)
 
 
 @pytest.mark.parametrize("text", ["", "a", "a,1", "a,1,b", ",1,2", "a,1,2+", "a,nan,2"])
-def test_words_that_are_no_place_are_refused(text):
+def test_invalid_marks_are_refused(text):
     with pytest.raises(InputError, match="is no place in a photograph; needed: NAME,x,y"):
         Mark.read(text)
 
 
-def test_one_place_twice_has_no_length(ball):
+def test_two_equal_marks_have_no_length(ball):
     end = mark(ball, direction(0, 0, 1), 2)
     with pytest.raises(InputError, match="is 0 in the result and 5 mm in truth; needed: two"):
         scale_of_bars(ball, [ScaleBar(first=end, second=end, length=5.0)])
@@ -157,14 +157,14 @@ def distances(result, factor, pairs):
     ]
 
 
-def test_cameras_tell_the_size_exactly(ball):
+def test_camera_distances_give_the_exact_scale(ball):
     scale = scale_of_cameras(ball, distances(ball, 123.0, [(0, 4), (1, 2), (2, 3)]), "cm")
     assert scale.factor == pytest.approx(123, rel=1e-6)
     assert scale.residual < 1e-6
     assert scale.unit == "cm"
 
 
-def test_the_factor_is_that_of_least_squares(ball):
+def test_the_factor_is_the_least_squares_solution(ball):
     given = distances(ball, 100.0, [(0, 4), (1, 2)])
     given = [given[0], CameraDistance(first="IMG_1", second="IMG_2", length=1.01 * given[1].length)]
     found = torch.tensor([one.length for one in distances(ball, 1.0, [(0, 4), (1, 2)])])
@@ -173,7 +173,7 @@ def test_the_factor_is_that_of_least_squares(ball):
     assert scale_of_cameras(ball, given).factor == pytest.approx(float(wanted), rel=1e-5)
 
 
-def test_distances_that_contradict_one_another_are_named_with_their_residuals(ball):
+def test_inconsistent_distances_are_named_with_their_residuals(ball):
     given = distances(ball, 100.0, [(0, 4), (1, 2), (2, 3)])
     wrong = CameraDistance(first="IMG_1", second="IMG_2", length=1.2 * given[1].length)
     with pytest.warns(UserWarning, match=r"camera distances contradict.*IMG_1 to IMG_2 is .*\(-1"):

@@ -1,4 +1,4 @@
-"""From photographs of which two places are known to a result of the right size."""
+"""From photographs with two known points to a result in real units."""
 
 import json
 import logging
@@ -18,11 +18,11 @@ SIZE = {"width": 640, "height": 480}
 
 
 def ends(capture, view):
-    """Two pixels of a view that show the object far apart, and where in space."""
+    """Return two distant pixels of the object in a view, and their points in space."""
     truth, cameras = capture.truth, capture.cameras.to(torch.float64)
     pixels = pixel_centers(SIZE["width"], SIZE["height"], like=cameras.intrinsics)
     depth = truth.depth[view].double()
-    # Away from its border, where a pixel more is another depth.
+    # Away from its border, where depth changes from pixel to pixel.
     inner = -torch.nn.functional.max_pool2d(
         -truth.foreground[view][None].float(), 31, stride=1, padding=15
     )[0]
@@ -42,8 +42,8 @@ def centers(poses):
 
 
 @pytest.mark.slow
-def test_two_clicks_on_a_rendered_object_give_its_size(tmp_path, capsys):
-    """With the true cameras, so that a scene's unit is a thousand millimetres exactly."""
+def test_two_marks_on_a_rendered_object_give_the_scale(tmp_path, capsys):
+    """With the true cameras, so a scene unit is exactly a thousand millimetres."""
     scene, out = tmp_path / "scene", tmp_path / "out"
     sizes = [word for name, value in SIZE.items() for word in (f"--{name}", str(value))]
     assert main(["render", "potatoes", "-o", str(scene), "--num-views", "12", *sizes]) == 0

@@ -1,4 +1,4 @@
-"""Results in another unit: every length, and nothing else."""
+"""Results in a different unit: all lengths change, and only these."""
 
 import dataclasses
 import typing
@@ -24,7 +24,7 @@ from pimper_torch.records import (
 )
 from pimper_torch.runtime.errors import ConfigError
 
-# What has no unit of length, or another one: pixels, angles, radiance, fractions.
+# Fields without a unit of length: pixels, angles, radiance, fractions.
 WITHOUT = {
     "Views": {"images", "focals_px"},
     "Cameras": {"intrinsics"},
@@ -44,7 +44,7 @@ WITHOUT = {
     "LightPrior": {"lights", "variance"},
     "Surface": {"barycentric", "normals_world", "albedo", "information"},
     "Convergence": {"residual"},
-    "ViewLights": {"direction_world", "inverse_distance", "ambient", "directed"},  # that is a ratio
+    "ViewLights": {"direction_world", "inverse_distance", "ambient", "directed"},  # a ratio
     "Materials": {"metallic", "roughness", "specular"},
     "ViewErrors": {"psnr_db"},
     "Textured": {"normals", "uv", "tangent", "base_color", "normal", "reflectance"},
@@ -58,7 +58,7 @@ def parts_of(hint):
 
 
 def records_in(kind, found):
-    """Collect the records that one holds, whatever they stand in."""
+    """Collect the records inside a record, in any container."""
     if kind not in found:
         found.add(kind)
         for hint in typing.get_type_hints(kind).values():
@@ -68,7 +68,7 @@ def records_in(kind, found):
     return found
 
 
-def test_every_number_of_a_result_is_a_length_or_is_known_to_be_none():
+def test_every_number_of_a_result_is_declared_a_length_or_not():
     kinds = records_in(Reconstruction, {Surface})
     assert {Heights, Depths, CoarseMesh, FacetPoints} <= kinds
     for kind in kinds:
@@ -96,17 +96,17 @@ def alike(first, second, tolerance):
 
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
-def test_a_scene_of_another_unit_gives_the_result_in_that_unit():
-    """A length that was left out, or a setting in scene units, would be off by a factor."""
+def test_a_scene_in_a_different_unit_gives_the_result_in_that_unit():
+    """A length that is not scaled, or a setting in scene units, would be off by a factor."""
     scene, coarse = (record.to(torch.float32) for record in small_scene(num_views=5, width=40))
     settings = {"silhouettes": {"object": "everything"}, "scales": [1.0]}
     chain = pt.load_chain("default", settings)
     plain = chain(scene, mesh=coarse.mesh)
     large = chain(scaled(scene, 4.0), mesh=scaled(coarse.mesh, 4.0))
     wanted = scaled(plain, 4.0)
-    assert large.mesh.vertices_world.abs().max() > 3.9  # of a ball of radius 1
+    assert large.mesh.vertices_world.abs().max() > 3.9  # of a ball of radius 1, times 4
     rest = {"report": (), "failures": ()}
-    alike(large.replace(**rest), wanted.replace(**rest), 1e-4)  # a power of two rounds nothing
+    alike(large.replace(**rest), wanted.replace(**rest), 1e-4)  # a power of two causes no rounding
 
 
 def test_scaling_back_gives_the_same(reconstruction):
@@ -117,14 +117,14 @@ def test_scaling_back_gives_the_same(reconstruction):
     assert scaled(reconstruction, 1.0) is reconstruction
 
 
-def test_photographs_are_shared_and_one_object_stays_one(reconstruction):
+def test_scaling_shares_photographs_and_keeps_object_identity(reconstruction):
     made = scaled(reconstruction, 3.0)
     assert made.scene.views is reconstruction.scene.views
     assert made.patches.patches.coarse is made.coarse
     assert made.coarse is not reconstruction.coarse
 
 
-def test_a_scaled_object_is_photographed_as_before(reconstruction):
+def test_a_scaled_scene_has_the_same_images(reconstruction):
     far = reconstruction.scene.replace(offset_world=(10.0, 20.0, -30.0))
     made = scaled(reconstruction.replace(scene=far), 7.0)
     assert made.scene.offset_world == (70.0, 140.0, -210.0)
@@ -136,7 +136,7 @@ def test_a_scaled_object_is_photographed_as_before(reconstruction):
     torch.testing.assert_close(after[1], 7 * before[1])
 
 
-def test_variances_and_planes_are_scaled_as_what_they_are():
+def test_variances_and_planes_are_scaled_by_their_dimension():
     points = FacetPoints(
         points_world=torch.ones(1, 3),
         covariance_world=torch.eye(3)[None],
@@ -157,13 +157,13 @@ def test_variances_and_planes_are_scaled_as_what_they_are():
     assert float(plane[:3] @ (10 * on) + plane[3]) == 0
 
 
-def test_lengths_that_stages_tell_are_scaled_and_counts_are_not(reconstruction):
+def test_lengths_in_reports_are_scaled_and_counts_are_not(reconstruction):
     report = reconstruction.report[0].replace(figures={"mismatch": 0.5, "samples": 96})
     made = scaled(reconstruction.replace(report=(report,)), 4.0)
     assert made.report[0].figures == {"mismatch": 2.0, "samples": 96}
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_factor_that_is_none_is_refused(factor, reconstruction):
+def test_an_invalid_factor_is_refused(factor, reconstruction):
     with pytest.raises(ConfigError, match=r"factor is .*above 0 and finite"):
         scaled(reconstruction, factor)

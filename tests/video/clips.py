@@ -1,4 +1,4 @@
-"""Videos of a patterned plane that passes by."""
+"""Videos of a moving patterned plane."""
 
 from functools import cache
 
@@ -19,7 +19,7 @@ def texture(seed=3):
 
 
 def positions():
-    """Give where the plane stands in each frame: it starts slowly."""
+    """Return the plane's position in each frame; it starts slowly."""
     return (500 * np.linspace(0, 1, COUNT) ** 2).round().astype(int)
 
 
@@ -32,7 +32,7 @@ def written(
     field_step=0,
     places=None,
 ):
-    """Write a clip; ``shape`` is that of a pixel, ``field_step`` the motion from
+    """Write a clip; ``shape`` is the pixel aspect ratio, ``field_step`` the motion from
     the field of odd rows to that of even ones."""
     plane = texture()
     options = {"x264-params": "interlaced=1"} if field_step else {}

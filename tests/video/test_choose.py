@@ -9,7 +9,7 @@ def scan(way, sharpness=None):
     return Scan(sharpness=sharpness, way=way)
 
 
-def test_frames_are_as_far_apart_on_the_way_however_fast_it_went():
+def test_frames_are_equally_spaced_at_any_speed():
     time = torch.linspace(0, 1, 400)
     found = scan(2 * time**3)  # slow at first
     numbers = chosen(found, 20)
@@ -20,14 +20,14 @@ def test_frames_are_as_far_apart_on_the_way_however_fast_it_went():
     assert numbers.diff()[0] > 4 * numbers.diff()[-1]
 
 
-def test_the_sharpest_frame_of_each_stretch_is_taken():
+def test_the_sharpest_frame_of_each_interval_is_selected():
     sharpness = torch.full((200,), 0.2)
     sharpness[7::20] = 0.4
     numbers = chosen(scan(torch.arange(200) / 200, sharpness), 10)
     assert numbers.tolist() == list(range(7, 200, 20))
 
 
-def test_a_camera_that_rests_for_a_while_gives_one_frame_of_there():
+def test_a_static_camera_gives_one_frame():
     way = torch.cat(
         [torch.linspace(0, 0.5, 50), torch.full((200,), 0.5), torch.linspace(0.5, 1, 50)]
     )
@@ -36,7 +36,7 @@ def test_a_camera_that_rests_for_a_while_gives_one_frame_of_there():
     assert len(numbers) >= 9
 
 
-def test_frames_that_show_the_same_are_not_chosen_to_make_up_the_number():
+def test_duplicate_frames_are_not_selected():
     way = torch.cat([torch.full((30,), place) for place in (0.0, 0.3, 0.7, 1.0)])
     noise = 0.001 * torch.rand(120, generator=torch.Generator().manual_seed(1))
     numbers = chosen(scan((way + noise).cummax(dim=0).values), 12)

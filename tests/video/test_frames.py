@@ -1,4 +1,4 @@
-"""Videos of a patterned plane that passes by, made here."""
+"""Videos of a moving patterned plane, generated here."""
 
 import json
 from fractions import Fraction
@@ -24,7 +24,7 @@ def clip(tmp_path_factory):
     return written(tmp_path_factory.mktemp("videos") / "clip.mp4")
 
 
-def test_frames_that_are_chosen_are_sharp_and_equally_far_apart(tmp_path, capsys):
+def test_selected_frames_are_sharp_and_equally_spaced(tmp_path, capsys):
     video = written(tmp_path / "clip.mp4", blur=lambda number: 0.0 if number % 3 == 1 else 2.5)
     line = ["frames", str(video), "-o", str(tmp_path / "photos"), "--count", "12", "--json"]
     assert main(line) == 0
@@ -43,14 +43,14 @@ def test_frames_that_are_chosen_are_sharp_and_equally_far_apart(tmp_path, capsys
     assert np.abs(shown - texture()[20 : 20 + HEIGHT, at : at + WIDTH]).mean() < 6
 
 
-def test_frames_that_show_the_same_are_not_written_to_make_up_the_number(tmp_path, capsys):
+def test_duplicate_frames_are_not_written(tmp_path, capsys):
     clip = written(tmp_path / "rest.mp4", places=[12 * (number // 8) for number in range(40)])
     assert main(["frames", str(clip), "-o", str(tmp_path / "few"), "--count", "11"]) == 0
     assert len(list_images(tmp_path / "few")) == 5
     assert "has 5 frames that differ, of 11 that were asked for" in capsys.readouterr().err
 
 
-def test_light_that_changes_is_not_taken_for_motion(clip, tmp_path):
+def test_changing_light_does_not_count_as_motion(clip, tmp_path):
     moving = scanned(luma_frames(clip))
     video = written(tmp_path / "b.mp4", gain=lambda number: 0.75 + 0.25 * np.sin(number / 9))
     lit = scanned(luma_frames(video))
@@ -76,7 +76,7 @@ def test_light_that_changes_is_not_taken_for_motion(clip, tmp_path):
         (lambda path: written(path, shape=Fraction(4, 3), places=range(3)), PLAIN),
     ],
 )
-def test_what_is_no_plain_video_is_refused(make, said, tmp_path, capsys):
+def test_an_unsupported_video_is_refused(make, said, tmp_path, capsys):
     make(tmp_path / "clip.mkv")
     line = ["frames", str(tmp_path / "clip.mkv"), "-o", str(tmp_path / "photos"), "--count", "5"]
     assert main(line) == 2
@@ -84,7 +84,7 @@ def test_what_is_no_plain_video_is_refused(make, said, tmp_path, capsys):
     assert not (tmp_path / "photos").exists()
 
 
-def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, capsys):
+def test_a_folder_with_other_files_is_refused(tmp_path, capsys):
     video = written(tmp_path / "clip.mp4", places=range(0, 300, 12))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "a.png").write_bytes(b"mine")
@@ -92,7 +92,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, capsys):
     assert main(line) == 2
     assert (tmp_path / "mine" / "a.png").read_bytes() == b"mine"
     line[3] = str(tmp_path / "photos")
-    assert main(line) == main(line) == 0  # what came from a video is replaced
+    assert main(line) == main(line) == 0  # frames of a video are replaced
     assert len(list_images(tmp_path / "photos")) == 5
     assert main(line[:-1]) == 2
 
@@ -111,8 +111,8 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, capsys):
         ((0.1, 0.99, -0.99, 0.1), lambda picture: np.rot90(picture, -1)),
     ],
 )
-def test_pictures_are_turned_and_mirrored_as_the_video_says(matrix, wanted, clip, tmp_path):
-    """The matrix of the track's header: (x, y) is shown at (a x + c y, b x + d y)."""
+def test_frames_are_rotated_and_mirrored_by_the_display_matrix(matrix, wanted, clip, tmp_path):
+    """The matrix of the track's header displays (x, y) at (a x + c y, b x + d y)."""
     turned = tmp_path / "turned.mp4"
     data = bytearray(clip.read_bytes())
     a, b, c, d = (round(65536 * value) for value in matrix)
@@ -126,7 +126,7 @@ def test_pictures_are_turned_and_mirrored_as_the_video_says(matrix, wanted, clip
     assert np.array_equal(after, wanted(before))
 
 
-def test_blur_along_the_motion_makes_a_frame_less_sharp_and_light_does_not():
+def test_motion_blur_reduces_sharpness_and_light_does_not():
     picture = texture()[:, :WIDTH, 1].astype(np.float32)
     plain = sharpness(torch.from_numpy(picture.astype(np.uint8)))
     dim = sharpness(torch.from_numpy((0.6 * picture).astype(np.uint8)))
@@ -136,7 +136,7 @@ def test_blur_along_the_motion_makes_a_frame_less_sharp_and_light_does_not():
     assert sharpness(torch.zeros(20, 20, dtype=torch.uint8)) == 0.0
 
 
-def test_an_object_that_turns_before_a_wall_moves():
+def test_an_object_that_turns_in_front_of_a_wall_is_motion():
     wall, plane = texture(4), texture()
     before, after = (wall[:HEIGHT, :WIDTH, 1].copy() for _ in range(2))
     before[60:200, 100:240], after[60:200, 100:240] = plane[:140, :140, 1], plane[:140, 5:145, 1]
@@ -148,7 +148,7 @@ def test_an_object_that_turns_before_a_wall_moves():
 
 
 @pytest.mark.parametrize(("curve", "name"), [(16, "PQ"), (18, "HLG")])
-def test_high_dynamic_range_is_warned_of(curve, name, tmp_path):
+def test_high_dynamic_range_gives_a_warning(curve, name, tmp_path):
     video = written(tmp_path / "clip.mp4", curve=curve, places=range(2))
     with pytest.warns(PimperWarning, match=f"clip.mp4: is of high dynamic range, {name}"):
         next(iter(luma_frames(video)))

@@ -131,7 +131,7 @@ def test_distortions_are_read(save, lens_of, kind, params, x, y):
         ({"poses": []}, "a list of objects as poses"),
     ],
 )
-def test_another_file_is_refused(save, options, needed):
+def test_an_unknown_file_is_refused(save, options, needed):
     with pytest.raises(InputError, match=needed):
         read_camera_file(save(**options))
 

@@ -112,7 +112,7 @@ def test_the_lens_is_that_of_the_manual(save, lens_of, kind, terms, x, y):
         ({"chunk": "<"}, "cannot be read as XML"),
     ],
 )
-def test_another_file_is_refused(save, pieces, needed):
+def test_an_unknown_file_is_refused(save, pieces, needed):
     with pytest.raises(InputError, match=needed):
         read_camera_file(save(**pieces))
 

@@ -214,7 +214,7 @@ LAYOUTS = {
 @pytest.mark.parametrize("layout", LAYOUTS)
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 2**31), skewed=st.booleans(), masked=st.booleans())
-def test_what_is_written_is_read_back(layout, seed, skewed, masked):
+def test_an_export_survives_a_round_trip(layout, seed, skewed, masked):
     write, read = LAYOUTS[layout]
     views, cameras, points = photographed(seed, skewed, masked)
     with TemporaryDirectory() as folder:
