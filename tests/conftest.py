@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-# Tests run one to a core, and their scenes are tiny: threads would wait for one another longer
-# than they compute. Read when torch and numpy are loaded, here and in programs that tests start.
+# Tests run one per core, and their scenes are tiny: threads would wait longer than they compute.
+# Read when torch and numpy are loaded, here and in programs started by tests.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -37,14 +37,14 @@ def generator() -> torch.Generator:
 
 @pytest.fixture
 def shapes_checked(pytestconfig: pytest.Config) -> None:
-    """Skip where annotations are not checked when functions are called."""
+    """Skip if annotations are not checked at calls."""
     if not pytestconfig.getoption("jaxtyping_packages"):
         pytest.skip("needs --jaxtyping-packages=pimper_torch,pimper_bench,beartype.beartype")
 
 
 @pytest.fixture
 def shapes_unchecked(pytestconfig: pytest.Config) -> None:
-    """Skip where annotations are checked before what is called can refuse its arguments itself."""
+    """Skip if annotations are checked before a function can refuse its arguments."""
     if pytestconfig.getoption("jaxtyping_packages"):
         pytest.skip("annotations refuse this first")
 
@@ -66,7 +66,7 @@ def _answered_once(function: Callable[..., object]) -> Callable[..., object]:
 
 @pytest.fixture
 def lit_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fit lights to equal results and bake their textures once: many tests write the same one."""
+    """Fit lights and bake textures once per result: many tests write the same result."""
     from pimper_torch.stages import Relight, Texture
 
     for stage in (Relight, Texture):
@@ -76,7 +76,7 @@ def lit_before(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def small_pictures(monkeypatch: pytest.MonkeyPatch, lit_before: None) -> None:
-    """Write results with small pictures: the large ones take longer than all else."""
+    """Write results with small images: large ones take most of the time."""
     from pimper_torch.doors.io import results
 
     draw, turn = results.draw_overview, results.draw_turn
@@ -86,7 +86,7 @@ def small_pictures(monkeypatch: pytest.MonkeyPatch, lit_before: None) -> None:
 
 @pytest.fixture
 def reconstruction():
-    """A bump on a square seen by three cameras: a small, complete result."""
+    """A small, complete result: a bump on a square, with three cameras."""
     from torch.nn.functional import normalize
 
     from pimper_bench.scenes.procedural_meshes import table
@@ -171,7 +171,7 @@ def reconstruction():
         inside=ones > 0,
     )
     lights_patch = torch.randn(2, 3, 4, generator=generator)
-    lights_patch[0, 2] = 0  # a view that does not have the patch
+    lights_patch[0, 2] = 0  # a view without the patch
     photometry = Photometry(
         normals_patch=normalize(torch.tensor([0.1, 0.2, -1.0]), dim=0).expand(2, 4, 4, 3),
         albedo=ones[..., None].expand(2, 4, 4, 3),
@@ -210,9 +210,9 @@ def reconstruction():
 
 @pytest.fixture(scope="session")
 def lift():
-    """Facets ``height`` samples outside a photographed plane, and its light, known exactly.
+    """Facets ``height`` samples above a photographed plane with known light.
 
-    Textured, or of one albedo all over; ``normal`` is the plane's.
+    The plane is textured or has uniform albedo; ``normal`` is its normal.
     """
     from types import SimpleNamespace
 
@@ -292,7 +292,7 @@ def lift():
 
 @pytest.fixture(scope="session")
 def dtu(tmp_path_factory):
-    """Write scan 9 of three places, seen under lights 0 and 3, with the files of its protocol."""
+    """Write scan 9 with three positions, lights 0 and 3, and the files of its protocol."""
     import numpy as np
     import scipy.io
     from PIL import Image
@@ -331,7 +331,7 @@ def dtu(tmp_path_factory):
 
 @pytest.fixture
 def problem(generator):
-    """Random factors on the cone, their exact product, and a perturbed start."""
+    """Random factors on the cone, their exact product, and a perturbed initial value."""
     from torch.nn.functional import normalize
 
     from pimper_torch.method.photometry.bilinear import Bilinear

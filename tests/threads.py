@@ -1,4 +1,4 @@
-"""The same work on several numbers of threads."""
+"""Run a function with several numbers of threads."""
 
 from collections.abc import Callable, Iterator
 from typing import TypeVar
@@ -9,7 +9,7 @@ Result = TypeVar("Result")
 
 
 def on_threads(work: Callable[[], Result], *counts: int) -> Iterator[Result]:
-    """Do the work once for each number of torch's threads; afterwards it is what it was."""
+    """Call ``work`` once for each number of torch's threads; the number is restored."""
     former = torch.get_num_threads()
     try:
         for count in counts:

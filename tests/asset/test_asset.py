@@ -36,7 +36,7 @@ from pimper_torch.runtime.parallel import on_one_thread
 
 
 def ball(level: int) -> Mesh:
-    """A sphere that carries other normals than its shape has, and a smooth albedo."""
+    """A sphere with normals that differ from its shape, and a smooth albedo."""
     vertices, faces = icosphere(level)
     vertices = vertices.float()
     bumps = torch.stack([torch.sin(9 * vertices[:, 1]), torch.cos(7 * vertices[:, 2])], dim=1)
@@ -67,14 +67,14 @@ def asset(full, few) -> Textured:
 
 
 def sampled(picture, uv):
-    """A texture between texels, as graphics cards blend it."""
+    """Sample a texture by bilinear interpolation, as graphics cards do."""
     planes = picture.float().movedim(-1, 0)[None]
     found = grid_sample(planes, 2 * uv[None, None] - 1, align_corners=False, padding_mode="border")
     return found[0, :, 0].T
 
 
 def seen(asset: Textured, count: int = 50_000):
-    """Points on every part of the asset, with normals and base colours as three.js draws them."""
+    """Return points all over the asset, with normals and base colours as drawn by three.js."""
     random = torch.Generator().manual_seed(1)
     face = torch.randint(len(asset.mesh.faces), (count,), generator=random)
     weights = torch.rand(count, 3, generator=random)
@@ -98,19 +98,19 @@ def angles_deg(one, other):
 
 
 def of_surface(full: Mesh, points):
-    """Carried normals and base colours where rays from the ball's centre meet it."""
+    """Return attached normals and base colours where rays from the centre hit the ball."""
     hits = RayCaster(full.vertices_world, full.faces).cast(torch.zeros(3), normalize(points, dim=1))
     normals = normalize(hits.interpolate(full.normals_world, full.faces), dim=1)
     return normals, hits.interpolate(base_color(full), full.faces)
 
 
 @pytest.mark.parametrize("packed", ["xatlas", "triangles"])
-def test_normals_and_albedo_are_those_of_the_surface(full, few, asset, packed):
+def test_baked_normals_and_albedo_equal_those_of_the_surface(full, few, asset, packed):
     if packed == "triangles":
         asset = textured(full, few, atlas=by_triangles(few, 0.008))
     points, normals, color = seen(asset)
     wanted, albedo = of_surface(full, points)
-    assert angles_deg(wanted, of_surface(few, points)[0]).max() > 2  # the vertices do not tell it
+    assert angles_deg(wanted, of_surface(few, points)[0]).max() > 2  # vertices alone do not give it
     assert angles_deg(normals, wanted).max() < 1.0
     assert (color - 255 * srgb_from_linear(albedo)).abs().max() < 1
 
@@ -145,30 +145,30 @@ def test_no_two_faces_share_a_texel(few, packed):
     lengths = (lengths - lengths.roll(1, dims=1)).norm(dim=2) / 0.01
     for side in (atlas.width, atlas.height):
         assert side.bit_count() == 1  # a power of two
-    if packed == "xatlas":  # a texel is as large as it was asked for, but for the nearest power
+    if packed == "xatlas":  # texels have the requested size, up to the nearest power
         assert 1 / 1.5 < float(sides.mean() / lengths.mean()) < 1.5
         assert atlas.charts < 100
 
 
 @pytest.mark.parametrize("why", ["timed out", "No such file", "No module named"])
-def test_every_face_is_a_chart_where_xatlas_fails(few, monkeypatch, why):
+def test_every_face_is_a_chart_if_xatlas_fails(few, monkeypatch, why):
     if why == "timed out":
         monkeypatch.setattr(atlases, "_LIMIT_S", 0.01)
     elif why == "No such file":
         monkeypatch.setattr(atlases.sys, "executable", "/nowhere/python")
-    else:  # sought where the package is not installed
+    else:  # the package is not installed
         monkeypatch.setattr(atlases, "_CHILD", ("-P", "-S"))
         monkeypatch.delenv("PYTHONPATH", raising=False)
     with pytest.warns(PimperWarning, match=f"xatlas failed to unwrap the surface .*{why}"):
         assert unwrapped(few, 0.01).charts == len(few.faces)
 
 
-def test_a_texture_is_never_larger_than_browsers_take(few):
+def test_texture_size_is_limited_to_that_of_browsers(few):
     for atlas in (unwrapped(few, 0.001), by_triangles(few, 0.0001)):
         assert max(atlas.width, atlas.height) == MAX_SIDE
 
 
-def test_tangents_follow_the_texture_and_their_signs_its_mirror_images():
+def test_tangents_follow_the_texture_and_mark_mirrored_charts():
     square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     up, faces = torch.tensor([[0.0, 0, 1]]).expand(4, 3), torch.tensor([[0, 1, 2], [0, 2, 3]])
     uv = square[:, :2] * torch.tensor([1.0, -1.0]) + torch.tensor([0.0, 1.0])
@@ -182,7 +182,7 @@ def test_tangents_follow_the_texture_and_their_signs_its_mirror_images():
 
 
 def validated(path: Path) -> list[dict[str, object]]:
-    """Errors and warnings of Khronos' validator: the folder of the npm package gltf-validator."""
+    """Return errors and warnings of Khronos' validator, the npm package gltf-validator."""
     folder = os.environ.get("PIMPER_GLTF_VALIDATOR")
     node = shutil.which("node")
     if not (folder and node):
@@ -206,7 +206,7 @@ def tree_of(path: Path) -> dict:
 
 @pytest.fixture
 def two_cameras(full) -> Cameras:
-    """Cameras that look at the ball horizontally, and from straight above; z is up."""
+    """Two cameras that look at the ball, horizontally and from above; z is up."""
     up = torch.tensor([[0.0, 0, 1], [1.0, 0, 0]])
     poses = look_at(torch.tensor([[0.0, 9, 0], [0.0, 0, 9]]), torch.zeros(3), up)
     return Cameras(
@@ -229,7 +229,7 @@ def placement(asset, two_cameras) -> Placement:
 
 
 @pytest.mark.parametrize("texture", ["png", "jpeg", "webp"])
-def test_the_glb_is_clean_and_says_what_was_baked(asset, placement, tmp_path, texture):
+def test_the_glb_is_valid_and_has_the_baked_textures(asset, placement, tmp_path, texture):
     path = tmp_path / "asset.glb"
     write_asset(asset, path, placement, texture)
     scene = trimesh.load_scene(path, process=False)
@@ -251,21 +251,19 @@ def test_the_glb_is_clean_and_says_what_was_baked(asset, placement, tmp_path, te
     material = shape.visual.material
     color, bumps = material.baseColorTexture, material.normalTexture
     away = torch.tensor(np.asarray(color)).float() - asset.base_color
-    # Charts of unlike colours meet in this small picture: 2 and 4 levels.
+    # Charts of different colours meet in this small image: 2 and 4 levels.
     assert away.square().mean().sqrt() <= (0 if texture == "png" else 5)
-    assert np.array_equal(np.asarray(bumps), asset.normal)  # directions are kept as they are
+    assert np.array_equal(np.asarray(bumps), asset.normal)  # directions are stored losslessly
     kinds = (texture.upper(), "WEBP" if texture == "webp" else "PNG")
     assert (color.format, bumps.format) == kinds
     assert (material.metallicFactor, material.roughnessFactor) == (0, 1)
-    # Trimesh has v up.
+    # v is up in trimesh.
     assert np.allclose(shape.visual.uv * [1, -1] + [0, 1], asset.uv, atol=1e-6)
     assert validated(path) == []
 
 
-def test_an_asset_stands_on_the_origin_and_faces_the_reference_camera(
-    asset, two_cameras, placement
-):
-    """A ball of radius 1 whose scene has z up, ten units a metre; a bump shows the front."""
+def test_an_asset_is_at_the_origin_and_faces_the_reference_camera(asset, two_cameras, placement):
+    """A ball of radius 1 with z up, ten units per metre; a bump marks the front."""
     vertices, _ = placement.placed(asset.mesh.vertices_world, asset.normals)
     low, high = vertices.aminmax(dim=0)
     assert_close(low, torch.tensor([-0.1, 0.0, -0.1]), atol=2e-3, rtol=0)
@@ -275,7 +273,7 @@ def test_an_asset_stands_on_the_origin_and_faces_the_reference_camera(
         matrix = standing(asset.mesh, two_cameras, reference, marks[1], 10.0)
         placed = replace(placement, scene_from_asset=matrix).placed(marks, marks)[0]
         assert_close(placed[1], torch.tensor([0.0, 0.2, 0.0]), atol=2e-3, rtol=0)
-        # From above, the picture's upper edge is at x: the front is opposite to it.
+        # From above, the image's upper edge is at x, and the front is opposite.
         assert_close(placed[0], torch.tensor(front), atol=2e-3, rtol=0)
     unknown = standing(asset.mesh, two_cameras, 0, marks[1], None)
     vertices, _ = replace(placement, scene_from_asset=unknown).placed(
@@ -284,8 +282,8 @@ def test_an_asset_stands_on_the_origin_and_faces_the_reference_camera(
     assert float((vertices.amax(dim=0) - vertices.amin(dim=0)).max()) == pytest.approx(1)
 
 
-def test_cameras_in_the_glb_see_what_the_photographs_do(asset, two_cameras, placement, tmp_path):
-    """glTF's cameras look along -z, with y up."""
+def test_cameras_in_the_glb_agree_with_the_photographs(asset, two_cameras, placement, tmp_path):
+    """Cameras in glTF look along -z, with y up."""
     write_asset(asset, tmp_path / "asset.glb", placement)
     tree = tree_of(tmp_path / "asset.glb")
     assert tree["scenes"] == [{"nodes": [0, 1, 2]}]
@@ -302,8 +300,8 @@ def test_cameras_in_the_glb_see_what_the_photographs_do(asset, two_cameras, plac
         assert_close(found.float(), wanted, atol=1e-5, rtol=0)
 
 
-def test_albedo_too_bright_to_be_true_is_the_neighbours_and_marked(full, few):
-    """A cap of the ball is dark without light that determines it, but for a glowing speck."""
+def test_implausibly_bright_albedo_is_inpainted_and_marked(full, few):
+    """A cap of the ball is unlit, except for an implausibly bright speck."""
     z = full.vertices_world[:, 2]
     confidence = (z < 0.5).float()
     speck = (full.vertices_world[:, 0] > 0.4) & (z > 0.6)
@@ -327,7 +325,7 @@ def test_albedo_too_bright_to_be_true_is_the_neighbours_and_marked(full, few):
     assert torch.equal(inpainted(none)[0].albedo, full.albedo)
 
 
-def test_the_mask_of_doubtful_albedo_is_a_texture_of_the_glb(full, few, asset, tmp_path):
+def test_the_mask_of_unreliable_albedo_is_a_texture_of_the_glb(full, few, asset, tmp_path):
     assert not asset.uncertainty.any()
     doubtful = asset.replace(uncertainty=torch.full_like(asset.uncertainty, 128))
     for one, name in ((asset, "sure"), (doubtful, "doubtful")):
@@ -370,13 +368,13 @@ def test_a_usdz_is_complete_and_in_metres(asset, placement, tmp_path):
     assert np.allclose(uv * [1, -1] + [0, 1], asset.uv)  # v is up
 
 
-def test_the_meshs_glb_is_clean(full, tmp_path):
+def test_the_glb_of_a_mesh_is_valid(full, tmp_path):
     write_glb(full, tmp_path / "mesh.glb", OFFSET)
     assert validated(tmp_path / "mesh.glb") == []
 
 
 @pytest.mark.parametrize("clusters", [1, 2])
-def test_materials_are_factors_or_textures_where_they_differ(full, few, tmp_path, clusters):
+def test_materials_are_factors_or_textures(full, few, tmp_path, clusters):
     known = torch.tensor([[0.0, 0.3, 0.5], [1.0, 0.6, 2.0]])
     cluster = (few.vertices_world[:, 0] > 0).long() * (clusters - 1)
     reflectance = known[cluster]

@@ -1,4 +1,4 @@
-"""Small valid files of every kind that the package reads, and their readers."""
+"""Small valid files of every kind read by the package, and their readers."""
 
 import warnings
 from collections import deque
@@ -44,7 +44,7 @@ from tests.io.heic_files import UPRIGHT
 
 @dataclass(frozen=True)
 class Seed:
-    """A valid folder, the files in it that are damaged, and what reads it."""
+    """A valid folder, its files to damage, and its reader."""
 
     name: str
     folder: Path
@@ -62,7 +62,7 @@ VIEWS = views_of(
 
 
 def make_seeds(root: Path) -> list[Seed]:
-    """Write all folders below a root, and check that their readers take them."""
+    """Write all folders below a root, and check that their readers accept them."""
     seeds = [
         *(_alone(root / "image", name, write, decode) for name, write in _pictures().items()),
         *_photographs(root / "photographs"),
@@ -84,7 +84,7 @@ def make_seeds(root: Path) -> list[Seed]:
 def _alone(
     root: Path, name: str, write: Callable[[Path], object], read: Callable[[Path], object]
 ) -> Seed:
-    """Write a file into a folder of its own."""
+    """Write a file to a new folder."""
     folder = root / name.replace(".", "_")
     folder.mkdir(parents=True)
     write(folder / name)
@@ -216,7 +216,7 @@ def _tables(root: Path) -> list[Seed]:
         return build(CoarseToFineConfig, read_mapping(path), str(path))
 
     def record(path: Path) -> object:
-        return load_record(Mesh, path) and None  # stages that take a record check its values
+        return load_record(Mesh, path) and None  # values are checked by stages
 
     files: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         "curve.csv": (lambda path: path.write_text(text), read_curve),
@@ -253,7 +253,7 @@ def _maps(root: Path) -> list[Seed]:
 
 
 def _camera_files(root: Path) -> list[Seed]:
-    """Write cameras that come with photographs of other folders, as `--sparse FILE` reads them."""
+    """Write camera files that refer to photographs in other folders, as for `--sparse FILE`."""
 
     def seed(write: Callable[[Cameras, Path], Path]) -> Seed:
         folder = root / write.__name__

@@ -1,9 +1,9 @@
-"""Damaged files of every kind: a clean error or a sound result, in little memory and time.
+"""Damaged files of every kind give a clean error or a valid result, in little memory and time.
 
-What is accepted: a :class:`~pimper_torch.runtime.errors.PimperError` in words of the package, or a
-result whose values are finite and whose indices exist. What is not: any other exception, a process
-that ends or hangs, two more gigabytes of memory, files opened outside of the folder, pickles, and
-text of a library's source in a message.
+Accepted are a :class:`~pimper_torch.runtime.errors.PimperError` in words of the package, or a
+result with finite values and valid indices. Failures are any other exception, a process that ends
+or hangs, two more gigabytes of memory, files opened outside the folder, pickles, and text of a
+library's source in a message.
 """
 
 import faulthandler
@@ -33,7 +33,7 @@ from pimper_torch.runtime.errors import PimperError
 from tests.fuzz.seeds import make_seeds
 
 LIMIT_BYTES, LIMIT_SECONDS = 2 * 2**30, 20
-# Of libraries' sources and memory, which say nothing to a reader.
+# Text of libraries' sources and memory, meaningless to users.
 FOREIGN = re.compile(r"Check failed|\.(?:cc|cpp|h|rs)\b|std::|0x[0-9a-f]{6}|object at|Traceback")
 SYSTEM = (sys.prefix, sys.base_prefix, "/proc", "/dev", "/sys", "/usr", "/lib")
 PACKAGE = str(Path(__file__).resolve().parents[2])
@@ -70,7 +70,7 @@ PIECES = st.one_of(
 
 @st.composite
 def damaged(draw, data: bytes) -> bytes:
-    """Put pieces over bytes anywhere, put words in the place of others, or cut the end off."""
+    """Overwrite bytes anywhere, replace words, or truncate the data."""
     for _ in range(draw(st.integers(1, 4))):
         how = draw(st.sampled_from(("over", "word", "word", "into", "head", "cut")))
         if how == "word":
@@ -89,7 +89,7 @@ def damaged(draw, data: bytes) -> bytes:
 
 @st.composite
 def damaged_inside(draw, data: bytes, suffix: str) -> bytes:
-    """Damage a file as :func:`damaged` does, or a part of it in a container left whole."""
+    """Damage a file as :func:`damaged` does, or a part of it inside an intact container."""
     if draw(st.integers(0, 2)) == 0:
         return draw(damaged(data))
     if suffix == ".png":
@@ -119,7 +119,7 @@ def damaged_inside(draw, data: bytes, suffix: str) -> bytes:
 
 @st.composite
 def _png(draw, data: bytes) -> bytes:
-    """Damage what is in a chunk and mend its checksum; compressed data are compressed again."""
+    """Damage the data of a chunk and fix its checksum; compressed data are recompressed."""
     at, pieces = 8, [data[:8]]
     chunks = []
     while at < len(data):
@@ -139,7 +139,7 @@ def _png(draw, data: bytes) -> bytes:
 
 @st.composite
 def _json(draw, data: bytes) -> bytes:
-    """Put values of another kind somewhere in the tree, texts that hold trees included."""
+    """Replace values in the tree by values of other types, also in texts that contain trees."""
     tree = json.loads(data)
     places: list[tuple[object, object]] = []
     stack = [tree]
@@ -172,7 +172,7 @@ def _watch(event: str, arguments: tuple[object, ...]) -> None:
 
 @contextmanager
 def limited() -> Iterator[None]:
-    """Give what a block does two more gigabytes and twenty seconds."""
+    """Limit a block to two more gigabytes and twenty seconds."""
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     former = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (held + LIMIT_BYTES, former[1]))
@@ -185,7 +185,7 @@ def limited() -> Iterator[None]:
 
 
 def unsound(result: object, where: str = "result") -> Iterator[str]:
-    """Find what is wrong with a result."""
+    """Yield the errors of a result."""
     if isinstance(result, SparseModel):
         rotation = result.cam_from_world[:, :3, :3]
         off = rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype)
@@ -234,7 +234,7 @@ def tried(seed, copy: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [150, pytest.param(5000, marks=pytest.mark.slow)])
-def test_damaged_files_end_in_clean_errors_or_sound_results(count, tmp_path):
+def test_damaged_files_give_clean_errors_or_valid_results(count, tmp_path):
     sys.addaudithook(_watch)
     seeds = make_seeds(tmp_path / "seeds")
     copy = tmp_path / "case" / "in"

@@ -1,4 +1,4 @@
-"""One rig in the words of every program."""
+"""Writers of one rig in the formats of all supported programs."""
 
 import json
 from pathlib import Path
@@ -18,7 +18,7 @@ NAMES = ("10.png", "2.png", "a b.png")
 
 
 def rig_of(seed: int) -> Cameras:
-    """Three cameras with one lens, anywhere and looking anywhere."""
+    """Return three cameras with equal intrinsics and random poses."""
     generator = torch.Generator().manual_seed(seed)
     rotation, _ = torch.linalg.qr(torch.randn(3, 3, 3, generator=generator).double())
     rotation = rotation * torch.linalg.det(rotation)[:, None, None]
@@ -104,7 +104,7 @@ def saved(folder: Path, **arrays: object) -> Path:
 
 def of_idr(rig: Cameras, folder: Path) -> Path:
     K = rig.intrinsics.clone()
-    K[:, :2, 2] -= 0.5  # which counts centres from 0
+    K[:, :2, 2] -= 0.5  # its first pixel centre is 0
     order = np.argsort(NAMES)
     world = rig.cam_from_world.clone()
     world[:, :3] = 2.5 * K @ rig.cam_from_world[:, :3]

@@ -1,4 +1,4 @@
-"""The comparison of a mesh with exact maps along the rays of one view."""
+"""Comparison of a mesh with exact maps along the rays of one view."""
 
 from types import SimpleNamespace
 

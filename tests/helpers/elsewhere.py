@@ -1,6 +1,6 @@
-"""A device that no machine needs: tensors lie elsewhere for programs, and the CPU computes them.
+"""A simulated device: tensors appear to be on it, and the CPU computes them.
 
-As on a GPU, an operation on tensors of two devices is refused, and so is numpy.
+As on a GPU, operations on tensors of two devices are refused, and so is numpy.
 """
 
 from types import TracebackType
@@ -13,15 +13,15 @@ from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 ELSEWHERE = torch.device("meta")
-# Tensors of the CPU may be indices and values of others, and are copied to and fro.
+# Operations that accept CPU tensors as indices or values, or copy between devices.
 _CROSSING = {"__getitem__", "__setitem__", "index", "index_put_", "_index_put_impl_"}
-# What torch itself tells apart by the device: done where operations are few and plain.
+# Functions that torch dispatches by device: decomposed into a few simple operations.
 _PLAIN = {"__get__", "to", "cpu", "as_tensor"}
 _NUMPY = {"numpy", "__array__", "data_ptr"}
 
 
 class Far(Tensor):
-    """A tensor elsewhere, with the one of the CPU that has its values."""
+    """A tensor on the simulated device, with the CPU tensor of its values."""
 
     @staticmethod
     def __new__(cls, near: Tensor) -> "Far":
@@ -40,7 +40,7 @@ class Far(Tensor):
 
 
 def _computed(func: Any, name: str, args: Any, kwargs: Any) -> Any:
-    """Compute on the CPU what is elsewhere; refuse what is in both places."""
+    """Compute on the CPU for tensors of the simulated device; refuse mixed devices."""
     tensors = [leaf for leaf in pytree.tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
     mine = {id(one.near): one for one in tensors if isinstance(one, Far)}
     device = kwargs.get("device")
@@ -70,7 +70,7 @@ class _Operations(TorchDispatchMode):
 
 
 class Elsewhere(TorchFunctionMode):
-    """In the block, of one thread, tensors are made and computed elsewhere where that is asked."""
+    """Within the block and its thread, tensors can be created and computed on the device."""
 
     def __enter__(self) -> "Elsewhere":
         self._operations = _Operations()
@@ -92,5 +92,5 @@ class Elsewhere(TorchFunctionMode):
 
 
 def sent(record: Any) -> Any:
-    """Put the tensors of records elsewhere."""
+    """Move the tensors of records to the simulated device."""
     return pytree.tree_map_only(Tensor, Far, record)

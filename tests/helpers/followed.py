@@ -1,4 +1,4 @@
-"""Names and calls in pieces of Python, followed through the packages without running them."""
+"""Static check of names and calls in Python snippets against the packages."""
 
 import ast
 import functools
@@ -15,13 +15,13 @@ from pimper_torch.method.chains.presets import make_chain
 
 
 def _own(kind: object) -> bool:
-    """Whether a module, a class or a function is of the packages."""
+    """Return whether a module, a class or a function belongs to the packages."""
     name = kind.__name__ if inspect.ismodule(kind) else getattr(kind, "__module__", None) or ""
     return name.partition(".")[0] in (pt.__name__, "pimper_bench")
 
 
 class Of:
-    """An object of which the class alone is known, or a few that it may have."""
+    """An object known only by its class, or by a few possible ones."""
 
     def __init__(self, kinds: object) -> None:
         union = typing.get_origin(kinds) in (typing.Union, types.UnionType)
@@ -29,7 +29,7 @@ class Of:
         self.kinds = [kind for kind in told if inspect.isclass(kind) and _own(kind)]
 
 
-# What variables of documents hold.
+# Types of variables in documents.
 VARIABLES = {
     "pt": pt,
     "chain": Of(pt.CoarseToFine | pt.Published),
@@ -44,16 +44,16 @@ _EXPORTED = {name: getattr(pt.stages, name) for name in dir(pt.stages)} | {
 
 
 def follow(text: str) -> None:
-    """Look up the names of a piece of Python, and bind the arguments of its calls.
+    """Resolve the names of a Python snippet, and bind the arguments of its calls.
 
-    What it imports is imported, and settings are loaded. Objects are followed as far as
-    annotations tell their classes; of others nothing is known.
+    Its imports are executed, and its settings loaded. Objects are followed if annotations give
+    their classes; others are not checked.
 
     Raises:
-        SyntaxError: It is no Python.
-        ImportError: A module, or a name in it, is not there.
+        SyntaxError: It is not valid Python.
+        ImportError: A module, or a name in it, does not exist.
         AttributeError: An object of the package has no such attribute.
-        TypeError: A signature does not take a call.
+        TypeError: A call does not match a signature.
         ConfigError: Settings, or names of stages, that the chain refuses.
     """
     held: dict[str, object] = {**_EXPORTED, **VARIABLES}
@@ -62,7 +62,7 @@ def follow(text: str) -> None:
 
 
 def _followed(node: ast.AST, held: dict[str, object]) -> object:
-    """Return what an expression is, ``None`` where nothing tells; enter what a statement binds."""
+    """Return the value or type of an expression, if known; record the bindings of a statement."""
     if isinstance(node, ast.Name):
         return held.get(node.id)
     if isinstance(node, ast.Attribute):
@@ -96,7 +96,7 @@ def _attribute(owner: object, name: str) -> object:
 
 
 def _assigned(kind: type) -> set[str]:
-    """Names that a class annotates, and those that a module assigns when it is made."""
+    """Return names that a class annotates, and those that a module assigns in its constructor."""
     own = [one for one in kind.__mro__ if _own(one)]
     names = {name for one in own for name in inspect.get_annotations(one)}
     if issubclass(kind, nn.Module):
@@ -124,7 +124,7 @@ def _module(function: Of) -> bool:
 
 
 def _load(call: ast.Call) -> None:
-    """Let the loader read the settings of a call, and the chain the names of stages."""
+    """Check the settings of a call with the loader, and its stages with the chain."""
     parameters = ("name_or_path", "changes", "observer", "cache")
     given = dict(zip(parameters, call.args, strict=False))
     given |= {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg}
@@ -141,5 +141,5 @@ def _load(call: ast.Call) -> None:
 def _hints(annotated: Callable[..., object] | type) -> dict[str, object]:
     try:
         return typing.get_type_hints(annotated)
-    except NameError:  # imported for checkers of types alone
+    except NameError:  # imported only for type checkers
         return {}

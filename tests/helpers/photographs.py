@@ -1,4 +1,4 @@
-"""Photographs of rendered scenes as files, and photographs of nothing by cameras anywhere."""
+"""Photographs of rendered scenes as files, and random photographs with random cameras."""
 
 from pathlib import Path
 
@@ -13,20 +13,20 @@ from pimper_torch.records import Cameras, Views
 
 
 def save_photographs(views, folder):
-    """Write 8-bit sRGB PNG files, named as the views are."""
+    """Write 8-bit sRGB PNG files, named by the views."""
     for index, name in enumerate(views.names):
         write_picture(views, index, Path(folder) / name)
 
 
 def save_masks(masks, names, folder):
-    """Write PNG files, white on the object, named as the views are."""
+    """Write PNG files, white on the object, named by the views."""
     Path(folder).mkdir()
     for mask, name in zip(masks, names, strict=True):
         Image.fromarray(255 * mask.numpy().astype(np.uint8)).save(Path(folder) / name)
 
 
 def photographed(seed, skewed=False, masked=False):
-    """One to three photographs of unlike sizes, levels of 8 bits, their pinholes, and points."""
+    """Return 1 to 3 photographs of different sizes with 8-bit levels, pinholes, and points."""
     generator = torch.Generator().manual_seed(seed)
     count = 1 + seed % 3
     sizes = torch.randint(6, 17, (count, 2), generator=generator)

@@ -1,4 +1,4 @@
-"""Parts of scenes that tests in several rooms change."""
+"""Parts of scenes shared by tests of several subpackages."""
 
 from pathlib import Path
 
@@ -22,20 +22,20 @@ def subdivided_square(spacing):
 
 
 def tilted_square(x=0.0, y=0.0):
-    """A square of side 2 about the origin, in single precision; z rises by so much along axes."""
+    """Return a square of side 2 about the origin, float32, with slopes ``x`` and ``y`` of z."""
     vertices = 2 * CORNERS - torch.tensor([1.0, 1, 0])
     vertices[:, 2] = vertices[:, :2] @ torch.tensor([x, y], dtype=torch.float64)
     return Mesh(vertices_world=vertices.float(), faces=FACETS)
 
 
 def from_above(focal_px, width, height):
-    """A camera that looks at the origin from 5 along z, y up."""
+    """Return a camera at z = 5 that looks at the origin, y up."""
     pose = look_at(torch.tensor([[0.0, 0, 5]]), torch.zeros(3), torch.tensor([0.0, 1, 0]))
     return pinholes(pose, focal_px, width, height)
 
 
 def ball(radius=1.0, level=3, center=(0.0, 0.0, 0.0)):
-    """A ball of ``20 * 4**level`` faces; a radius along each axis makes it an ellipsoid."""
+    """Return a ball of ``20 * 4**level`` faces; one radius per axis gives an ellipsoid."""
     vertices, faces = icosphere(level)
     placed = vertices * vertices.new_tensor(radius) + vertices.new_tensor(center)
     return Mesh(vertices_world=placed, faces=faces)
@@ -48,7 +48,7 @@ def write_ball(path: Path, *shape, **options) -> Path:
 
 
 def observed(views, cameras, points, pixels, seen, lens):
-    """Return a scene of points without noise, each observed where a view sees it."""
+    """Return a scene of points without noise, observed in the views that see them."""
     view, point = seen.nonzero(as_tuple=True)
     return SparseScene(
         views=views,
@@ -63,7 +63,7 @@ def observed(views, cameras, points, pixels, seen, lens):
 
 
 def observing(scene, kept):
-    """Keep some of a scene's observations."""
+    """Select observations of a scene."""
     return scene.replace(
         observation_point=scene.observation_point[kept],
         observation_view=scene.observation_view[kept],
@@ -72,14 +72,14 @@ def observing(scene, kept):
 
 
 def without_points(scene):
-    """Leave out the cloud."""
+    """Remove the cloud."""
     return observing(scene, slice(0)).replace(
         points_world=scene.points_world[:0], reprojection_errors_px=scene.reprojection_errors_px[:0]
     )
 
 
 def edge_counts(faces):
-    """List edges, and how many faces each has."""
+    """Return edges with their number of faces."""
     return torch.unique(half_edges(faces).sort(dim=1).values, dim=0, return_counts=True)
 
 
@@ -89,6 +89,6 @@ def each_bucket(record, change):
 
 
 def first_bucket(record, **changes):
-    """Change fields of the first bucket of patches."""
+    """Replace fields of the first bucket of patches."""
     first, *others = record.buckets
     return record.replace(buckets=(first.replace(**changes), *others))

@@ -1,4 +1,4 @@
-"""What documents show as code, and the lines where they show it."""
+"""Code in documents, with its lines."""
 
 import ast
 import doctest
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-# Not the targets of roles, :func:`load_views`.
+# Excludes targets of roles, :func:`load_views`.
 _SPAN = re.compile(r"(?<![`:])(`{1,2})(?!`)([^`]+)\1(?!`)")
 _ROLE = re.compile(r":(?:func|class|mod|meth|attr|data|exc):`[~!]?(?:[^`<]+<)?([^`>]+)>?`")
 _FENCE = re.compile(r" *```([^\s`]*)[^`]*$")
@@ -20,8 +20,8 @@ class Shown:
     """A piece of code in a document.
 
     Attributes:
-        line: Where it begins, from 1.
-        language: Of a block, empty where it names none; ``None`` of code within a sentence.
+        line: Its first line, from 1.
+        language: Language of a block, possibly empty; ``None`` for inline code.
     """
 
     line: int
@@ -30,7 +30,7 @@ class Shown:
 
 
 def shown_in(path: Path) -> Iterator[Shown]:
-    """Find code in Markdown, in reStructuredText, in a notebook's text or in strings of Python."""
+    """Find code in Markdown, reStructuredText, a notebook's text or Python strings."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".ipynb":
         for number, cell in enumerate(json.loads(text)["cells"]):
@@ -45,7 +45,7 @@ def shown_in(path: Path) -> Iterator[Shown]:
 
 
 def in_markdown(text: str) -> Iterator[Shown]:
-    """Find blocks, fenced or indented, and code within sentences."""
+    """Find fenced or indented blocks, and inline code."""
     lines = text.split("\n")
     at = 0
     while at < len(lines):
@@ -64,7 +64,7 @@ def in_markdown(text: str) -> Iterator[Shown]:
 
 
 def in_restructured(text: str) -> Iterator[Shown]:
-    """Find blocks of code, literal ones too, and code within sentences."""
+    """Find code blocks, literal blocks, and inline code."""
     lines = text.split("\n")
     at = 0
     while at < len(lines):
@@ -77,7 +77,7 @@ def in_restructured(text: str) -> Iterator[Shown]:
 
 
 def _behind(lines: list[str], at: int) -> int:
-    """Return the line that follows a block of indented lines."""
+    """Return the line after a block of indented lines."""
     return next((i for i in range(at, len(lines)) if re.match(r" {0,3}\S", lines[i])), len(lines))
 
 
@@ -87,7 +87,7 @@ def in_sentence(line: int, sentence: str) -> Iterator[Shown]:
 
 
 def in_string(line: int, string: str) -> Iterator[Shown]:
-    """Find examples and code between backticks, which may be broken over lines."""
+    """Find examples and code between backticks, possibly across lines."""
     examples = doctest.DocTestParser().get_examples(string) if ">>>" in string else []
     if examples:
         code = "".join(example.source for example in examples)
@@ -98,7 +98,7 @@ def in_string(line: int, string: str) -> Iterator[Shown]:
 
 
 def strings(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """List the strings of a module with their lines, an ellipsis for what is put into them."""
+    """List the strings of a module with their lines; formatted values become an ellipsis."""
     inner = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
@@ -112,13 +112,13 @@ def strings(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def roles_in(text: str) -> Iterator[tuple[int, str]]:
-    """List the names that a text refers to by roles of Sphinx, with their lines."""
+    """List the targets of Sphinx roles in a text, with their lines."""
     for role in _ROLE.finditer(text):
         yield text.count("\n", 0, role.start()) + 1, re.sub(r"\s", "", role[1])
 
 
 def commands_in(block: str) -> Iterator[tuple[int, str]]:
-    """List the command lines of a block, with their lines in it: each after a prompt or ``&&``."""
+    """List the commands of a block, after a prompt or ``&&``, with their lines in it."""
     joined = re.sub(r"\\\n *", "", block)
     for line, content in enumerate(joined.split("\n")):
         for command in content.split("&&"):

@@ -1,4 +1,4 @@
-"""What a chain makes of samples: light, factorization and gauge, one after the other."""
+"""Photometry of samples as in a chain: light, factorization and gauge."""
 
 from pimper_torch.method.photometry.fit_light import FitLight
 from pimper_torch.method.photometry.gauge import FixGauge
@@ -6,5 +6,5 @@ from pimper_torch.method.photometry.photometry_config import FitLightConfig
 
 
 def solved(factorize, seen, **light):
-    """Factorize under the light that is fitted, with these settings of it, and set the gauge."""
+    """Fit the light with the given settings, factorize, and fix the gauge."""
     return FixGauge()(factorize(seen, FitLight(FitLightConfig(**light))(seen)))

@@ -1,4 +1,4 @@
-"""Photographs, and sparse models of points that cameras see."""
+"""Photographs, and sparse models of points observed by cameras."""
 
 import torch
 from torch import Tensor
@@ -30,15 +30,15 @@ def observed(
     noise_px: float = 0.0,
     generator: torch.Generator | None = None,
 ) -> SparseModel:
-    """Make a model in which pinholes observe points with noise.
+    """Make a model of points that pinholes observe with noise.
 
     Args:
         cameras: Their poses.
         points: World frame.
-        seen: Which view sees a point, ``point view``; all by default.
-        lens: Of all views, in the place of the cameras' pinholes: without distortion.
+        seen: Whether a view observes a point, ``point view``; all by default.
+        lens: Model of all views, without distortion; replaces the cameras' pinholes.
         noise_px: Standard deviation of the noise.
-        generator: Of the noise.
+        generator: Generator of the noise.
     """
     count = cameras.num_views
     seen = torch.ones(len(points), count, dtype=torch.bool) if seen is None else seen

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-# Stands for `pimper`: runs the object's own program, which finds `out`, and `tries` before it.
+# Replaces `pimper`: runs the object's program, with the variables `out` and `tries` (so far).
 CHILD = """
 import json, os, signal, sys, time
 from pathlib import Path
@@ -50,7 +50,7 @@ os.execvp(words[0], words)
 
 
 def children_stand_in(folder: Path) -> str:
-    """Let Python that is started with the path returned as ``PYTHONPATH`` run stand-ins."""
+    """Return a path; Python processes with it as ``PYTHONPATH`` run stand-ins."""
     import pimper_torch
 
     (folder / "sitecustomize.py").write_text(
@@ -60,7 +60,7 @@ def children_stand_in(folder: Path) -> str:
 
 
 def write_slurm(folder: Path) -> None:
-    """Write Slurm's commands, which run a job at once on this machine."""
+    """Write replacements of Slurm's commands that run jobs immediately on this machine."""
     folder.mkdir()
     for name, code in _COMMANDS.items():
         (folder / name).write_text(f"#!{sys.executable}\n{code}")

@@ -1,4 +1,4 @@
-"""Surfaces as fusion returns them, of which a test says only what it is about."""
+"""Surfaces like those of fusion, with defaults for all fields that a test does not set."""
 
 import torch
 
@@ -7,7 +7,7 @@ from pimper_torch.records import Convergence, Surface
 
 
 def surface_of(vertices, faces, **known):
-    """Return a converged surface: white, one facet, normals of its faces, unless more is known."""
+    """Return a converged surface; by default white, of one facet, with normals of its faces."""
     one = torch.ones_like(vertices[:, 0])
     if "normals_world" not in known:
         known["normals_world"] = vertex_normals(vertices, faces)

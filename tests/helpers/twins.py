@@ -1,4 +1,4 @@
-"""Functions in torch that compiled kernels stand in for."""
+"""Choice between compiled kernels and their torch equivalents."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,7 +16,7 @@ _MODULES = (
 
 @contextmanager
 def using(kernels: Literal["numba", "torch"]) -> Iterator[None]:
-    """Choose inside the ``with`` block whether kernels stand in for torch."""
+    """Choose compiled kernels or torch inside the ``with`` block."""
     with ExitStack() as stack:
         for module in _MODULES if kernels == "torch" else ():
             stack.enter_context(

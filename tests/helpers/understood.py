@@ -1,4 +1,4 @@
-"""Whether the command line and the loader of settings understand what documents show."""
+"""Check commands, options and settings in documents with the parsers of the package."""
 
 import dataclasses
 import functools
@@ -19,31 +19,31 @@ from pimper_torch.runtime.errors import ConfigError, PimperError
 
 COMMANDS = commands()
 
-# What stands for something of the reader's.
+# Placeholders for values of the reader.
 PLACEHOLDER = re.compile(r"[A-Z]+|…|\(x,y,z,x,y,z\)")
 
 
 class Stopped(BaseException):
-    """The arguments are read, and the command itself is not begun."""
+    """Raised once the arguments are parsed, instead of running the command."""
 
 
 def command_line(text: str, *, whole: bool = True) -> None:
-    """Let the command line read a command, and carry nothing out.
+    """Parse a command without running it.
 
     Args:
-        whole: Whether what a command needs must be there; else it is only mentioned.
+        whole: Whether required arguments must be present; else the command is only mentioned.
 
     Raises:
-        ConfigError: As the command line refuses it.
+        ConfigError: The command line refuses it.
     """
     words = [word for word in shlex.split(text, comments=True) if word != "..."]
     words = words[1 : words.index(">")] if ">" in words else words[1:]
     if not words or words[0].startswith("--"):
-        return  # `pimper --help` and the like
+        return  # such as `pimper --help`
     if words[0] not in COMMANDS:
         raise ConfigError(f"there is no command {words[0]}")
     name, given = words[0], words[1:]
-    if "--" in given:  # of `pimper batch`: options for every object
+    if "--" in given:  # `pimper batch`: options for every object
         command_line(
             f"pimper reconstruct {shlex.join(given[given.index('--') + 1 :])}", whole=False
         )
@@ -54,16 +54,16 @@ def command_line(text: str, *, whole: bool = True) -> None:
 
 
 def option(text: str) -> None:
-    """Let commands read options that a sentence names, with their values if it gives any.
+    """Parse options named in a sentence, with their values, if any.
 
     Raises:
-        ConfigError: No command has them, or none takes the values.
+        ConfigError: No command has them, or accepts the values.
     """
     words = text.removeprefix("-- ").split()
     named = {word.partition("=")[0] for word in words if word.startswith("--")}
     if named <= {"--help", "--help-all", "--version", "--quiet", "--json", "--log-level"}:
         return
-    names = [name for name in COMMANDS if name != "config"]  # which takes any text
+    names = [name for name in COMMANDS if name != "config"]  # accepts any text
     having = [name for name in names if named <= {*options(name)}]
     if not having:
         raise ConfigError(f"no command has {' '.join(sorted(named))}")
@@ -80,7 +80,7 @@ def option(text: str) -> None:
 
 @functools.cache
 def options(name: str) -> Mapping[str, Option]:
-    """Return the options of a command by their names, settings of both chains among them."""
+    """Return the options of a command by name, including settings of both chains."""
 
     def stop(command: object, **_: object) -> None:
         raise Stopped(command)
@@ -124,7 +124,7 @@ def _read(name: str, arguments: tuple[str, ...]) -> None:
 
 
 def _with_values(known: Mapping[str, Option], words: Sequence[str]) -> list[str]:
-    """Leave out options that a sentence only names, without a value or with a placeholder."""
+    """Remove options that are named without a value or with a placeholder."""
     groups: list[list[str]] = [[]]
     for word in words:
         if word in known:
@@ -136,7 +136,7 @@ def _with_values(known: Mapping[str, Option], words: Sequence[str]) -> list[str]
 
 
 def _completed(known: Mapping[str, Option], given: Sequence[str]) -> list[str]:
-    """Add what a command needs and is not given."""
+    """Add required arguments that are missing."""
     needed = [name for name, one in known.items() if one.default is REQUIRED]
     places = [name for name in needed if not name.startswith("-")]
     first = [*takewhile(lambda word: not word.startswith("-"), given)]
@@ -149,10 +149,10 @@ def _completed(known: Mapping[str, Option], given: Sequence[str]) -> list[str]:
 
 
 def setting(mapping: Mapping[str, object], preset: str = "default") -> None:
-    """Let the loader read settings.
+    """Parse settings.
 
     Raises:
-        ConfigError: As the loader refuses them.
+        ConfigError: The loader refuses them.
     """
     load_config(preset, mapping)
 

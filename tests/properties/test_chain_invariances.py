@@ -1,4 +1,4 @@
-"""What must not change the surface: order of photographs, the world's frame, brightness."""
+"""Invariances of the surface: order of photographs, world frame, brightness."""
 
 import dataclasses
 import warnings
@@ -12,8 +12,8 @@ from pimper_torch.records import Mesh, SparseScene
 from pimper_torch.runtime.errors import PimperWarning
 from tests.test_chain import photographed, small_chain
 
-# Of the diagonal of a cap that is 1.1 across, sampled 0.013 apart. Rounding of a shifted world, or
-# another order of sums, may choose other points for a few facets: 0.0012 was measured.
+# Fraction of the diagonal of a cap of width 1.1, sampled 0.013 apart. Rounding of a shifted world
+# or a different order of sums may select other points for a few facets: 0.0012 was measured.
 TOLERANCE = 2e-3
 
 
@@ -64,7 +64,7 @@ def moved(scene: SparseScene, scale: float, rotation: torch.Tensor, shift: torch
 
 
 def apart(one: torch.Tensor, other: torch.Tensor) -> float:
-    """Give the mean distance to the other's nearest vertex, both ways, over the diagonal."""
+    """Return the mean symmetric distance to the nearest vertex, divided by the diagonal."""
     one, other = one.double(), other.double()
     distance = torch.cdist(one, other)
     diagonal = (one.amax(dim=0) - one.amin(dim=0)).norm()
@@ -77,7 +77,7 @@ def test_the_order_of_photographs_does_not_matter(preset, scene, usual):
     assert apart(found.vertices_world, usual.vertices_world) < TOLERANCE
 
 
-def test_a_similarity_of_the_world_moves_the_surface_along(preset, scene, usual):
+def test_a_similarity_of_the_world_transforms_the_surface(preset, scene, usual):
     generator = torch.Generator().manual_seed(5)
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
     rotation = rotation * torch.linalg.det(rotation)
@@ -89,7 +89,7 @@ def test_a_similarity_of_the_world_moves_the_surface_along(preset, scene, usual)
 
 @pytest.mark.slow
 def test_a_world_twice_as_large_gives_the_same_bits_twice_as_large(preset, scene, usual):
-    """Scaling by two rounds nothing: whatever differs comes of a length that is a constant."""
+    """Scaling by two is exact: a difference would reveal a constant length."""
     nowhere = torch.zeros(3, dtype=torch.float64)
     found = surface_of(preset, moved(scene, 2.0, torch.eye(3, dtype=torch.float64), nowhere))
     assert torch.equal(found.vertices_world, 2 * usual.vertices_world)
@@ -101,7 +101,7 @@ def test_a_world_twice_as_large_gives_the_same_bits_twice_as_large(preset, scene
 def test_brighter_photographs_give_the_same_surface_and_a_brighter_light(
     preset, scene, usual, gain
 ):
-    """Within what the sensor tells: nothing becomes darker than the dark level or saturates."""
+    """Within the sensor's range: no pixel falls below the dark level or saturates."""
     views = scene.views.replace(images=scene.views.images * gain)
     assert float(views.images.amax()) < 0.98
     found = surface_of(preset, scene.replace(views=views))

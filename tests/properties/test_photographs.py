@@ -1,4 +1,4 @@
-"""A photograph that is stored turned, and says so in EXIF, is the same photograph."""
+"""Photographs stored rotated, with EXIF orientation, are read upright."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from PIL import Image
 
 from pimper_torch.doors.io.photographs import load_views
 
-# EXIF's orientation, and how pixels are stored so that a reader who heeds it sees them upright.
+# EXIF orientation, and the stored pixels that it makes upright.
 STORED = {
     1: lambda pixels: pixels,
     2: lambda pixels: pixels[:, ::-1],
@@ -28,7 +28,7 @@ STORED = {
     high=st.integers(4, 40),
     seed=st.integers(0, 2**31 - 1),
 )
-def test_orientation_changes_how_files_are_stored_and_nothing_else(
+def test_exif_orientation_does_not_change_the_views(
     tmp_path_factory, orientations, wide, high, seed
 ):
     folder = tmp_path_factory.mktemp("turned")

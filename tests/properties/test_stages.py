@@ -1,4 +1,4 @@
-"""Invariances of single stages, on many random inputs."""
+"""Invariances of single stages on random inputs."""
 
 import torch
 import trimesh
@@ -21,7 +21,7 @@ def drawn(seed: int, *shape: int) -> torch.Tensor:
 
 @settings(max_examples=50, deadline=None)
 @given(seed=SEEDS, gain=st.floats(1e-6, 1e6), size=st.integers(20, 9000))
-def test_a_robust_variance_follows_the_scale_and_no_order(seed, gain, size):
+def test_a_robust_variance_scales_with_data_and_ignores_their_order(seed, gain, size):
     square = drawn(seed, size).square()
     seen = torch.ones(size, dtype=torch.bool)
     usual = robust_variance(square, seen)
@@ -32,7 +32,7 @@ def test_a_robust_variance_follows_the_scale_and_no_order(seed, gain, size):
 
 @settings(max_examples=40, deadline=None)
 @given(seed=SEEDS, missing=st.floats(0.0, 0.7))
-def test_whatever_is_missing_of_a_ball_is_closed(seed, missing):
+def test_any_missing_faces_of_a_ball_are_closed(seed, missing):
     vertices, faces = icosphere(2)
     chosen = torch.rand(len(faces), generator=torch.Generator().manual_seed(seed)) >= missing
     mesh = Mesh(vertices_world=vertices.double(), faces=faces[chosen])
@@ -47,7 +47,7 @@ def test_whatever_is_missing_of_a_ball_is_closed(seed, missing):
 
 @settings(max_examples=20, deadline=None)
 @given(seed=SEEDS, power=st.integers(-20, 20))
-def test_a_mesh_of_another_unit_is_simplified_to_the_same_faces(seed, power):
+def test_simplification_does_not_depend_on_the_unit(seed, power):
     vertices, faces = icosphere(4)
     bumps = 1 + 0.05 * torch.cos(drawn(seed, 3) * 4 * vertices.double()).sum(dim=1, keepdim=True)
     mesh = Mesh(vertices_world=vertices.double() * bumps, faces=faces)

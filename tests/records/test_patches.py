@@ -1,4 +1,4 @@
-"""Records of patches that are made by hand."""
+"""Records of patches made from tensors."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from pimper_torch.records import PatchStatus
 
 
 def taken_apart(found):
-    """The normals, albedo, lights and information of photometry, a bucket each."""
+    """Return normals, albedo, lights and information of photometry per bucket."""
     names = {"normals": "normals_patch", "lights": "lights_patch"}
     return {
         name: [getattr(bucket, names.get(name, name)) for bucket in found.buckets]
@@ -18,7 +18,7 @@ def taken_apart(found):
     }
 
 
-def test_photometry_put_together_from_its_parts_is_the_whole(lift):
+def test_photometry_is_reassembled_from_its_parts(lift):
     true = lift(0.0).photometric
     found = pt.PhotometricPatches.of(true.patches, **taken_apart(true))
     for made, own in zip(found.buckets, true.buckets, strict=True):
@@ -29,7 +29,7 @@ def test_photometry_put_together_from_its_parts_is_the_whole(lift):
         assert bool(made.convergence.converged.all())
 
 
-def test_lights_of_the_world_are_turned_to_every_patch_and_residuals_are_those_of_the_views(lift):
+def test_world_lights_are_rotated_to_patches_and_residuals_are_of_the_views(lift):
     plane = lift(0.0)
     true = plane.photometric
     parts = taken_apart(true)
@@ -40,7 +40,7 @@ def test_lights_of_the_world_are_turned_to_every_patch_and_residuals_are_those_o
         assert_close(made.lights_patch, own.lights_patch)
         assert made.albedo.unique().tolist() == [1]
         assert made.convergence.residual.unique().tolist() == [0]
-    # What the views show under these lights is albedo by the median of their quotients.
+    # Albedo is the median quotient of radiance and shading under these lights.
     albedo = []
     for views, made in zip(plane.seen.buckets, bare.buckets, strict=True):
         quotient = torch.where(views.valid[:, :, None], views.radiance / made.predicted, torch.nan)
@@ -58,7 +58,7 @@ def test_lights_of_the_world_are_turned_to_every_patch_and_residuals_are_those_o
     assert_close(half.buckets[0].convergence.residual.mean(), level.double() / 2, rtol=0.1, atol=0)
 
 
-def test_samples_without_a_normal_are_not_valid_and_a_patch_of_them_is_unseen(lift):
+def test_samples_without_a_normal_are_invalid_and_their_patch_is_unobserved(lift):
     true = lift(0.0).photometric
     parts = taken_apart(true)
     normals = [3 * values.clone() for values in parts["normals"]]  # of any length
@@ -75,7 +75,7 @@ def test_samples_without_a_normal_are_not_valid_and_a_patch_of_them_is_unseen(li
     assert not bool(turned.buckets[0].valid.any())
 
 
-def test_what_does_not_belong_to_the_patches_is_refused(lift):
+def test_values_that_do_not_match_the_patches_are_refused(lift):
     true = lift(0.0).photometric
     parts = taken_apart(true)
     with pytest.raises(
@@ -90,7 +90,7 @@ def test_what_does_not_belong_to_the_patches_is_refused(lift):
         pt.PhotometricPatches.of(true.patches, **{**parts, "albedo": nowhere})
 
 
-def test_printed_a_result_is_a_few_lines(reconstruction):
+def test_the_repr_of_a_result_has_a_few_lines(reconstruction):
     shown = str(reconstruction)
     assert len(shown) < 600
     assert len(shown.splitlines()) == 13

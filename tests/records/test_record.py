@@ -35,11 +35,11 @@ def views_of(num_views, height=4, width=6):
 
 @pytest.mark.parametrize("device", [None, "cpu", "meta"])
 @pytest.mark.parametrize("dtype", [None, torch.float64])
-def test_moving_a_record_moves_every_tensor_down_to_the_last(cameras, device, dtype):
+def test_moving_a_record_moves_all_nested_tensors(cameras, device, dtype):
     many = (torch.zeros(2), torch.ones(3) > 0, torch.arange(4))
     box = Box(inside=cameras.to(torch.float32), many=many, label="box")
     moved = box.to(device or dtype or "cpu", dtype if device else None)
-    kind = dtype or torch.float32  # of floating-point tensors alone
+    kind = dtype or torch.float32  # only of floating-point tensors
     assert moved.inside.intrinsics.dtype == kind
     assert moved.inside.sizes_px.dtype == torch.int64
     assert [tensor.dtype for tensor in moved.many] == [kind, torch.bool, torch.int64]
@@ -49,7 +49,7 @@ def test_moving_a_record_moves_every_tensor_down_to_the_last(cameras, device, dt
     assert box.inside.intrinsics.device.type == "cpu"
 
 
-def test_replace_changes_a_copy_alone(cameras):
+def test_replace_changes_only_a_copy(cameras):
     farther = cameras.replace(sizes_px=cameras.sizes_px * 2)
     assert farther.sizes_px[0].tolist() == [12, 8]
     assert cameras.sizes_px[0].tolist() == [6, 4]
@@ -78,14 +78,14 @@ def test_tensors_of_the_wrong_shape_or_kind_are_refused(cameras):
     with pytest.raises(InputError, match=r"Cameras.cam_from_world is float64\[1, 4, 4\]; needed: "):
         cameras.replace(cam_from_world=cameras.cam_from_world[:1])  # one camera, two intrinsics
     with pytest.raises(InputError, match=r"sizes_px is float64\[2, 2\]; needed: Int of shape"):
-        cameras.replace(sizes_px=cameras.sizes_px.double())  # sizes are whole
+        cameras.replace(sizes_px=cameras.sizes_px.double())  # sizes are integers
     with pytest.raises(InputError, match=r"shape \(view channel height width\)"):
         views_of(2).replace(images=torch.zeros(3, 3))
     with pytest.raises(InputError, match=r"masks is 3; needed: Bool .* or None, next to images"):
         views_of(2).replace(masks=3)
 
 
-def test_a_part_that_is_taken_and_put_together_again_is_the_whole(cameras):
+def test_take_and_concatenate_are_inverse(cameras):
     views = views_of(3).replace(images=torch.arange(3.0)[:, None, None, None].expand(3, 3, 4, 6))
     some = views.take([2, 0])
     assert some.names == ("2.png", "0.png")
@@ -103,7 +103,7 @@ def test_a_part_that_is_taken_and_put_together_again_is_the_whole(cameras):
         Views.cat([views, views.replace(masks=torch.ones(3, 4, 6, dtype=torch.bool))])
 
 
-def test_records_inside_are_taken_along():
+def test_take_applies_to_nested_records():
     convergence = Convergence(
         iterations=torch.arange(3), residual=torch.zeros(3), cause=torch.zeros(3).long()
     )
@@ -125,17 +125,17 @@ def test_a_record_is_a_pytree(cameras):
     assert [leaf.shape for leaf in leaves] == [(2, 3, 3), (2, 4, 4), (2, 2)]
     again = pytree.tree_unflatten(leaves, spec)
     assert torch.equal(again.intrinsics, cameras.intrinsics)
-    axes = pytree.tree_map(lambda _: 0, cameras)  # any leaves, as for vmap's `in_dims`
+    axes = pytree.tree_map(lambda _: 0, cameras)  # leaves of any type, as for vmap's `in_dims`
     far = torch.func.vmap(lambda one: one.cam_from_world[:3, 3].norm(), in_dims=(axes,))(cameras)
     assert far.shape == (2,)
 
 
-def test_detached_records_are_cut_off(cameras):
+def test_detached_records_have_no_graph(cameras):
     moved = cameras.replace(intrinsics=cameras.intrinsics.requires_grad_())
     assert not moved.detach().intrinsics.requires_grad
 
 
-def test_camera_centres_are_transferred_to_the_origin_of_their_camera(cameras):
+def test_camera_centres_map_to_the_origin_of_their_camera(cameras):
     homogeneous = torch.cat([cameras.centers_world, torch.ones(2, 1).double()], dim=1)
     in_cam = torch.einsum("vij,vj->vi", cameras.cam_from_world, homogeneous)
     torch.testing.assert_close(in_cam[:, :3], torch.zeros(2, 3).double())
@@ -147,7 +147,7 @@ def test_padding_is_outside_the_photographs():
     assert views.inside[1].nonzero().tolist() == [[r, c] for r in range(2) for c in range(3)]
 
 
-def test_the_table_of_observations_says_which_view_saw_which_point(cameras):
+def test_the_table_of_observations_has_view_and_point_pairs(cameras):
     scene = SparseScene(
         views=views_of(2),
         cameras=cameras,
@@ -161,7 +161,7 @@ def test_the_table_of_observations_says_which_view_saw_which_point(cameras):
     assert scene.observed.tolist() == [[False, True], [False, False], [True, True]]
 
 
-def test_template_samples_lie_right_and_down_from_the_first_and_deep_along_z():
+def test_template_samples_follow_x_right_y_down_z_inward():
     templates = Templates(
         facet=torch.tensor([0]),
         patch_from_world=torch.eye(4)[None],

@@ -1,4 +1,4 @@
-"""Records in files: what is saved comes back bit for bit, and what a stranger wrote is refused."""
+"""Records in files: round trips are exact bit for bit, and untrusted files are refused."""
 
 import dataclasses
 import json
@@ -19,14 +19,14 @@ from pimper_torch.records import Record, stored
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.runtime.errors import InputError, OutputError
 
-# Lengths of the axes that several fields share; they differ, so that no axis passes for another.
+# Lengths of axes shared by fields; all different, so that exchanged axes are detected.
 AXES = {"patch": 2, "view": 3, "height": 4, "width": 5, "channel": 1, "vertex": 6, "face": 7}
 BITS = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Odds(Record):
-    """What no record of the package has all of."""
+    """All types of fields in one record."""
 
     many: tuple[Tensor | None, ...]
     pair: tuple[int, float]
@@ -42,7 +42,7 @@ def every_record():
 
 
 def example(hint, generator, full=True):
-    """Make a value of an annotation: random tensors, records of all their fields."""
+    """Make a value for an annotation: random tensors, records with all fields."""
     choices = [one for one in typing.get_args(hint) if one is not type(None)]
     if typing.get_origin(hint) in (tuple, dict):
         if typing.get_origin(hint) is dict:
@@ -76,7 +76,7 @@ def example(hint, generator, full=True):
 
 
 def assert_same(found, wanted):
-    """Compare down to types and bits."""
+    """Compare types and bits recursively."""
     assert type(found) is type(wanted)
     if isinstance(wanted, Record):
         for field in dataclasses.fields(wanted):
@@ -117,13 +117,13 @@ def path(tmp_path):
 
 @pytest.mark.parametrize("full", [True, False])
 @pytest.mark.parametrize("cls", [*every_record(), Step])
-def test_every_record_comes_back_bit_for_bit(cls, full, generator, tmp_path):
+def test_every_record_survives_a_round_trip_bit_for_bit(cls, full, generator, tmp_path):
     record = example(cls, generator, full)
     pt.save_record(record, str(tmp_path / "new" / "one.safetensors"))
     assert_same(pt.load_record(cls, tmp_path / "new" / "one.safetensors"), record)
 
 
-def test_whatever_a_field_may_hold_comes_back_bit_for_bit(odds, path):
+def test_every_type_of_field_survives_a_round_trip_bit_for_bit(odds, path):
     kinds = [torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64]
     kinds += [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.complex64]
     values = torch.tensor([0.0, 1.0, 2.0])
@@ -133,14 +133,14 @@ def test_whatever_a_field_may_hold_comes_back_bit_for_bit(odds, path):
     assert_same(load_record(Odds, path), odds)
 
 
-def test_a_tensor_that_is_shared_is_stored_once_and_shared_again(odds, path):
+def test_a_shared_tensor_is_stored_once_and_stays_shared(odds, path):
     save_record(odds, path)
     assert set(load_file(path)) == {f"many[{index}]" for index in (0, 3, 4, 5, 6)}
     found = load_record(Odds, path)
     assert found.many[0] is found.many[2]
 
 
-def test_tensors_that_overlap_in_memory_come_back_bit_for_bit(odds, path, generator):
+def test_overlapping_tensors_survive_a_round_trip_bit_for_bit(odds, path, generator):
     memory = torch.rand(300, generator=generator)
     firsts = torch.randint(0, 280, (60,), generator=generator).tolist()
     lengths = torch.randint(0, 20, (60,), generator=generator).tolist()
@@ -151,7 +151,7 @@ def test_tensors_that_overlap_in_memory_come_back_bit_for_bit(odds, path, genera
         assert_same(found, wanted)
 
 
-def test_a_file_is_mapped_and_writing_into_a_tensor_leaves_it_alone(odds, path):
+def test_a_file_is_mapped_and_writes_to_tensors_do_not_change_it(odds, path):
     save_record(odds, path)
     before = path.read_bytes()
     found = load_record(Odds, path)
@@ -161,7 +161,7 @@ def test_a_file_is_mapped_and_writing_into_a_tensor_leaves_it_alone(odds, path):
     assert_same(load_record(Odds, path), odds)
 
 
-def test_a_record_on_a_graph_is_saved_without_it(odds, path):
+def test_a_record_with_gradients_is_saved_without_its_graph(odds, path):
     leaf = torch.ones(2, requires_grad=True)
     save_record(odds.replace(many=(2 * leaf,)), path)
     found = load_record(Odds, path).many[0]
@@ -182,13 +182,13 @@ def test_a_record_on_a_graph_is_saved_without_it(odds, path):
         (torch.zeros(2, device="meta"), "needed: .* dense tensors with values"),
     ],
 )
-def test_what_a_file_cannot_hold_is_refused(odds, path, value, message):
+def test_values_that_cannot_be_stored_are_refused(odds, path, value, message):
     with pytest.raises(InputError, match=message):
         save_record(odds.replace(many=(value,)), path)
     assert not path.exists()
 
 
-def test_a_save_that_fails_leaves_the_former_file_and_nothing_else(odds, path, monkeypatch):
+def test_a_failed_save_leaves_only_the_former_file(odds, path, monkeypatch):
     save_record(odds, path)
     before = path.read_bytes()
 
@@ -203,19 +203,19 @@ def test_a_save_that_fails_leaves_the_former_file_and_nothing_else(odds, path, m
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
     mapped = load_record(Odds, path)
-    save_record(odds.replace(many=()), path)  # a reader of the former file keeps it
+    save_record(odds.replace(many=()), path)  # readers of the former file keep it
     assert_same(mapped, odds)
     assert load_record(Odds, path).many == ()
     with pytest.raises(OutputError, match=r"odds.safetensors.one: writing failed"):
         save_record(odds, path / "one")
 
 
-def test_files_that_are_no_whole_record_are_refused(odds, path, tmp_path):
+def test_incomplete_or_foreign_files_are_refused(odds, path, tmp_path):
     with pytest.raises(InputError, match="is not a file; needed: a file that `save_record` wrote"):
         load_record(Odds, tmp_path)
     save_record(odds, path)
     whole = path.read_bytes()
-    claimed = (2**60).to_bytes(8, "little") + whole[8:]  # a header longer than any memory
+    claimed = (2**60).to_bytes(8, "little") + whole[8:]  # a header larger than memory
     shape = whole.replace(b'"shape":[3,4]', b'"shape":[9,4]')
     for damaged in (b"", whole[:4], whole[:200], whole[:-1], whole + b"x", claimed, shape):
         assert damaged != whole
@@ -232,7 +232,7 @@ def test_files_that_are_no_whole_record_are_refused(odds, path, tmp_path):
         load_record(Odds, path)
 
 
-def test_another_record_than_the_one_asked_for_is_refused(odds, path):
+def test_a_record_of_a_different_class_is_refused(odds, path):
     save_record(odds, path)
     with pytest.raises(InputError, match=r'Mesh is {"record": "Odds", .*; needed: Mesh\.'):
         load_record(pt.Mesh, path)
@@ -257,7 +257,7 @@ def test_another_record_than_the_one_asked_for_is_refused(odds, path):
     ],
     ids=lambda one: str(one)[:40],
 )
-def test_a_strangers_structure_is_refused_where_it_is_wrong(odds, path, changes, message):
+def test_an_untrusted_structure_is_refused_at_its_error(odds, path, changes, message):
     save_record(odds, path)
 
     def forged(structure):
@@ -280,7 +280,7 @@ def test_a_tensor_of_the_wrong_shape_is_refused_by_file_and_field(path, generato
 
 
 def forge(path, change, **others):
-    """Write a file anew with another structure, or other tensors."""
+    """Rewrite a file with a changed structure or other tensors."""
     with safe_open(path, framework="pt") as file:
         structure = json.loads(file.metadata()[stored._KEY])
     tensors = {name: one.clone() for name, one in load_file(path).items()}

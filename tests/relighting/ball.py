@@ -17,7 +17,7 @@ SIDE = 80
 
 
 def ring(views):
-    """Cameras round the ball, on its equator."""
+    """Cameras around the ball, on its equator."""
     angle = torch.arange(views, dtype=torch.float64) * (2 * torch.pi / views)
     eyes = 4 * torch.stack([angle.cos(), angle.sin(), 0.2 * torch.ones_like(angle)], dim=1)
     pose = look_at(eyes, torch.zeros(3).double(), torch.tensor([0.0, 0, 1]).double())
@@ -25,7 +25,7 @@ def ring(views):
 
 
 def lights_beside(cameras):
-    """Tinted lights, each some 40 degrees from its camera, at another side of it."""
+    """Tinted lights, each about 40 degrees from its camera, on varying sides."""
     eyes = normalize(cameras.centers_world.double(), dim=1)
     aside = normalize(even_directions(len(eyes)), dim=1)
     tint = torch.tensor([0.9, 0.8, 0.6]).double()
@@ -39,13 +39,13 @@ def lights_beside(cameras):
 
 
 def colours(points):
-    """Base colour on the ball: a good part at 0.9, where base colours are scaled to."""
+    """Base colour on the ball: a large part is 0.9, the value to which it is scaled."""
     waves = 0.5 + 0.5 * torch.sin(points @ points.new_tensor([[5.0, 2, 1], [1, 6, 2], [3, 1, 4]]))
     return (0.15 + 0.9 * waves).clamp(max=0.9)
 
 
 def ball_mesh(albedo=colours):
-    """The ball; its albedo is up to a scale, as that of a result."""
+    """The ball as a mesh; its albedo is known up to a scale, as in a result."""
     vertices, faces = icosphere(5)
     return Mesh(
         vertices_world=vertices.float(),
@@ -56,7 +56,7 @@ def ball_mesh(albedo=colours):
 
 
 def textbook(normal, to_light, to_eye, base, material):
-    """Radiance under a light of strength 1, as in glTF's specification, appendix B."""
+    """Compute radiance under a light of strength 1 by glTF's specification, appendix B."""
     metallic, roughness, specular = material
     half = normalize(to_light + to_eye, dim=-1)
 
@@ -79,7 +79,7 @@ def textbook(normal, to_light, to_eye, base, material):
 
 @cache
 def photographed(material, views=6, albedo=colours):
-    """Photographs of a ball of one material, as a scene, and their lights."""
+    """Return photographs of a ball of one material as a scene, and their lights."""
     cameras = ring(views)
     lights = lights_beside(cameras)
     pixels = pixel_centers(SIDE, SIDE, like=torch.zeros(1).double()).reshape(-1, 2)

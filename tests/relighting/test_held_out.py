@@ -20,7 +20,7 @@ def scene():
     return photographed(GLOSSY, views=6)[0]
 
 
-def test_every_nth_photograph_by_name_is_held_out_but_for_what_is_needed(scene):
+def test_every_nth_photograph_is_held_out_unless_it_is_needed(scene):
     used, held = split_held_out(scene, 3)
     assert held.views.names == ("002", "005")
     assert used.views.names == ("000", "001", "003", "004")
@@ -53,7 +53,7 @@ def test_held_out_photographs_are_predicted_better_with_their_highlights(scene):
     assert abs(material["roughness"] - GLOSSY[1]) < 0.1
 
 
-def test_without_held_out_photographs_those_used_are_predicted():
+def test_without_held_out_photographs_the_used_ones_are_predicted():
     scene = photographed((0.0, 1.0, 0.0), views=3)[0]
     found = Relight()(ball_mesh(), scene, Silhouettes.everything(scene.views))
     report = relighting_report(found)
@@ -62,7 +62,7 @@ def test_without_held_out_photographs_those_used_are_predicted():
     assert len(report["views"]) == 3
 
 
-def test_what_no_photograph_shows_has_no_figure():
+def test_unobserved_surface_has_no_figure():
     scene = photographed((0.0, 1.0, 0.0), views=3)[0]
     nothing = Silhouettes.everything(scene.views).replace(
         inside=torch.zeros_like(scene.views.images[:, 0])
@@ -72,7 +72,7 @@ def test_what_no_photograph_shows_has_no_figure():
     assert not math.isnan(report["materials"][0]["roughness"])
 
 
-def test_textures_come_nearer_to_photographs_than_vertices_of_few_faces(scene):
+def test_textures_predict_photographs_better_than_vertices_of_few_faces(scene):
     full = ball_mesh()
     few = reduced(full, 1200)
     found = Relight()(few, scene, None)
@@ -80,6 +80,6 @@ def test_textures_come_nearer_to_photographs_than_vertices_of_few_faces(scene):
     errors = judge_textures(found, asset, scene, None)
     coarse, fine = found.errors.psnr_db.mean(), errors.textured.psnr_db.mean()
     assert fine > coarse + 1
-    assert fine > 45  # eight bits a texel
+    assert fine > 45  # eight bits per texel
     assert relighting_report(errors)["psnr_textured_db"] == pytest.approx(float(fine), abs=1e-3)
     assert relighting_report(found)["psnr_textured_db"] is None

@@ -30,7 +30,7 @@ def ball():
     return ball_mesh()
 
 
-def test_the_light_of_a_matte_ball_is_found(ball):
+def test_the_light_of_a_matte_ball_is_estimated(ball):
     scene, lights = photographed(MATTE)
     found = fit_lights(ball, scene)
     assert angles_deg(found.direction_world, lights.direction_world).max() < 0.5
@@ -84,7 +84,7 @@ def light():
     )
 
 
-def test_a_shadow_is_cast_where_geometry_has_it(ball_over_table, camera, light):
+def test_cast_shadows_follow_the_geometry(ball_over_table, camera, light):
     surface, direction = LitSurface(ball_over_table), light.direction_world
     picture = predict(surface, camera, light)
     pixels = surface.pixels(camera)
@@ -99,11 +99,11 @@ def test_a_shadow_is_cast_where_geometry_has_it(ball_over_table, camera, light):
     assert (apart < 0.48).sum() > 100
 
 
-def test_cast_shadows_tell_a_light_that_shading_leaves_open(ball_over_table, camera, light):
-    """A plane alone is lit alike by all lights round its normal."""
+def test_cast_shadows_determine_a_light_that_shading_does_not(ball_over_table, camera, light):
+    """All lights at one angle to its normal light a plane equally."""
     picture = predict(ball_over_table, camera, light).nan_to_num(0)
     scene = scene_of(picture.movedim(-1, 0)[None], camera.intrinsics, camera.cam_from_world)
     found = fit_lights(ball_over_table, scene)
-    # A pixel of the table is 0.036 wide or more, and the ball's centre 1.4 from its shadow.
+    # A pixel is at least 0.036 wide on the table, and the ball's centre 1.4 from its shadow.
     half_a_pixel_deg = math.degrees(0.018 / 1.4)
     assert angles_deg(found.direction_world, light.direction_world).max() < half_a_pixel_deg

@@ -12,7 +12,7 @@ MATTE = (0.0, 1.0, 0.0)
 
 
 def relit(material, views=6, albedo=colours):
-    """Lights and materials of a ball, in two turns."""
+    """Estimate lights and materials of a ball in two alternations."""
     scene, lights = photographed(material, views, albedo)
     surface = LitSurface(ball_mesh(albedo))
     observed = observe_all(surface, scene, None)
@@ -23,7 +23,7 @@ def relit(material, views=6, albedo=colours):
 
 
 @pytest.mark.parametrize("material", [(0.0, 0.3, 1.0), (0.0, 0.5, 2.0)])
-def test_a_glossy_ball_has_its_roughness_and_light(material):
+def test_the_roughness_and_light_of_a_glossy_ball_are_estimated(material):
     surface, observed, materials, matte, found, lights = relit(material)
     assert len(materials.roughness) == 1
     assert float(materials.metallic) == 0
@@ -61,7 +61,7 @@ def test_materials_and_lights_have_the_same_bits_on_any_number_of_threads():
             assert torch.equal(lights.directed, own.directed)
 
 
-def test_radiance_is_that_of_the_specification():
+def test_radiance_agrees_with_the_gltf_specification():
     scene, lights = photographed((0.0, 0.4, 1.5), views=3)
     surface = LitSurface(ball_mesh())
     pixels = surface.pixels(scene.cameras.take([0]))
@@ -87,7 +87,7 @@ def test_colours_of_two_paints_are_two_clusters():
     assert torch.equal(found == found[0], paint)
 
 
-def test_a_surface_of_fewer_colours_than_clusters_is_divided_by_these():
+def test_a_surface_with_few_colours_has_one_cluster_per_colour():
     colours = torch.tensor([[0.2, 0.2, 0.2], [0.8, 0.1, 0.1]]).repeat(50, 1)
     assert len(clusters(colours[::2], 2).unique()) == 1
     assert len(clusters(colours, 3).unique()) == 2

@@ -1,4 +1,4 @@
-"""The page in a browser: what it draws, under which light, and what it asks for."""
+"""The page in a browser: what it draws, under which light, and what it fetches."""
 
 import base64
 import re
@@ -88,7 +88,7 @@ def shown(tmp_path_factory):
     )
     folder = tmp_path_factory.mktemp("page")
     asset = textured(mesh, mesh, materials.at_vertices())
-    # The page undoes what the file does: it is upright, and its longest side is 1.
+    # The page reverts the file's transform: upright, with longest side 1.
     placed = standing(asset.mesh, scene.cameras, 1, torch.tensor([0.0, 0.0, 1.0]), None)
     write_asset(asset, folder / "asset.glb", Placement(name="ball", scene_from_asset=placed))
     views = scene.views.num_views
@@ -132,7 +132,7 @@ def browser():
 
 @pytest.fixture
 def opened(browser, shown):
-    """Open the page in a window; whatever goes wrong in it, or is fetched, is noted."""
+    """Open the page in a window; record its errors and requests."""
     context = browser.new_context(viewport={"width": 1200, "height": 800})
     page = context.new_page()
     page.faults, page.asked = [], []
@@ -158,7 +158,7 @@ def choose(page, layer):
 
 
 def canvas(page):
-    """The canvas as it is seen, without what lies over it, once nothing is left to draw."""
+    """Return the canvas without its overlays, once drawing is finished."""
     page.add_style_tag(content="#lamp, #legend { opacity: 0; }")
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => setTimeout(done, 60)))")
     return pixels(page.locator("#stage").screenshot())
@@ -173,7 +173,7 @@ def behind(page, view):
 
 
 def photograph_of(picture):
-    """The middle square of the canvas, as large as the photographs."""
+    """Return the middle square of the canvas, at the size of the photographs."""
     height, width = picture.shape[:2]
     side = min(height, width)
     top, left = (height - side) // 2, (width - side) // 2
@@ -182,13 +182,13 @@ def photograph_of(picture):
 
 
 def inner(scene, mesh, view):
-    """Pixels of the ball, but for those at its border."""
+    """Return the pixels of the ball, except at its border."""
     seen = view_maps(mesh, scene.cameras, view).seen
     return (-torch.nn.functional.max_pool2d(-seen[None].float(), 5, 1, 2)[0] > 0).numpy()
 
 
 @pytest.mark.parametrize("view", [0, 2])
-def test_albedo_is_drawn_where_our_own_renderer_sees_it(opened, shown, view):
+def test_albedo_is_drawn_as_by_our_renderer(opened, shown, view):
     _, mesh, scene, _, _ = shown
     choose(opened, "albedo")
     behind(opened, view)
@@ -197,10 +197,10 @@ def test_albedo_is_drawn_where_our_own_renderer_sees_it(opened, shown, view):
     wanted = srgb_from_linear(view_maps(colored, scene.cameras, view).albedo).numpy() * 255
     inside = inner(scene, mesh, view)
     assert np.abs(drawn - wanted)[inside].mean() < 3
-    assert np.abs(drawn - wanted)[inside].max() < 40  # somewhere between texels
+    assert np.abs(drawn - wanted)[inside].max() < 40  # interpolation between texels
 
 
-def test_normals_have_the_colours_of_our_pictures(opened, shown):
+def test_normals_have_the_colours_of_our_images(opened, shown):
     _, mesh, scene, _, _ = shown
     choose(opened, "normals")
     behind(opened, 1)
@@ -210,8 +210,8 @@ def test_normals_have_the_colours_of_our_pictures(opened, shown):
     assert np.abs(drawn - 0.5 - 0.5 * normals)[inside].mean() < 0.01
 
 
-def test_a_photograph_is_drawn_as_its_fitted_light_makes_it(opened, shown):
-    """The renderer of the page and ours have one model of reflectance and one of light."""
+def test_a_photograph_is_rendered_under_its_fitted_light(opened, shown):
+    """The page's renderer and ours share the reflectance and light models."""
     _, mesh, scene, lights, materials = shown
     choose(opened, "lit")
     behind(opened, 3)
@@ -224,7 +224,7 @@ def test_a_photograph_is_drawn_as_its_fitted_light_makes_it(opened, shown):
     own = encoded(predict(mesh, scene.cameras.take([3]), lights.take([3]), materials))
     taken = encoded(scene.views.images[3].movedim(0, -1))
     dull = encoded(predict(mesh, scene.cameras.take([3]), lights.take([3])))
-    # The page's renderer takes from ambient light what the surface mirrors of it: 2 levels.
+    # The page's renderer subtracts mirrored ambient light from the diffuse part: 2 levels.
     assert np.abs(drawn - own)[inside].mean() < 3.5
     assert np.abs(drawn - taken)[inside].mean() < 4
     bright = inside & (taken.mean(axis=-1) > dull.mean(axis=-1) + 15)  # the highlight
@@ -246,7 +246,7 @@ def test_the_light_follows_the_pointer(opened):
     assert across[1] > across[0] + 20
 
 
-def test_the_surface_turns_under_the_pointer(opened):
+def test_the_surface_rotates_with_the_pointer(opened):
     choose(opened, "albedo")
     before, stage = canvas(opened), opened.locator("#canvas").bounding_box()
     x, y = stage["x"] + stage["width"] / 2, stage["y"] + stage["height"] / 2
@@ -258,7 +258,7 @@ def test_the_surface_turns_under_the_pointer(opened):
         opened.mouse.move(x + 6 * step, y + step)
     opened.mouse.up()
     rate = (opened.evaluate(count) - frames) / (time.perf_counter() - began)
-    print(f"turns at {rate:.0f} frames a second, drawn by software")  # noqa: T201 - a figure to read
+    print(f"turns at {rate:.0f} frames a second, drawn by software")  # noqa: T201 - a figure for the reader
     assert rate > 1
     assert np.abs(canvas(opened) - before).mean() > 2
 
@@ -271,7 +271,7 @@ def test_layers_of_numbers_have_a_legend(opened):
     assert (high - low).max() > 100
 
 
-def test_a_click_on_a_camera_stands_behind_it(opened, shown):
+def test_a_click_on_a_camera_moves_the_viewpoint_there(opened, shown):
     scene = shown[2]
     opened.get_by_label("cameras").check()
     canvas(opened)
@@ -296,7 +296,7 @@ def test_the_photograph_fades_in_over_the_surface(opened, shown):
 
 
 def pressed(page):
-    """Names of the photographs that are chosen."""
+    """Return the names of the selected photographs."""
     return page.locator("#thumbnails button[aria-pressed=true] span").all_inner_texts()
 
 
@@ -312,18 +312,18 @@ def test_keys_and_buttons_step_through_photographs(opened, shown):
     assert pressed(opened) == [names[5]]
     opened.get_by_role("button", name="next photograph").click()
     assert pressed(opened) == [names[0]]
-    for control in ("#lamp", "#ambient"):  # have arrow keys of their own
+    for control in ("#lamp", "#ambient"):  # these use arrow keys themselves
         opened.locator(control).focus()
         press("ArrowRight")
         assert pressed(opened) == [names[0]]
-    press("Alt+ArrowRight")  # the browser's
+    press("Alt+ArrowRight")  # a shortcut of the browser
     assert pressed(opened) == [names[0]]
     opened.locator("#thumbnails button").first.focus()
     press("ArrowRight")
     assert opened.evaluate("document.activeElement.innerText") == names[1]
 
 
-def test_the_ring_of_the_focus_is_round_and_for_keys_alone(opened):
+def test_the_focus_ring_is_shown_only_for_keys(opened):
     outline = "getComputedStyle(document.getElementById('lamp')).outlineStyle"
     opened.locator("#lamp").click()
     assert opened.evaluate("document.activeElement.id") == "lamp"
@@ -336,13 +336,13 @@ def test_the_ring_of_the_focus_is_round_and_for_keys_alone(opened):
     assert opened.evaluate(radius) == "50%"
 
 
-def test_photograph_prediction_and_difference_are_in_one_row_with_a_word_on_decibels(opened):
+def test_photograph_prediction_and_difference_are_in_one_row_with_decibels(opened):
     behind(opened, 1)
     boxes = [one.bounding_box() for one in opened.locator("#figures figure").all()]
     assert len(boxes) == 3
     assert len({box["y"] for box in boxes}) == 1
     assert boxes[0]["x"] < boxes[1]["x"] < boxes[2]["x"]
-    assert boxes[0]["y"] + boxes[0]["height"] <= 800  # in sight with the surface
+    assert boxes[0]["y"] + boxes[0]["height"] <= 800  # visible together with the surface
     words = opened.locator("#worth").inner_text()
     assert words.startswith("31.0 dB (PSNR): the prediction is off by 7.2 of 255 (root")
     assert words.endswith("number 1 of 6.")
@@ -354,27 +354,27 @@ def linear(picture):
 
 
 def first_order(scene, mesh, view, even, along):
-    """The irradiance of a first-order light at the pixels of a view."""
+    """Return the irradiance of a first-order light at the pixels of a view."""
     normals_cam = view_maps(mesh, scene.cameras, view).normals_cam
     normals = normals_cam @ scene.cameras.cam_from_world[view, :3, :3]
     return (even + normals @ torch.tensor(along)).clamp_min(0).numpy()
 
 
-def test_the_shape_is_grey_under_a_sky_that_is_brighter_above(opened, shown):
+def test_the_shape_is_grey_under_a_sky_that_is_brighter_at_the_top(opened, shown):
     _, mesh, scene, _, _ = shown
     choose(opened, "shape")
     behind(opened, 1)
     opened.get_by_label("lamp").uncheck()
     inside = inner(scene, mesh, 1)
     drawn = linear(photograph_of(canvas(opened)))
-    up = [0.0, 0.0, 1.0]  # of the ring of cameras
+    up = [0.0, 0.0, 1.0]  # axis of the ring of cameras
     grey, ambient = linear(np.array(0xB8)), 0.3
     wanted = grey * ambient * first_order(scene, mesh, 1, 1.0, [0.6 * one for one in up])
     assert np.abs(drawn - wanted[..., None])[inside].mean() < 0.01
-    assert drawn[inside].max() > 2 * drawn[inside].min()  # no cut-out
+    assert drawn[inside].max() > 2 * drawn[inside].min()  # not a flat cut-out
 
 
-def test_hollows_of_the_shape_are_as_dark_as_they_see_little_sky(opened, shown, tmp_path):
+def test_ambient_occlusion_darkens_hollows(opened, shown, tmp_path):
     _, mesh, scene, _, _ = shown
     page = shown[0].read_text(encoding="utf-8")
     open_to = re.search(r'"openness": "([^"]*)"', page)[1]
@@ -391,7 +391,7 @@ def test_hollows_of_the_shape_are_as_dark_as_they_see_little_sky(opened, shown, 
     assert found[1] / found[0] == pytest.approx(128 / 255, abs=0.01)
 
 
-def test_the_shape_has_the_same_lamp_from_every_photograph(opened):
+def test_the_lamp_of_the_shape_is_the_same_for_every_photograph(opened):
     bulb = opened.locator("#lamp .bulb")
     places = []
     for layer in ("shape", "lit"):
@@ -410,21 +410,21 @@ def test_the_environment_is_the_first_order_light_of_the_photograph(opened, show
     opened.get_by_label("environment").check()
     assert not opened.get_by_label("lamp").is_checked()
     assert not opened.locator("#lamp").is_visible()
-    strength = LIGHT[0] + np.linalg.norm(LIGHT[1:])  # its brightest is 1
+    strength = LIGHT[0] + np.linalg.norm(LIGHT[1:])  # scaled to a maximum of 1
     shading = first_order(scene, mesh, 2, LIGHT[0], LIGHT[1:]) / strength
     colored = mesh.replace(albedo=base_color(mesh))
     wanted = view_maps(colored, scene.cameras, 2).albedo.numpy() * shading[..., None]
     inside = inner(scene, mesh, 2)
     own = linear(photograph_of(canvas(opened)))
-    # The page's renderer takes from light of all sides what the surface mirrors of it.
+    # The page's renderer subtracts mirrored ambient light from the diffuse part.
     assert np.abs(own - wanted)[inside].mean() < 0.02
-    behind(opened, 0)  # has none of its own: the mean
+    behind(opened, 0)  # has no light: the mean is used
     before = canvas(opened)
-    opened.get_by_label("lamp").check()  # beside it
+    opened.get_by_label("lamp").check()  # in addition
     assert (canvas(opened) - before).mean() > 2
 
 
-def test_two_clicks_measure_the_surface(opened, shown):
+def test_two_clicks_measure_a_distance(opened, shown):
     scene = shown[2]
     behind(opened, 0)
     choose(opened, "measure")
@@ -434,7 +434,7 @@ def test_two_clicks_measure_the_surface(opened, shown):
     side = min(stage["width"], stage["height"])
 
     def click(x, y):
-        """Click a place of the photograph, in pixels; return that of the ball."""
+        """Click a pixel of the photograph; return the point of the ball."""
         left = stage["x"] + (stage["width"] - side) / 2
         top = stage["y"] + (stage["height"] - side) / 2
         opened.mouse.click(left + x * side / SIDE, top + y * side / SIDE)
@@ -452,7 +452,7 @@ def test_two_clicks_measure_the_surface(opened, shown):
     second = click(52.0, 31.0)
     wanted = 100 * float((first - second).norm()) / (2 * 3**0.5)
     value, _, unit = told.inner_text().partition(" ")
-    assert float(value) == pytest.approx(wanted, rel=0.02)  # a click is a whole pixel
+    assert float(value) == pytest.approx(wanted, rel=0.02)  # clicks are integer pixels
     assert unit == "% of the object's size"
     assert len(pressed(opened)) == 1  # no camera was clicked
     click(30.0, 40.0)  # begins anew
@@ -462,13 +462,13 @@ def test_two_clicks_measure_the_surface(opened, shown):
 
 
 def ball_pixels(picture):
-    """Pixels of colour in the middle of the canvas."""
+    """Count the coloured pixels in the middle of the canvas."""
     height, width = picture.shape[:2]
     square = picture[height // 4 : -height // 4, (width - height // 2) // 2 :][:, : height // 2]
     return int((square.max(axis=-1) - square.min(axis=-1) > 30).sum())
 
 
-def test_cameras_leave_the_surface_a_third_of_the_picture(opened):
+def test_with_cameras_the_surface_fills_a_third_of_the_canvas(opened):
     choose(opened, "albedo")
     height = opened.locator("#stage").bounding_box()["height"]
     opened.get_by_label("cameras").check()
@@ -492,12 +492,12 @@ def test_the_viewer_fills_the_screen(opened):
 
 
 def cells(page, title):
-    """Rows of the table of a section, in texts."""
+    """Return the rows of a section's table as texts."""
     section = page.locator("#sections > *", has_text=title).first
     return [row.locator("td, th").all_text_contents() for row in section.locator("tr").all()]
 
 
-def test_head_and_tables_say_one_thing(opened):
+def test_headline_and_tables_agree(opened):
     assert opened.locator("#headline").inner_text() == (
         "6 of 7 photographs, 2,999 facets, 83,045 vertices in mesh.ply (560,140 before "
         "simplification), 150 s"
@@ -506,7 +506,7 @@ def test_head_and_tables_say_one_thing(opened):
     assert cells(opened, "Stages")[1:] == [
         ["warp", "8.0", "", "500", "samples 12,345"],
         ["fuse", "4.0", "", "900", ""],
-        ["sweep", "kept", "", "800", ""],  # it took its time elsewhere
+        ["sweep", "kept", "", "800", ""],  # its time belongs to a former run
     ]
     bars = opened.locator("td.bar i").evaluate_all("(all) => all.map((one) => one.style.width)")
     assert bars == ["100%", "50%", "0%"]
@@ -528,7 +528,7 @@ def test_head_and_tables_say_one_thing(opened):
     assert "roughness 0.35" in predicted.locator("p").text_content()
 
 
-def test_a_plain_result_has_no_section_without_a_message(opened, shown):
+def test_sections_without_content_are_omitted(opened, shown):
     opening(opened, shown[0].with_name("plain.html"))
     opened.asked[:] = opened.asked[:1]
     titles = opened.locator("#sections h2, #sections summary").all_inner_texts()
@@ -565,14 +565,14 @@ def test_the_page_is_usable_on_a_phone(phone):
     assert phone.evaluate("document.documentElement.scrollWidth") <= 390
 
 
-def test_the_surface_stays_in_sight_of_a_phone(phone):
+def test_the_surface_stays_visible_on_a_phone(phone):
     phone.locator("#thumbnails button").nth(1).evaluate("(one) => one.scrollIntoView()")
     phone.locator("#thumbnails button").nth(1).tap()
     assert phone.locator("#photo").is_visible()
     stage, row = (phone.locator(one).bounding_box() for one in ("#stage", "#figures"))
     assert stage["y"] >= 0
     assert 0.3 * 844 < stage["height"] < 0.5 * 844
-    assert row["y"] >= stage["y"] + stage["height"]  # seen with it, not under it
+    assert row["y"] >= stage["y"] + stage["height"]  # visible together with it
     assert row["y"] + row["height"] <= 844
 
 

@@ -68,7 +68,7 @@ def data_of(page):
     return json.loads(element(page, "data"))
 
 
-def test_a_page_holds_what_it_is_told_and_needs_nothing_else(reconstruction, tmp_path):
+def test_a_page_contains_its_data_and_fetches_no_other(reconstruction, tmp_path):
     layer = VertexLayer(attribute="_support", title="support", about="views", low=0, high=1,
                   low_text="none", high_text="full")  # fmt: skip
     page = written(reconstruction, tmp_path / "report.html", layers=[layer])
@@ -82,18 +82,18 @@ def test_a_page_holds_what_it_is_told_and_needs_nothing_else(reconstruction, tmp
         "fuse": {"terms": '["normals", "points"]', "max_hole": "Infinity"},
     }
     assert [view["name"] for view in data["views"]] == list(reconstruction.scene.views.names)
-    # Nothing is fetched: no address but data, and the browser is told to refuse others.
+    # The page fetches no file: all addresses are data, and its policy refuses others.
     template = page.replace(element(page, "data"), "")
     assert not re.search(r"<(?:script|link|img)[^>]+(?:src|href)=", template)
     assert "default-src 'none'" in page
-    assert "somebody" not in page  # nor does it say whose machine made it
+    assert "somebody" not in page  # nor does it contain the user's name
     assert not re.search(r"\{(?:page|three)\.(?:css|js)\}|\{data\}|\{asset\}", page)
 
 
 @pytest.mark.parametrize(
     "name", ["</script><script>alert(1)</script>", "<!--<script>", "a\u2028b\\n{data}", "{asset}"]
 )
-def test_names_of_files_cannot_leave_their_text(reconstruction, tmp_path, name):
+def test_file_names_are_escaped(reconstruction, tmp_path, name):
     plain = written(reconstruction, tmp_path / "plain.html")
     views = reconstruction.scene.views
     scene = reconstruction.scene.replace(views=views.replace(names=(name, *views.names[1:])))
@@ -103,7 +103,7 @@ def test_names_of_files_cannot_leave_their_text(reconstruction, tmp_path, name):
     assert page.count("</script") == plain.count("</script") == 4
 
 
-def test_pinholes_are_those_of_the_run(reconstruction):
+def test_pinholes_equal_those_of_the_run(reconstruction):
     scene = reconstruction.scene
     entries = view_entries(scene, reconstruction.silhouettes, [None] * 3)
     point = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
@@ -118,7 +118,7 @@ def test_pinholes_are_those_of_the_run(reconstruction):
         assert (entry["width"], entry["height"]) == tuple(scene.cameras.sizes_px[view].tolist())
 
 
-def test_a_prediction_comes_with_its_light(reconstruction):
+def test_a_prediction_has_its_light(reconstruction):
     light = ViewLights(
         direction_world=torch.tensor([[0.0, 0.6, 0.8]]),
         inverse_distance=torch.tensor([0.25]),
@@ -144,7 +144,7 @@ def test_a_prediction_comes_with_its_light(reconstruction):
     assert abs(picture.mean() - 255 * float(srgb_from_linear(torch.tensor(0.2)))) < 1.5
 
 
-def test_predictions_are_of_every_photograph(reconstruction):
+def test_every_photograph_has_a_prediction(reconstruction):
     scene, mesh = reconstruction.scene, reconstruction.mesh
     lights = ViewLights(
         direction_world=torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3),
@@ -175,7 +175,7 @@ def decoded(address):
     return np.asarray(Image.open(BytesIO(base64.b64decode(body))).convert("L")).astype(float)
 
 
-def test_pictures_shrink_by_averages_and_are_encoded_for_the_screen():
+def test_images_are_downscaled_by_averages_and_encoded_as_srgb():
     stripes = torch.tensor([0.0, 1.0]).repeat(100).expand(1, 100, 200)
     small = shrunk(stripes, 100)
     assert small.shape == (1, 50, 100)
@@ -184,14 +184,14 @@ def test_pictures_shrink_by_averages_and_are_encoded_for_the_screen():
     assert abs(decoded(jpeg(small)).mean() - 187.5) < 1.5
 
 
-def test_more_photographs_share_the_room():
+def test_more_photographs_have_smaller_images():
     assert longest_px(3) == longest_px(24) == 800
     area = [number * longest_px(number) ** 2 for number in (24, 66, 300)]
     assert max(area) < 1.01 * min(area)
     assert longest_px(10_000) == 120
 
 
-def test_an_outline_is_where_the_silhouette_ends():
+def test_an_outline_is_the_border_of_the_silhouette():
     y, x = torch.meshgrid(torch.arange(60) + 0.5, torch.arange(80) + 0.5, indexing="ij")
     away = torch.hypot(x - 40, y - 30)
     path = outline((20.5 - away).clamp(0, 1), scale=10.0)
@@ -207,11 +207,11 @@ def left_out(guard, count, total=100, *, what="points", names=()):
             "names": list(names)}  # fmt: skip
 
 
-def test_what_was_left_out_is_said_pass_by_pass_where_it_matters():
+def test_large_removals_are_listed_by_pass():
     entries = [
         left_out("sfm.missing", 1, what="photographs", names=["a.png"]),
-        left_out("coarse.hull", 5),  # a twentieth: hardly anything
-        left_out("warp", 99, what="pixels"),  # most views see most facets from behind
+        left_out("coarse.hull", 5),  # one twentieth: not listed
+        left_out("warp", 99, what="pixels"),  # most facets face away from most views
         left_out("fuse.albedo", 6),
         left_out("repair", 0),
         left_out("fuse.albedo", 7),
@@ -251,7 +251,7 @@ def test_lengths_are_in_the_known_unit_or_in_hundredths_of_the_diagonal():
         ([math.nan], 0.0),
     ],
 )
-def test_few_outliers_do_not_take_the_colours_of_all(values, high):
+def test_outliers_do_not_stretch_the_colour_scale(values, high):
     layer = length_layer("_a", "a", "", torch.tensor(values), length_unit(SQUARE, "mm"))
     assert layer.low == 0
     assert layer.high == high
@@ -264,15 +264,15 @@ SQUARE = Mesh(
 )
 
 
-def test_a_ball_sees_all_of_its_sky():
+def test_a_ball_has_no_ambient_occlusion():
     vertices, faces = icosphere(3)
     ball = Mesh(vertices_world=vertices, faces=faces, normals_world=vertices)
     assert_close(openness(ball), torch.ones(len(vertices)))
 
 
 @pytest.mark.parametrize("depth", [0.5, 1.0, 2.0])
-def test_the_floor_of_a_pit_sees_the_sky_above_its_rim(depth):
-    """The middle of the floor of a round pit has the irradiance r^2 / (r^2 + h^2) of the sky."""
+def test_the_floor_of_a_pit_is_lit_by_the_sky_above_its_rim(depth):
+    """The centre of a round pit's floor receives r^2 / (r^2 + h^2) of the sky's irradiance."""
     angle = torch.arange(180) * (2 * torch.pi / 180)
     ring = torch.stack([angle.cos(), angle.sin(), torch.zeros(180)], dim=1)
     middle = torch.tensor([[0.0, 0.0, 0.0]])
@@ -283,5 +283,5 @@ def test_the_floor_of_a_pit_sees_the_sky_above_its_rim(depth):
     other = torch.stack([1 + here, 181 + there, 181 + here], dim=1)
     upward = torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3)
     pit = Mesh(vertices_world=points, faces=torch.cat([floor, wall, other]), normals_world=upward)
-    # A ray is a fiftieth of what the middle sees.
+    # One ray is a fiftieth of the centre's irradiance.
     assert float(openness(pit)[0]) == pytest.approx(1 / (1 + depth**2), abs=0.04)

@@ -1,4 +1,4 @@
-"""Which code a record depends on."""
+"""The code on which a record depends."""
 
 import sys
 
@@ -6,7 +6,7 @@ import pytest
 
 from pimper_torch.runtime.store.digest import code, is_known
 
-# The package's name for the module is its function.
+# The package's attribute of this name is the function, not the module.
 module = sys.modules[code.__module__]
 
 
@@ -17,7 +17,7 @@ def forgotten():
     code.cache_clear()
 
 
-def test_every_source_file_and_its_name_and_versions_count(tmp_path, monkeypatch):
+def test_the_hash_covers_source_files_their_names_and_versions(tmp_path, monkeypatch):
     (tmp_path / "pimper_torch" / "inner").mkdir(parents=True)
     monkeypatch.setattr(module, "_PACKAGE", tmp_path / "pimper_torch")
     seen = {code()}
@@ -30,6 +30,6 @@ def test_every_source_file_and_its_name_and_versions_count(tmp_path, monkeypatch
     assert len(seen | {code()}) == 6
 
 
-def test_other_code_is_not_known():
+def test_code_outside_the_package_has_no_hash():
     assert is_known("pimper_torch.method.fusion.fuse")
     assert not any(map(is_known, ["torch.nn", "pimper_torch_extra.fuse", "__main__"]))

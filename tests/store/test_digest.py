@@ -1,4 +1,4 @@
-"""Hashes of values: equal where the bits are, and nowhere else."""
+"""Hashes of values are equal exactly if their bits are."""
 
 import sys
 from dataclasses import dataclass, replace
@@ -46,7 +46,7 @@ UNLIKE = [
 ]
 
 
-def test_unlike_values_have_unlike_hashes():
+def test_different_values_have_different_hashes():
     found = [digest(value) for value in UNLIKE]
     assert None not in found
     assert len(set(found)) == len(UNLIKE)
@@ -64,7 +64,7 @@ def test_equal_values_have_equal_hashes():
     assert digest(torch.view_as_complex(table[:, :2].contiguous()).conj()) is not None
 
 
-def test_modules_are_what_they_are_made_with():
+def test_modules_are_hashed_by_their_arguments():
     torch.manual_seed(0)
     one = nn.Sequential(nn.Linear(2, 3), nn.ReLU())
     before = digest(one)
@@ -74,18 +74,18 @@ def test_modules_are_what_they_are_made_with():
     plain = digest(one)
     one[0].weight += 1
     assert len({before, plain, digest(one)}) == 3
-    assert before is None  # gradients are asked for
+    assert before is None  # it requires gradients
 
 
 @pytest.mark.parametrize(
     "value", [object(), lambda: 1, {1, 2}, Pair(a=object()), torch.ones(2).requires_grad_()]
 )
-def test_what_is_not_known_has_no_hash(value):
+def test_values_of_unknown_types_have_no_hash(value):
     assert digest(value) is None
     assert digest(1, (value,)) is None
 
 
-def test_a_tensor_is_hashed_once_until_it_is_written_into(monkeypatch):
+def test_the_hash_of_a_tensor_is_cached_until_it_changes(monkeypatch):
     table = torch.zeros(5)
     before = digest(table)
     monkeypatch.setattr(torch.Tensor, "reshape", None)  # hashing would need it
@@ -98,10 +98,10 @@ def test_a_tensor_is_hashed_once_until_it_is_written_into(monkeypatch):
 
 
 class Own(nn.Module):
-    """A module of another package."""
+    """A module of a different package."""
 
 
-def test_code_of_other_packages_or_made_inside_a_function_is_not_known():
+def test_foreign_or_nested_code_has_no_hash():
     def inner() -> None: ...
 
     inner.__module__ = digest.__module__
@@ -109,7 +109,7 @@ def test_code_of_other_packages_or_made_inside_a_function_is_not_known():
         assert digest(unknown) is None
 
 
-def test_the_package_s_code_counts_where_code_is_hashed(monkeypatch):
+def test_hashes_of_functions_cover_the_packages_code(monkeypatch):
     before = [digest(value) for value in (opened, Fuse(), 1)]
     monkeypatch.setattr(sys.modules[digest.__module__], "code", lambda: "edited")
     changed = [digest(value) for value in (opened, Fuse(), 1)]

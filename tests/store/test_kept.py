@@ -1,4 +1,4 @@
-"""What was told when a record was made is told again when it is found."""
+"""Messages from the computation of a record are repeated when it is read from the store."""
 
 import pytest
 import torch
@@ -23,7 +23,7 @@ FAILURE = Failure(stage="warp", what="patch", name="3", reason="numbers", done="
 
 
 def found(store):
-    """Return the record, what was told, and whether it was made."""
+    """Return the record, its messages, and whether it was computed."""
     made = []
 
     def make():
@@ -41,7 +41,7 @@ def found(store):
     return record, told, [(one.name, one.figures) for one in reports], bool(made), names
 
 
-def test_cautions_failures_guards_and_reports_are_told_again(tmp_path):
+def test_stored_records_replay_cautions_failures_guards_and_reports(tmp_path):
     first, second = (found(Store(folder=tmp_path)) for _ in range(2))
     assert digest(first[0]) == digest(second[0])
     assert first[1] == second[1]
@@ -52,7 +52,7 @@ def test_cautions_failures_guards_and_reports_are_told_again(tmp_path):
     assert (first[4], second[4]) == ([], ["stage"])
 
 
-def test_what_has_no_key_is_made_again(tmp_path):
+def test_a_record_without_a_key_is_recomputed(tmp_path):
     for _ in range(2):
         kept(Store(folder=tmp_path), None, Cameras, cameras)
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Records that are kept from run to run."""
+"""Records stored between runs."""
 
 import os
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ def files(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_record_comes_back_bit_for_bit(record, tmp_path):
+def test_a_stored_record_is_read_bit_for_bit(record, tmp_path):
     store = Store(folder=tmp_path / "new" / "folder")
     assert store.find("a", Cameras) is None
     assert store.keep("a", record, {"seconds": 12.5})
@@ -47,7 +47,7 @@ def test_a_record_comes_back_bit_for_bit(record, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut short", "tensor", "about", "empty", "another file"])
-def test_a_damaged_entry_is_never_believed(record, tmp_path, damage):
+def test_a_damaged_entry_is_never_used(record, tmp_path, damage):
     store, path = Store(folder=tmp_path), tmp_path / "a.safetensors"
     store.keep("a", record, {"seconds": 12.5})
     whole = path.read_bytes()
@@ -66,7 +66,7 @@ def test_a_damaged_entry_is_never_believed(record, tmp_path, damage):
     assert store.find("a", Cameras) is not None
 
 
-def test_what_was_not_written_whole_is_not_there(record, tmp_path, monkeypatch):
+def test_a_partly_written_entry_is_not_found(record, tmp_path, monkeypatch):
     def full(self, target):
         raise OSError("disk full")
 
@@ -76,20 +76,20 @@ def test_what_was_not_written_whole_is_not_there(record, tmp_path, monkeypatch):
     assert files(tmp_path) == []
 
 
-def test_the_folder_forgets_what_was_used_longest_ago(record, tmp_path):
+def test_the_least_recently_used_entries_are_removed(record, tmp_path):
     store = Store(folder=tmp_path)
     for second, key in enumerate("abc"):
         store.keep(key, record)
         os.utime(tmp_path / f"{key}.safetensors", (second, second))
     size = (tmp_path / "a.safetensors").stat().st_size
-    assert store.find("a", Cameras)  # used just now
+    assert store.find("a", Cameras)  # most recently used
     assert Store(folder=tmp_path, max_bytes=3 * size).keep("d", record)
     assert files(tmp_path) == [f"{key}.safetensors" for key in "acd"]
     assert not Store(folder=tmp_path, max_bytes=size - 1).keep("e", record)
     assert files(tmp_path) == []
 
 
-def test_files_that_a_killed_run_left_are_deleted_after_a_day(record, tmp_path):
+def test_files_of_a_killed_run_are_deleted_after_a_day(record, tmp_path):
     old, new = tmp_path / ".a.safetensors.new-0a", tmp_path / ".a.safetensors.new-0b"
     for path in (old, new):
         path.write_bytes(b"half")
@@ -98,7 +98,7 @@ def test_files_that_a_killed_run_left_are_deleted_after_a_day(record, tmp_path):
     assert (old.exists(), new.exists()) == (False, True)
 
 
-def test_afresh_finds_nothing_and_replaces(record, tmp_path):
+def test_fresh_ignores_and_replaces_entries(record, tmp_path):
     Store(folder=tmp_path).keep("a", record)
     afresh = Store(folder=tmp_path, fresh=True)
     assert afresh.find("a", Cameras) is None
@@ -108,7 +108,7 @@ def test_afresh_finds_nothing_and_replaces(record, tmp_path):
     )
 
 
-def test_what_asks_for_gradients_is_not_kept(record, tmp_path):
+def test_records_that_require_gradients_are_not_stored(record, tmp_path):
     store = Store(folder=tmp_path)
     assert not store.keep("a", record.replace(intrinsics=record.intrinsics.requires_grad_()))
     assert files(tmp_path) == []

@@ -1,4 +1,4 @@
-"""The page in a browser that draws in software."""
+"""The page in a browser with software rendering."""
 
 import io
 import shutil
@@ -16,10 +16,10 @@ from pimper_torch.result.viewer.show import add_found
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DRAWN_IN_SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-# A busy machine draws a first picture after half a minute.
+# A busy machine takes half a minute for the first image.
 PATIENCE_SECONDS = 120.0
 LARGE = 2_000  # pixels
-LAYER, PHOTOGRAPH = 0, 1  # lists of the page, from above
+LAYER, PHOTOGRAPH = 0, 1  # drop-down lists of the page, from the top
 GROUND = 80 / 255  # the background is darker, and the surface brighter
 
 pytestmark = [
@@ -41,31 +41,31 @@ def page():
 
 
 def colors(page):
-    """The picture left of the controls and below the browser's notices, 0 to 1."""
+    """Return the image left of the controls and below the browser's notices, 0 to 1."""
     with Image.open(io.BytesIO(page.screenshot())) as picture:
         return np.asarray(picture.convert("RGB"), dtype=float)[200:580, :500] / 255
 
 
 def drawn(picture):
-    """Whether a surface is in front of the background; the page is white until then."""
+    """Return whether a surface is drawn; the page is white until then."""
     return min((picture > GROUND).sum(), (picture < GROUND).sum()) > LARGE
 
 
 def violet(page):
-    """Fraction of the picture that shows photographs of :func:`close_cameras`."""
+    """Return the fraction of the image with photographs of :func:`close_cameras`."""
     red, green, blue = colors(page).transpose(2, 0, 1)
     return float(((red > 0.5) & (blue > 0.5) & (green < 0.4)).mean())
 
 
 def choose(page, control, option):
-    """Choose in a list of the page, by the mouse."""
+    """Select an option of a list with the mouse."""
     page.locator("input.mantine-Select-input:visible").nth(control).click()
     page.get_by_role("option", name=option, exact=True).click()
 
 
 @pytest.fixture
 def close_cameras(viewer):
-    """Violet photographs, the second between the first and the surface, close to a large ball."""
+    """Show violet photographs near a large ball; the second is between it and the first."""
     towards, up = torch.tensor([0.94, 0.0, 0.34]), torch.tensor([0.0, 0.0, 1.0])
     eyes = torch.stack([3.2 * towards, 2.8 * towards, torch.tensor([0.0, 2.8, 1.0])])
     cameras = pinholes(look_at(eyes, torch.zeros(3), up), 300.0, 400, 300)
@@ -81,7 +81,7 @@ def close_cameras(viewer):
 
 
 @pytest.mark.usefixtures("close_cameras")
-def test_no_photograph_covers_the_surface_unless_it_is_faded_in(viewer, page):
+def test_photographs_do_not_cover_the_surface_unless_faded_in(viewer, page):
     page.set_viewport_size({"width": 900, "height": 600})
     page.goto(viewer.address)
     until(page, drawn)
@@ -105,7 +105,7 @@ def test_no_photograph_covers_the_surface_unless_it_is_faded_in(viewer, page):
 
 
 @pytest.mark.usefixtures("close_cameras")
-def test_a_telephone_shows_the_whole_surface_above_the_controls(viewer, page):
+def test_a_phone_shows_the_complete_surface_above_the_controls(viewer, page):
     page.set_viewport_size({"width": 390, "height": 760})
     page.goto(viewer.address)
 
@@ -116,7 +116,7 @@ def test_a_telephone_shows_the_whole_surface_above_the_controls(viewer, page):
     until(page, drawn)
     page.wait_for_timeout(5000)
     shown = bright()
-    assert not shown[:, [0, 1, -2, -1]].any()  # no side is cut off
+    assert not shown[:, [0, 1, -2, -1]].any()  # no side is cropped
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     choose(page, LAYER, "support")
     bar = page.get_by_text("full", exact=True)
@@ -127,7 +127,7 @@ def test_a_telephone_shows_the_whole_surface_above_the_controls(viewer, page):
 
 
 def until(page, true):
-    """Wait until something holds of the picture left of the controls, 0 to 1."""
+    """Wait until a condition on the image left of the controls, 0 to 1, is true."""
     end = time.monotonic() + PATIENCE_SECONDS
     while True:
         with Image.open(io.BytesIO(page.screenshot())) as picture:
@@ -138,7 +138,7 @@ def until(page, true):
         page.wait_for_timeout(500)
 
 
-def test_the_object_is_there_and_a_click_on_a_frustum_stands_there(viewer, page, reconstruction):
+def test_a_click_on_a_frustum_moves_the_viewpoint_there(viewer, page, reconstruction):
     fetched, errors = [], []
     page.on("request", lambda request: fetched.append(request.url))
     page.on("pageerror", lambda error: errors.append(error.message))
@@ -150,7 +150,7 @@ def test_the_object_is_there_and_a_click_on_a_frustum_stands_there(viewer, page,
     name = reconstruction.scene.views.names[1]
     position = viewer._cameras[name][0][:3, 3].numpy()
     client.camera.position = 3 * position
-    client.camera.look_at = position  # in the middle of the page
+    client.camera.look_at = position  # at the centre of the page
     page.wait_for_timeout(3000)
     box = page.locator("canvas").first.bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2

@@ -1,4 +1,4 @@
-"""A folder of results, from the command that wrote it to the page."""
+"""A result folder in the viewer, by command and in Python."""
 
 import json
 import os
@@ -23,14 +23,14 @@ pytest.importorskip("viser")
 
 @pytest.fixture
 def folder(reconstruction, tmp_path, small_pictures):
-    """A folder of results whose photographs are gone."""
+    """A result folder without its photographs."""
     scale = {"factor": 2.0, "unit": "cm"}
     about = {"photographs": str(tmp_path / "gone"), "masks": None, "scale": scale}
     results.write_result(reconstruction, CoarseToFineConfig(), tmp_path / "out", about=about)
     return tmp_path / "out"
 
 
-def test_without_its_photographs_the_rest_is_shown_and_said(viewer, folder):
+def test_without_photographs_the_rest_is_shown_with_a_message(viewer, folder):
     with pytest.warns(PimperWarning, match="shows no photographs"):
         add_folder(viewer, folder)
     scene = viewer.server.scene
@@ -54,7 +54,7 @@ def ball(tmp_path):
 def test_the_command_serves_a_page_until_ctrl_c(ball):
     code = "import sys; from pimper_torch.cli.supervise import main; sys.exit(main())"
     line = [sys.executable, "-c", code, "view", str(ball), "--port", "0", "--json"]
-    # What runs in the background of a shell ignores Ctrl-C, and so does what it starts.
+    # Background processes of a shell ignore Ctrl-C, and so do their children.
     with subprocess.Popen(
         line,
         stdout=subprocess.PIPE,

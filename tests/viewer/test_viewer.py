@@ -36,12 +36,12 @@ def node(viewer, name):
 
 @pytest.fixture
 def page(viewer, reconstruction):
-    """The page of a whole result."""
+    """The page of a complete result."""
     add_found(viewer, reconstruction)
     return viewer
 
 
-def test_the_page_comes_by_http_from_this_machine_alone(viewer):
+def test_the_page_is_served_only_to_the_local_machine(viewer):
     assert viewer.address.startswith("http://127.0.0.1:")
     with urlopen(viewer.address, timeout=10) as answer:
         assert answer.status == 200
@@ -49,7 +49,7 @@ def test_the_page_comes_by_http_from_this_machine_alone(viewer):
     assert viewer.address in viewer._repr_html_()
 
 
-def test_scene_holds_cameras_photographs_points_and_surface(page, reconstruction):
+def test_the_scene_has_cameras_photographs_points_and_surface(page, reconstruction):
     assert len(page.server.get_scene_serializer().serialize()) > 10_000
     assert len(node(page, "/points").points) == len(reconstruction.scene.points_world)
     assert node(page, RESULT).glb_data[:4] == b"glTF"
@@ -75,7 +75,7 @@ def camera(client):
     return client.camera
 
 
-def test_frusta_and_pages_stand_where_the_cameras_do(page, camera, reconstruction):
+def test_frusta_and_selected_views_have_the_poses_of_cameras(page, camera, reconstruction):
     from viser.transforms import SO3
 
     frame = page._viewer_from_world
@@ -84,7 +84,7 @@ def test_frusta_and_pages_stand_where_the_cameras_do(page, camera, reconstructio
     ahead = transform(frame, (world_from_cam[:, :3, 3] + world_from_cam[:, :3, 2]))
     for view, name in enumerate(reconstruction.scene.views.names):
         frustum = node(page, f"/cameras/{view:05d}")
-        # Float64 at three units from the middle; coordinates may be zero.
+        # Float64 at distance 3 from the centre; coordinates may be zero.
         np.testing.assert_allclose(frustum.position, placed[view], atol=1e-12)
         forward = torch.nn.functional.normalize(ahead[view] - placed[view], dim=0)
         np.testing.assert_allclose(SO3(frustum.wxyz).as_matrix()[:, 2], forward, atol=1e-6)
@@ -94,20 +94,20 @@ def test_frusta_and_pages_stand_where_the_cameras_do(page, camera, reconstructio
         assert_close(gaze / gaze.norm(), forward, rtol=0, atol=1e-6)
         assert camera.up_direction[2] > 0
         right = SO3(frustum.wxyz).as_matrix()[:, 0]
-        assert abs(float(np.dot(camera.up_direction, right))) < 1e-6  # right in its picture
+        assert abs(float(np.dot(camera.up_direction, right))) < 1e-6  # the image's right
 
 
-def test_the_last_surface_is_shown_and_those_before_are_kept(viewer, reconstruction):
+def test_the_last_surface_is_shown_and_earlier_ones_are_kept(viewer, reconstruction):
     add_found(viewer, reconstruction.scene)
     assert node(viewer, "/points").visible
     viewer.add_pass("coarse surface", reconstruction.coarse.mesh)
-    assert not node(viewer, "/points").visible  # they lie on the surface
+    assert not node(viewer, "/points").visible  # the surface replaces them
     viewer.add_pass("result", reconstruction.mesh)
     assert [node(viewer, name).visible for name in (COARSE, RESULT)] == [False, True]
     assert viewer._about.content == f"**result**, {len(reconstruction.mesh.faces):,} faces."
 
 
-def test_a_photograph_hides_the_frusta_and_none_shows_the_whole_surface(
+def test_a_selected_photograph_hides_the_frusta_and_none_shows_the_complete_surface(
     page, camera, reconstruction
 ):
     page.choose(reconstruction.scene.views.names[0])
@@ -117,14 +117,14 @@ def test_a_photograph_hides_the_frusta_and_none_shows_the_whole_surface(
     vertices = transform(page._viewer_from_world, reconstruction.mesh.vertices_world.double())
     rays, eye = vertices - torch.as_tensor(camera.position), torch.as_tensor(camera.position)
     angles = torch.cosine_similarity(rays, -eye.double(), dim=1).acos()
-    # The farthest vertex may be nearer to the eye than the middle, or farther away.
+    # The farthest vertex may be nearer to the viewpoint than the centre, or farther.
     assert camera.fov / 4 < float(angles.max()) <= camera.fov / 2 + 1e-6
     np.testing.assert_array_equal(page.server.initial_camera.position, camera.position)
 
 
 @pytest.fixture
 def ball():
-    """A sphere that carries all that a result does."""
+    """A sphere with all attributes of a result."""
     vertices, faces = icosphere(2)
     vertices = vertices.float()
     known = (vertices[:, 2] + 1) / 2
@@ -134,11 +134,11 @@ def ball():
         normals_world=-vertices,
         albedo=0.5 + 0.4 * vertices,
         confidence=known,
-        expected_error=known.square(),  # unlike its confidence
+        expected_error=known.square(),  # different from its confidence
     )
 
 
-def test_layers_are_those_that_the_newest_surface_has(viewer, ball):
+def test_layers_are_those_of_the_newest_surface(viewer, ball):
     viewer.add_pass("ball", ball)
     names = ("lit", "shape", "albedo", "normals", "expected error", "support")
     assert viewer._layer.options == names
@@ -162,26 +162,26 @@ def test_layers_are_those_that_the_newest_surface_has(viewer, ball):
     assert not viewer._bar.visible
 
 
-def test_what_layers_show(ball, monkeypatch):
+def test_layers_have_the_expected_colours(ball, monkeypatch):
     """The ball's world is the viewer's frame; its normals point inward."""
     monkeypatch.setattr(layers, "gltf_of", lambda *given: given)
     shown = {name: layers.painted(ball, name, torch.eye(4).double())[0] for name in layers.LAYERS}
     assert ["extensions" in material for _, _, material in shown.values()] == [0, 0, 1, 1]
     outward = ball.vertices_world.numpy()
-    for name, sign in [("lit", -1), ("shape", 1)]:  # clay is shaded by its own normals
+    for name, sign in [("lit", -1), ("shape", 1)]:  # the shape is shaded by geometric normals
         assert ((shown[name][0]["NORMAL"] * sign * outward).sum(axis=1) > 0.99).all()
     colors = {name: attributes["COLOR_0"] for name, (attributes, _, _) in shown.items()}
     np.testing.assert_array_equal(colors["lit"], colors["albedo"])
     assert (colors["shape"] == 0.5).all()
-    # From the reference camera, which stands at x, y is to the right, red, and z is up, green.
+    # From the reference camera at x, y is right (red), and z is up (green).
     encoded = torch.tensor(0.5 - 0.5 * outward[:, [1, 2, 0]])
     np.testing.assert_allclose(colors["normals"], linear_from_srgb(encoded), atol=1e-6)
     error = layers.painted(ball, "expected error", torch.eye(4).double())[0][0]["COLOR_0"]
     assert (np.diff(error.sum(axis=1)[outward[:, 2].argsort()]) > -1e-6).all()
 
 
-def test_the_light_is_where_the_sliders_are_as_seen_from_the_eye(page, client):
-    """The eye looks along z, with y down; then it turns about y to look along x."""
+def test_the_sliders_set_the_light_relative_to_the_viewpoint(page, client):
+    """The viewpoint looks along z with y down, then rotates about y to look along x."""
     lamp = client.scene.get_handle_by_name("/light")
     for right, up, direction in [(0, 0, (0, 0, -1)), (0.6, 0, (0.6, 0, -0.8)), (0, 1, (0, -1, 0))]:
         for slider, value in zip(page._light, (right, up), strict=True):
@@ -195,19 +195,19 @@ def test_the_light_is_where_the_sliders_are_as_seen_from_the_eye(page, client):
 
 
 def test_frusta_between_the_eye_and_the_surface_are_hidden(viewer):
-    """A surface of radius 1 is seen from x, a little above; cameras on a ring look at it."""
+    """A surface of radius 1 viewed from x, slightly above, with a ring of cameras."""
     cameras = cameras_on_a_ring(12, 3.0, 1.0)
     names = [f"{number}.jpg" for number in range(12)]
     vertices, faces = icosphere(2)
     viewer.add_cameras(names, cameras, torch.zeros(1, 3), 0)
     viewer.add_pass("ball", Mesh(vertices_world=vertices.float() / 2, faces=faces))
     hidden = {name for name, frustum in viewer._frusta.items() if not frustum.visible}
-    assert not hidden  # the eye is nearer than the cameras
-    viewer._see_whole(1.35)  # and now farther: the first, towards which the eye is, covers it
+    assert not hidden  # the viewpoint is nearer than the cameras
+    viewer._see_whole(1.35)  # now farther: the first camera is in front of it
     assert {name for name, one in viewer._frusta.items() if not one.visible} == {"0.jpg"}
 
 
-def test_a_narrow_page_shows_the_whole_picture(page, client, reconstruction):
+def test_a_narrow_page_shows_the_complete_photograph(page, client, reconstruction):
     name = reconstruction.scene.views.names[0]
     _, fov, aspect = page._cameras[name]
     page.choose(name)
@@ -218,7 +218,7 @@ def test_a_narrow_page_shows_the_whole_picture(page, client, reconstruction):
     assert across == pytest.approx(2 * math.atan(aspect * math.tan(fov / 2)))
 
 
-def test_the_photograph_fades_in_where_its_pixels_are(page, client, reconstruction):
+def test_the_photograph_fades_in_at_its_pixels(page, client, reconstruction):
     name = reconstruction.scene.views.names[1]
     page._fade.value = 0.25
     assert node(page, "/photograph") is None
@@ -245,7 +245,7 @@ def test_the_photograph_fades_in_where_its_pixels_are(page, client, reconstructi
     assert not page._fade.visible
 
 
-def test_a_cloud_is_no_surface(viewer, reconstruction):
+def test_a_cloud_is_not_shown_as_a_surface(viewer, reconstruction):
     cloud = Mesh(
         vertices_world=reconstruction.mesh.vertices_world, faces=torch.zeros(0, 3, dtype=torch.long)
     )
@@ -253,7 +253,7 @@ def test_a_cloud_is_no_surface(viewer, reconstruction):
         viewer.add_pass("surface", cloud)
 
 
-def test_show_takes_what_chains_and_folders_return(reconstruction):
+def test_show_accepts_results_of_chains_and_folders(reconstruction):
     scene = reconstruction.scene
     read = Result(
         mesh=reconstruction.mesh,
@@ -278,7 +278,7 @@ def test_show_takes_what_chains_and_folders_return(reconstruction):
             assert_close(viewer._viewer_from_world, frame)
 
 
-def test_show_closes_what_it_cannot_fill(tmp_path, monkeypatch):
+def test_show_closes_its_viewer_on_failure(tmp_path, monkeypatch):
     closed = []
     monkeypatch.setattr(
         Viewer, "stop", lambda self: closed.append(self.server) or self.server.stop()
@@ -289,14 +289,14 @@ def test_show_closes_what_it_cannot_fill(tmp_path, monkeypatch):
         urlopen(f"http://127.0.0.1:{closed[0].get_port()}", timeout=5)
 
 
-def test_a_taken_port_is_left_alone():
+def test_a_port_in_use_is_refused():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with Viewer(port=port) as viewer:
             assert viewer.server.get_port() != port
 
 
-def test_nothing_is_written_on_standard_output(capsys):
+def test_the_viewer_does_not_write_to_standard_output(capsys):
     with Viewer(port=0):
         pass
     assert capsys.readouterr().out == ""
@@ -312,12 +312,12 @@ def test_nothing_is_written_on_standard_output(capsys):
         ({"host": ""}, "an address of this machine"),
     ],
 )
-def test_an_impossible_place_is_refused(place, needed):
+def test_an_invalid_address_is_refused(place, needed):
     with pytest.raises(ConfigError, match=needed):
         open_server(**place)
 
 
-def test_a_page_that_others_reach_is_warned_of():
+def test_a_page_open_to_other_machines_gives_a_warning():
     with (
         pytest.warns(PimperWarning, match="everyone who can connect to this machine"),
         Viewer("0.0.0.0", 0),
@@ -325,7 +325,7 @@ def test_a_page_that_others_reach_is_warned_of():
         pass
 
 
-def test_without_viser_the_error_names_what_to_install(monkeypatch):
+def test_without_viser_the_error_names_the_extra_to_install(monkeypatch):
     monkeypatch.setattr(server_module, "find_spec", lambda _: None)
     with pytest.raises(ConfigError, match=r"pip install 'pimper_torch\[view\]'"):
         require_viser()

@@ -9,7 +9,7 @@ from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
 
 @pytest.fixture
 def plane():
-    """A tilted plane: x from -1 to 1 to the right, y up, leaning back to the right."""
+    """A tilted plane: x from -1 to 1 to the right, y up, farther away on the right."""
     return tilted_square(x=-0.3)
 
 
@@ -18,7 +18,7 @@ def front():
     return from_above(20.0, 16, 12)
 
 
-def test_depth_and_normals_of_a_plane_are_those_of_the_formula(plane, front):
+def test_depth_and_normals_of_a_plane_equal_the_formula(plane, front):
     maps = view_maps(plane, front, 0)
     # z = -0.3 x in the world; in the camera the plane is z = 5 + 0.3 x.
     u = torch.arange(16) + 0.5
@@ -32,7 +32,7 @@ def test_depth_and_normals_of_a_plane_are_those_of_the_formula(plane, front):
     assert (maps.normals_cam[~maps.seen] == 0).all()
 
 
-def test_a_mesh_shows_what_it_carries(plane, front):
+def test_maps_have_the_attributes_of_the_mesh(plane, front):
     transferred = torch.nn.functional.normalize(torch.tensor([0.0, 0.6, 0.8]), dim=0).expand(4, 3)
     height = plane.vertices_world[:, 1:2]
     mesh = plane.replace(normals_world=transferred, albedo=height, confidence=height[:, 0])
@@ -45,13 +45,13 @@ def test_a_mesh_shows_what_it_carries(plane, front):
     assert_close(maps.confidence[maps.seen], wanted[maps.seen])
 
 
-def test_colours_of_normals_follow_the_custom():
+def test_colours_of_normals_follow_the_convention():
     normals = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1], [0, 0, 0]])
     wanted = torch.tensor([[1.0, 0.5, 0.5], [0.5, 1, 0.5], [0.5, 0.5, 1], [0, 0, 0]])
     assert_close(normal_colors(normals), wanted)
 
 
-def test_the_scale_of_albedo_ignores_a_few_highlights_and_what_is_unknown(plane):
+def test_the_scale_of_albedo_ignores_highlights_and_unknown_albedo(plane):
     albedo = torch.full((1000, 3), 2.0)
     albedo[:5] = 1000.0
     albedo[5:500] = 0.0

@@ -30,12 +30,12 @@ def drawn(path):
 
 
 def thumbnail(picture):
-    """Shrink to a few pixels, in which resampling and rounding no longer count."""
+    """Downscale to a few pixels, to ignore resampling and rounding."""
     rgb = Image.fromarray((255 * picture).round().astype(np.uint8))
     return np.asarray(rgb.resize((6, 4), Image.Resampling.BOX)).astype(np.float32) / 255
 
 
-def test_every_picture_is_another_and_on_the_sheet(reconstruction, tmp_path):
+def test_all_images_are_different_and_on_the_sheet(reconstruction, tmp_path):
     draw_overview(reconstruction, tmp_path / "overview.png", 120)
     shown = panels_of(reconstruction, 120)
     assert len(shown) == 8
@@ -53,8 +53,8 @@ def test_every_picture_is_another_and_on_the_sheet(reconstruction, tmp_path):
     assert min(np.abs(one - other).max() for one, other in pairs) > 0.06
 
 
-def test_facets_lie_where_the_photograph_shows_their_corners(reconstruction):
-    """White at the projected corners of the facets, as the photograph was, and nowhere else."""
+def test_facets_are_drawn_at_their_projected_corners(reconstruction):
+    """The photograph is white at the projected corners: each white spot must have a drawn corner."""
     cameras, coarse = reconstruction.cameras, reconstruction.coarse.mesh
     pixels, _ = project(coarse.vertices_world, cameras.cam_from_world[1], cameras.intrinsics[1])
     y, x = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(60) + 0.5, indexing="ij")
@@ -71,10 +71,10 @@ def test_facets_lie_where_the_photograph_shows_their_corners(reconstruction):
     for spot in range(1, count + 1):
         assert (yellow & (spots == spot)).any()
     dark = facets[~yellow & (photograph[..., 0] > 0.9)]
-    assert len(dark) == 0 or dark.max() < 0.7  # lines stand out, and the object is still seen
+    assert len(dark) == 0 or dark.max() < 0.7  # lines and object are both visible
 
 
-def test_a_grey_result_without_normals_and_albedo_is_drawn_too(reconstruction, tmp_path):
+def test_a_grey_result_without_normals_and_albedo_is_drawn(reconstruction, tmp_path):
     views = reconstruction.scene.views
     grey = reconstruction.scene.replace(views=views.replace(images=views.images[:, :1]))
     bare = reconstruction.mesh.replace(normals_world=None, albedo=None, confidence=None)
@@ -102,11 +102,11 @@ def test_silhouettes_are_drawn_over_the_photograph_and_all_views_below(reconstru
     red = (below[..., 0] > 200) & (below[..., 1:] < 90).all(-1)
     yellow = (below[..., 0] > 200) & (below[..., 1] > 170) & (below[..., 2] < 130)
     assert red.sum() > 100
-    assert yellow.sum() > 1.5 * red.sum()  # two views are trusted, one is not
+    assert yellow.sum() > 1.5 * red.sum()  # two views are reliable, one is not
 
 
 @pytest.mark.parametrize("count", [1, 64, 65, 300])
-def test_all_views_are_shown_and_of_many_a_selection_with_all_that_are_not_trusted(count):
+def test_all_views_or_a_selection_with_all_unreliable_ones_are_shown(count):
     reliable = torch.ones(count, dtype=torch.bool)
     reliable[count // 2] = False
     shown = _selected(reliable)
@@ -119,7 +119,7 @@ def test_all_views_are_shown_and_of_many_a_selection_with_all_that_are_not_trust
     assert len(_selected(torch.zeros(count, dtype=torch.bool))) == min(count, 64)
 
 
-def test_gradients_do_not_hinder_drawing(reconstruction, tmp_path):
+def test_records_with_gradients_are_drawn(reconstruction, tmp_path):
     vertices = reconstruction.mesh.vertices_world.clone().requires_grad_()
     mesh = reconstruction.mesh.replace(vertices_world=vertices)
     draw_overview(reconstruction.replace(mesh=mesh), tmp_path / "overview.png", 60)
@@ -133,9 +133,7 @@ def test_the_headline_counts(reconstruction):
     assert headline(doubted).startswith("3 of 4 photographs (cameras unreliable), 2 facets")
 
 
-def test_the_photograph_and_the_surface_from_three_sides_stand_side_by_side(
-    reconstruction, tmp_path
-):
+def test_the_photograph_and_three_views_of_the_surface_are_side_by_side(reconstruction, tmp_path):
     path = tmp_path / "preview.png"
     coarse = reconstruction.coarse
     draw_preview(reconstruction.scene, coarse, path, 90)
@@ -150,7 +148,7 @@ def test_the_photograph_and_the_surface_from_three_sides_stand_side_by_side(
     image = reconstruction.scene.views.images[coarse.reference]
     assert sheet[:, :left].mean() ** 2.2 == pytest.approx(float(image.mean()), abs=0.1)
     sides = sheet[:, left + front.shape[1] :]
-    assert sides.min() < 0.9  # something is seen there
+    assert sides.min() < 0.9  # the sides are not empty
     assert [path.name for path in tmp_path.iterdir()] == ["preview.png"]
 
 
@@ -160,7 +158,7 @@ def test_the_border_of_a_square_is_its_outermost_pixels():
     wanted = mask.clone()
     wanted[3:6, 3:6] = False
     assert torch.equal(border(mask), wanted)
-    assert not border(torch.ones_like(mask)).any()  # the picture's edge is none
+    assert not border(torch.ones_like(mask)).any()  # the image's edge does not count
 
 
 def test_every_view_has_its_tile_and_its_silhouette():

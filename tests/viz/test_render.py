@@ -13,22 +13,22 @@ def front():
     return from_above(40.0, 32, 24)
 
 
-def test_the_point_light_is_up_on_the_left(front):
+def test_the_light_comes_from_the_upper_left(front):
     def tone(mesh):
         return shade(mesh, front)[12, 16, 0]
 
-    # z towards the viewer growing to the right: the face looks to the left.
+    # The right side is nearer to the viewer: the face looks to the left.
     assert tone(tilted_square(x=0.4)) > tone(tilted_square()) > tone(tilted_square(x=-0.4))
     assert tone(tilted_square(y=-0.4)) > tone(tilted_square()) > tone(tilted_square(y=0.4))
 
 
-def test_transferred_normals_do_not_pretend_height_field(front):
+def test_shading_ignores_the_given_normals(front):
     flat = tilted_square()
     bumpy = flat.replace(normals_world=torch.eye(4, 3) + 0.1)
     assert torch.equal(shade(bumpy, front), shade(flat, front))
 
 
-def test_a_face_seen_from_behind_is_bluish_and_emptiness_white(front):
+def test_back_faces_are_bluish_and_the_background_is_white(front):
     behind = tilted_square().replace(faces=tilted_square().faces.flip(1))
     red, _, blue = shade(behind, front)[12, 16]
     assert blue > red + 0.1
@@ -47,7 +47,7 @@ def test_flat_shading_shows_edges_that_smooth_shading_hides(front):
     assert flat.diff().abs().max() > 3 * smooth.diff().abs().max()
 
 
-def test_walking_to_the_right_shows_the_right_side_and_keeps_the_centre(front):
+def test_a_camera_moved_to_the_right_shows_the_right_side_and_keeps_the_centre(front):
     center = torch.tensor([0.2, 0.1, -0.3])
     rotated = rotation(front, center, 40.0)
     before, depth_before = project(center[None], front.cam_from_world[0], front.intrinsics[0])
@@ -59,13 +59,13 @@ def test_walking_to_the_right_shows_the_right_side_and_keeps_the_centre(front):
     assert_close(rotation(rotated, center, -40.0).cam_from_world, front.cam_from_world)
 
 
-def test_a_frame_holds_the_points_at_the_size_asked_for(front):
-    points = torch.tensor([[-1.0, 0.5, 0], [0.5, -0.2, 0.3], [0, 0, 9.0]])  # the last behind
+def test_a_frame_contains_the_points_at_the_given_size(front):
+    points = torch.tensor([[-1.0, 0.5, 0], [0.5, -0.2, 0.3], [0, 0, 9.0]])  # the last one is behind
     framed = frame(front, points, longer_side_px=200, margin=0.1)
     pixels, _ = project(points[:2], framed.cam_from_world[0], framed.intrinsics[0])
     width, height = framed.sizes_px[0].tolist()
     assert max(width, height) == 200
-    # A margin of a tenth on either side leaves ten twelfths to the box.
+    # A margin of a tenth on either side leaves ten twelfths for the box.
     assert_close(pixels[:, 0].min(), torch.tensor(200 / 12), rtol=0, atol=0.5)
     assert_close(pixels[:, 0].max(), torch.tensor(200 * 11 / 12), rtol=0, atol=0.5)
     low, high = bounding_box(front, points, 0.0)

@@ -10,13 +10,13 @@ def plain(color, height=30, width=40):
 
 
 def places(page, color):
-    """Rows and columns of a colour, or nothing."""
+    """Return the rows and columns of a colour, if any."""
     pixels = np.asarray(page).astype(float) / 255
     rows, columns = np.nonzero(np.abs(pixels - np.array(color)).max(axis=-1) < 0.01)
     return (rows.min(), rows.max() + 1, columns.min(), columns.max() + 1) if len(rows) else None
 
 
-def test_tiles_lie_in_rows_as_high_as_their_highest():
+def test_rows_of_tiles_have_the_height_of_their_tallest():
     red, green, blue = (0.8, 0, 0), (0, 0.8, 0), (0, 0, 0.8)
     rows = [
         [Tile(title="a", picture=plain(red, 60)), Tile(title="b", picture=plain(green))],
@@ -53,7 +53,7 @@ def test_a_headline_and_a_note_are_written():
     assert sheet([[Tile()]], 80, "3 photographs").height > bare.height
 
 
-def test_pictures_are_scaled_to_their_tile_and_kept_where_they_fit():
+def test_images_are_scaled_to_their_tile_unless_they_fit():
     picture = plain((0.2, 0.4, 0.6))
     assert fitted(picture, 40) is picture
     assert fitted(picture, 80).shape == (60, 80, 3)

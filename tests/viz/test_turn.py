@@ -22,13 +22,13 @@ def ball():
     return Mesh(vertices_world=vertices, faces=faces, albedo=albedo)
 
 
-def test_cameras_stand_on_a_circle_upright_and_see_everything(ball):
+def test_cameras_are_upright_on_a_circle_and_show_everything(ball):
     start = torch.tensor([0.0, 3.0, 4.0])
     cameras = circling(ball, UP, start, 12, 100)
     rotations = cameras.cam_from_world[:, :3, :3]
     assert_close(rotations @ rotations.mT, torch.eye(3).expand(12, 3, 3))
     assert_close(torch.linalg.det(rotations), torch.ones(12))
-    assert (rotations[:, 1] @ UP < 0).all()  # down in the picture is down in the world
+    assert (rotations[:, 1] @ UP < 0).all()  # image down is world down
     centers = cameras.centers_world
     assert_close(centers[:, 1], centers[:1, 1].expand(12))
     assert centers[0, 2] > 0
@@ -42,7 +42,7 @@ def test_cameras_stand_on_a_circle_upright_and_see_everything(ball):
         assert 92 < pixels.max() < 100
 
 
-def test_up_is_y_unless_photographs_were_held_otherwise(reconstruction):
+def test_up_is_y_unless_cameras_are_rotated(reconstruction):
     cameras = reconstruction.cameras
     quarter = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     own = -cameras.cam_from_world[:, 1, :3].mean(dim=0)
@@ -55,7 +55,7 @@ def test_up_is_y_unless_photographs_were_held_otherwise(reconstruction):
         assert torch.equal(up, UP) == bool(held[1] > 0.5 * held.norm())
 
 
-def test_the_surface_turns_once_round(ball, reconstruction, tmp_path, monkeypatch):
+def test_the_surface_turns_once_around(ball, reconstruction, tmp_path, monkeypatch):
     monkeypatch.setattr(turn, "_FRAMES", 8)
     draw_turn(ball, reconstruction.cameras, 0, tmp_path / "turn.webp")
     with Image.open(tmp_path / "turn.webp") as loop:
@@ -66,7 +66,7 @@ def test_the_surface_turns_once_round(ball, reconstruction, tmp_path, monkeypatc
             frames.append(np.asarray(loop.convert("RGBA")).astype(float))
     side = frames[0].shape[0]
     assert frames[0].shape == (side, 2 * side, 4)
-    assert frames[0][2, 2, 3] == 0  # nothing round the object
+    assert frames[0][2, 2, 3] == 0  # transparent around the object
     box = slice(side // 2 - 5, side // 2 + 5), slice(3 * side // 2 - 5, 3 * side // 2 + 5)
     middle = np.array([frame[box][..., :3].mean(axis=(0, 1)) for frame in frames])
     reds = middle[:, 0] > middle[:, 2]
