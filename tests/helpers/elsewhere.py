@@ -15,7 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 ELSEWHERE = torch.device("meta")
 # Operations that accept CPU tensors as indices or values, or copy between devices.
 _CROSSING = {"__getitem__", "__setitem__", "index", "index_put_", "_index_put_impl_"}
-# Functions that torch dispatches by device: decomposed into a few simple operations.
+# Functions in which torch handles the device by itself.
 _PLAIN = {"__get__", "to", "cpu", "as_tensor"}
 _NUMPY = {"numpy", "__array__", "data_ptr"}
 

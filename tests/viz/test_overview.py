@@ -54,7 +54,7 @@ def test_all_images_are_different_and_on_the_sheet(reconstruction, tmp_path):
 
 
 def test_facets_are_drawn_at_their_projected_corners(reconstruction):
-    """The photograph is white at the projected corners: each white spot must have a drawn corner."""
+    """The photograph is white at the projected corners: each white spot has a drawn corner."""
     cameras, coarse = reconstruction.cameras, reconstruction.coarse.mesh
     pixels, _ = project(coarse.vertices_world, cameras.cam_from_world[1], cameras.intrinsics[1])
     y, x = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(60) + 0.5, indexing="ij")

@@ -23,7 +23,7 @@ BUMPS = WavyPlane(
 
 @pytest.fixture(autouse=True)
 def _bare(monkeypatch, tmp_path):
-    """Without the machine's programs."""
+    """Hide installed programs."""
     (tmp_path / "bin").mkdir()
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
 
@@ -40,7 +40,7 @@ def bumps():
 
 @pytest.fixture(scope="package")
 def photographed():
-    """Nine exact views of a shape, its cloud, and a mesh of about 60 facets through it."""
+    """Nine exact views of a shape, its cloud, and a mesh of about 60 facets of its points."""
 
     @cache
     def build(shape, ambient=0.12, num_views=9):
@@ -48,7 +48,7 @@ def photographed():
         target = (0.0, 0.0, 1.0) if shape is SPHERE else (0.0, 0.0, 0.0)
         options = {"width": 120, "height": 90, "focal_px": 350.0, "distance": 3.0}
         cameras = arc_cameras(num_views, span_deg=40.0, target=target, **options)
-        # At most 35 degrees off: no shadow on what is seen, so first order is exact.
+        # At most 35 degrees off: visible surface has no shadows, so first order is exact.
         point_lights = wandering_lights(
             num_views,
             generator,

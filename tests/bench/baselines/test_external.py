@@ -25,7 +25,7 @@ def test_a_missing_program_is_named_with_its_source():
         find_program("tool")
 
 
-def test_the_path_goes_before_usual_folders(monkeypatch, tmp_path):
+def test_the_path_takes_precedence_over_usual_folders(monkeypatch, tmp_path):
     (tmp_path / "usual").mkdir()
     monkeypatch.setattr(openmvs, "_FOLDERS", (str(tmp_path / "usual"),))
     usual = script(tmp_path / "usual" / "tool", "")
@@ -34,7 +34,7 @@ def test_the_path_goes_before_usual_folders(monkeypatch, tmp_path):
     assert find_program("tool") == on_path
 
 
-def test_a_program_found_by_a_relative_path_runs_in_another_folder(monkeypatch, tmp_path):
+def test_a_program_with_a_relative_path_runs_in_a_different_folder(monkeypatch, tmp_path):
     script(tmp_path / "bin" / "tool", "print('here')")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "elsewhere").mkdir()
@@ -42,7 +42,7 @@ def test_a_program_found_by_a_relative_path_runs_in_another_folder(monkeypatch, 
     assert run_program([find_program("tool")], tmp_path / "elsewhere", soon(1.0), 1) == "here\n"
 
 
-def test_a_program_gets_its_arguments_without_a_shell_its_threads_and_no_terminal(tmp_path):
+def test_a_program_gets_its_arguments_and_threads_without_a_shell_or_terminal(tmp_path):
     tool = script(
         tmp_path / "tool",
         "import sys, os\n"
@@ -55,7 +55,7 @@ def test_a_program_gets_its_arguments_without_a_shell_its_threads_and_no_termina
 
 
 @pytest.mark.parametrize(
-    ("body", "told"),
+    ("body", "message"),
     [
         (
             "import sys\nfor i in range(40): print('line', i)\nsys.exit('no \\udcff disparity')",
@@ -64,9 +64,9 @@ def test_a_program_gets_its_arguments_without_a_shell_its_threads_and_no_termina
         ("import os; os.kill(os.getpid(), 9)", "signal 9; often because memory.*nothing"),
     ],
 )
-def test_a_failing_program_is_quoted_from_its_end(tmp_path, body, told):
+def test_a_failing_program_is_quoted_from_its_end(tmp_path, body, message):
     tool = script(tmp_path / "tool", body)
-    with pytest.raises(ReconstructionError, match=told):
+    with pytest.raises(ReconstructionError, match=message):
         run_program([tool], tmp_path, soon(1.0), 1)
 
 
@@ -85,7 +85,7 @@ def test_at_the_deadline_the_program_and_its_children_are_stopped(tmp_path):
     assert not (tmp_path / "late").exists()
 
 
-def test_a_file_that_is_no_program_for_this_machine_counts_as_missing(tmp_path):
+def test_a_program_that_cannot_be_executed_counts_as_missing(tmp_path):
     (tmp_path / "tool").write_bytes(b"\x7fELF of another kind")
     (tmp_path / "tool").chmod(0o755)
     with pytest.raises(MissingProgramError, match="cannot be started"):

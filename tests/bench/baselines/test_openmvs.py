@@ -14,8 +14,7 @@ from pimper_torch.method.sfm.model_files import read_model
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError, ReconstructionError
 
-# Every program refuses options it does not know, checks its input, and leaves what OpenMVS
-# leaves.
+# Every program refuses unknown options, checks its input, and writes the files of OpenMVS.
 FAKE = """#!{python}
 import pathlib, shutil, sys
 name = pathlib.Path(sys.argv[0]).name
@@ -73,7 +72,7 @@ def install(tmp_path, triangle, *, finds=True, names=PROGRAMS):
     return tmp_path / "seen"
 
 
-def test_the_mesh_comes_back_in_the_scenes_frame(reconstruction, triangle, tmp_path):
+def test_the_mesh_is_in_the_scenes_frame(reconstruction, triangle, tmp_path):
     install(tmp_path, triangle)
     estimate = OpenMvs()(reconstruction.scene, reconstruction.coarse)
     assert_close(estimate.mesh.vertices_world, triangle.vertices_world + 1)
@@ -86,8 +85,8 @@ def test_the_mesh_comes_back_in_the_scenes_frame(reconstruction, triangle, tmp_p
 def test_the_written_model_is_the_undistorted_scene(reconstruction, triangle, tmp_path):
     copy = install(tmp_path, triangle)
     scene = reconstruction.scene
-    # Every camera its own, a lens that is not the pinhole, an odd name, a point nobody sees
-    # and an error that is no number.
+    # Separate cameras, a camera model with distortion, an unusual name, a point without
+    # observations and a NaN error.
     own = scene.cameras.intrinsics.clone()
     own[:, 0, 0], own[:, 1, 1] = torch.tensor([91.0, 92, 93]), torch.tensor([81.0, 82, 83])
     own[:, 0, 2] = 28.25
@@ -123,14 +122,14 @@ def test_the_written_model_is_the_undistorted_scene(reconstruction, triangle, tm
     assert_close(model.observation_pixels, wanted, rtol=0, atol=1e-4)
 
 
-def test_every_missing_program_is_named_before_anything_runs(reconstruction, triangle, tmp_path):
+def test_every_missing_program_is_named_before_the_first_runs(reconstruction, triangle, tmp_path):
     copy = install(tmp_path, triangle, names=PROGRAMS[:2])
     with pytest.raises(MissingProgramError, match="ReconstructMesh is not installed"):
         OpenMvs()(reconstruction.scene, reconstruction.coarse)
     assert not copy.exists()
 
 
-def test_a_step_that_leaves_nothing_is_named(reconstruction, triangle, tmp_path):
+def test_a_step_without_output_is_named(reconstruction, triangle, tmp_path):
     install(tmp_path, triangle, finds=False)
     with pytest.raises(ReconstructionError, match=r"ReconstructMesh .* did not write scene_dense"):
         OpenMvs()(reconstruction.scene, reconstruction.coarse)

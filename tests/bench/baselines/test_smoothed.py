@@ -13,7 +13,7 @@ def _few(monkeypatch):
 
 
 @pytest.mark.parametrize("shape", ["sphere", "bumps"])
-def test_the_smooth_surface_is_nearer_to_the_truth_than_the_facets(
+def test_the_smooth_surface_is_more_accurate_than_the_facets(
     shape, photographed, compared, request
 ):
     truth, scene, coarse = photographed(request.getfixturevalue(shape))
@@ -24,18 +24,18 @@ def test_the_smooth_surface_is_nearer_to_the_truth_than_the_facets(
     assert smooth.coverage > facets.coverage - 0.01
 
 
-def test_a_flat_mesh_stays_where_it_is(photographed, sphere):
+def test_a_flat_mesh_is_unchanged(photographed, sphere):
     _, scene, coarse = photographed(sphere)
     flat = coarse.mesh.vertices_world @ torch.diag(torch.tensor([1.0, 1.0, 0.0]))
     level = coarse.replace(mesh=coarse.mesh.replace(vertices_world=flat))
     found = Smoothed()(scene, level).mesh
     assert found.vertices_world[:, 2].abs().max() < 1e-5
     low, high = flat[coarse.mesh.faces.unique()].aminmax(dim=0)
-    assert_close(found.vertices_world.amin(dim=0), low, atol=0.02, rtol=0)  # only corners round
+    assert_close(found.vertices_world.amin(dim=0), low, atol=0.02, rtol=0)  # rounded corners
     assert_close(found.vertices_world.amax(dim=0), high, atol=0.02, rtol=0)
 
 
-def test_a_closed_mesh_is_smoothed_too_and_becomes_rounder(photographed, sphere):
+def test_a_closed_mesh_becomes_rounder(photographed, sphere):
     _, scene, coarse = photographed(sphere)
     vertices, faces = icosphere(1)
     ball = coarse.replace(

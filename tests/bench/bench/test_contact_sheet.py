@@ -21,7 +21,7 @@ def has_color(path, color):
     return bool((np.abs(pixels - np.array(color)).max(axis=-1) < 0.02).any())
 
 
-def test_colours_run_from_no_error_to_the_clip_and_stay_there():
+def test_colours_saturate_at_the_clip():
     error = torch.tensor([[0.0, 0.5, 1.0, 50.0]])
     picture = error_picture(error)
     viridis = colormaps["viridis"]
@@ -29,13 +29,13 @@ def test_colours_run_from_no_error_to_the_clip_and_stay_there():
     np.testing.assert_allclose(picture[0], wanted, atol=1e-6)
 
 
-def test_missed_and_empty_pixels_are_told_from_errors_whatever_the_shading():
+def test_missed_and_empty_pixels_differ_from_errors_at_any_shading():
     error = torch.tensor([[math.inf, math.nan, 0.0]])
     picture = error_picture(error, torch.zeros(1, 3, 3))
     np.testing.assert_allclose(picture[0, 0], MISSED, atol=1e-6)
     np.testing.assert_allclose(picture[0, 1], 1.0, atol=1e-6)
     every = np.stack([colormaps["viridis"](x)[:3] for x in np.linspace(0, 1, 256)])
-    for tint in (0.65, 1.0):  # no error, however shaded, looks like a missed pixel
+    for tint in (0.65, 1.0):  # zero error does not look like a missed pixel at any shading
         assert np.abs(tint * every - np.array(MISSED)).max(axis=1).min() > 0.2
 
 
@@ -45,7 +45,7 @@ def test_shading_darkens_a_colour_without_changing_its_hue():
     np.testing.assert_allclose(picture[0, 0], 0.65 * picture[0, 1], atol=1e-6)
 
 
-def test_the_crop_holds_every_true_pixel_and_stays_inside():
+def test_the_crop_contains_every_true_pixel_and_stays_inside():
     where = torch.zeros(40, 60, dtype=torch.bool)
     where[0, 10] = where[20, 30] = True
     rows, columns = crop_to(where)
@@ -58,7 +58,7 @@ def picture_of(color):
     return np.broadcast_to(np.array(color, dtype=np.float32), (30, 40, 3)).copy()
 
 
-def test_the_sheet_holds_every_picture_and_says_why_one_is_missing(tmp_path):
+def test_the_sheet_has_every_image_or_the_reason_why_it_is_missing(tmp_path):
     colors = [(0.1, 0.2, 0.9), (0.9, 0.8, 0.1), (0.3, 0.9, 0.3), (0.9, 0.1, 0.9)]
     photograph, truth, surface, error = (picture_of(color) for color in colors)
     shown = MethodPanels(method="default", surface=surface, error=error)

@@ -1,4 +1,4 @@
-"""Structure from motion of a bench's scene, kept from run to run."""
+"""Structure from motion of a bench's scene, stored between runs."""
 
 import time
 
@@ -20,9 +20,7 @@ def rendered(tmp_path_factory):
     return render_scene(path, folder / "scene", settings, processes=1)
 
 
-def test_a_scenes_model_is_found_once_and_its_seconds_are_those_of_the_first_run(
-    rendered, tmp_path, monkeypatch
-):
+def test_a_scenes_model_is_computed_once_and_keeps_its_run_time(rendered, tmp_path, monkeypatch):
     runs = []
 
     def structure_from_motion(views, config):

@@ -10,7 +10,7 @@ MB = 2**20
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forgets a peak")
-def test_a_method_does_not_inherit_the_peak_of_the_one_before():
+def test_a_method_does_not_inherit_the_memory_peak_of_the_previous_one():
     with peak_memory() as peak:
         if peak() is None:
             pytest.skip("this system does not let a process forget its peak")
@@ -25,7 +25,7 @@ def test_a_method_does_not_inherit_the_peak_of_the_one_before():
     assert greedy - frugal > 350
 
 
-def test_where_the_system_cannot_tell_nothing_is_said(monkeypatch, tmp_path):
+def test_memory_is_unknown_if_the_system_does_not_report_it(monkeypatch, tmp_path):
     monkeypatch.setattr(measure, "_SELF", tmp_path / "none")
     with peak_memory() as peak:
         assert peak() is None

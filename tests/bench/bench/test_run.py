@@ -29,7 +29,7 @@ RIGHT = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def ball():
-    """A ball before five cameras: its truth, and what structure from motion would give."""
+    """A ball in five cameras: its truth, and a scene like that of structure from motion."""
     generator = torch.Generator().manual_seed(91)
     vertices, faces = icosphere(4)
     mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertices)
@@ -71,7 +71,7 @@ def ball():
 
 
 def of_radius(radius):
-    """Give a method whose surface is a ball of a radius where the truth has 1."""
+    """Return a method that returns a ball of the given radius; the true one is 1."""
 
     def method(scene, coarse):
         mesh = coarse.mesh.replace(vertices_world=radius * coarse.mesh.vertices_world)
@@ -99,7 +99,7 @@ def failing(error):
 
 @pytest.fixture
 def staged(monkeypatch, ball):
-    """Stand in for rendering and structure from motion, and for the methods' names."""
+    """Replace rendering, structure from motion, and the methods by name."""
     methods = {
         "exact": of_radius(1.0),
         "larger": of_radius(1.02),
@@ -112,15 +112,15 @@ def staged(monkeypatch, ball):
     return methods
 
 
-def test_methods_are_measured_alike_and_failures_have_rows(staged, tmp_path):
+def test_methods_are_measured_equally_and_failures_have_rows(staged, tmp_path):
     table = run_bench(config_of("exact", "larger", "lost", "absent"), tmp_path / "out")
     exact, larger, lost, absent = table.rows
-    assert exact.relative_error < 0.02  # float32 of the rays
-    assert exact.mean_normal_deg < 0.5  # the truth's are blended between vertices
+    assert exact.relative_error < 0.02  # float32 rays
+    assert exact.mean_normal_deg < 0.5  # the true normals are interpolated
     assert (exact.minutes, exact.sfm_minutes) == (0.1, 0.5)
     assert (exact.samples, exact.missing_percent) == (1000, 25.0)
     assert_close(exact.coverage_percent, 100.0)
-    # Radially off by 0.02 everywhere, in per cent of the bounding cube's diagonal.
+    # A radial error of 0.02 everywhere, in per cent of the bounding cube's diagonal.
     diagonal = 2 * 3**0.5
     assert_close(larger.accuracy, 100 * 0.02 / diagonal, rtol=0.02, atol=0)
     assert_close(larger.completeness_seen, 100 * 0.02 / diagonal, rtol=0.02, atol=0)
@@ -132,11 +132,11 @@ def test_methods_are_measured_alike_and_failures_have_rows(staged, tmp_path):
     assert lost.relative_error is None
 
 
-def test_figures_over_pixels_that_all_methods_cover_stand_beside_each_ones_own(staged, tmp_path):
+def test_figures_of_common_pixels_are_next_to_those_of_each_method(staged, tmp_path):
     def half(scene, coarse):
         outcome = of_radius(1.0)(scene, coarse)
         mesh = outcome.estimate.mesh
-        # The side that the reference camera sees obliquely is left out.
+        # Without the side that is oblique in the reference camera.
         kept = (mesh.vertices_world[mesh.faces].mean(dim=1) @ RIGHT) > 0
         mesh = mesh.replace(faces=mesh.faces[kept], normals_world=mesh.vertices_world)
         return outcome.replace(estimate=outcome.estimate.replace(mesh=mesh))
@@ -156,7 +156,7 @@ def test_figures_over_pixels_that_all_methods_cover_stand_beside_each_ones_own(s
     assert alone.common_relative_error == alone.relative_error
 
 
-def test_the_folder_holds_table_sheet_and_surfaces(staged, tmp_path):
+def test_the_folder_has_table_sheet_and_surfaces(staged, tmp_path):
     table = run_bench(config_of("larger", "lost"), tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
         [*BENCH_NAMES, MARKER]
@@ -171,7 +171,7 @@ def test_the_folder_holds_table_sheet_and_surfaces(staged, tmp_path):
 
 @pytest.fixture
 def fails(monkeypatch, ball):
-    """Let the preparation of scenes fail from one on."""
+    """Make the preparation of scenes fail from a given one on."""
 
     def let(error, first):
         scenes = iter(range(9))
@@ -187,7 +187,7 @@ def fails(monkeypatch, ball):
 
 
 @pytest.mark.usefixtures("staged")
-def test_what_was_complete_before_an_interruption_is_kept(fails, tmp_path):
+def test_complete_scenes_survive_an_interruption(fails, tmp_path):
     fails(KeyboardInterrupt(), 1)
     with pytest.warns(PimperWarning, match="two"):
         table = run_bench(config_of("exact", scenes=("one", "two")), tmp_path / "out")
@@ -207,7 +207,7 @@ def test_a_scene_without_cameras_has_a_row_for_every_method(fails, tmp_path):
     assert all("no view" in row.note for row in table.rows)
 
 
-def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball):
+def test_ray_errors_are_in_per_cent_of_the_diagonal(ball):
     shift = torch.eye(4).double()
     camera = ball.maps.cameras.cam_from_world[0]
     shift[:3, 3] = 0.03 * camera[2, :3]  # away from the camera
@@ -223,7 +223,7 @@ def test_an_error_along_the_rays_is_a_distance_in_per_cent_of_the_diagonal(ball)
     assert 0.3 < missed[foreground].float().mean() < 0.7
 
 
-def test_names_that_are_no_method_are_refused():
+def test_unknown_methods_are_refused():
     with pytest.raises(ConfigError, match="smoothed"):
         method_named("defautl")
 
@@ -240,12 +240,12 @@ def test_presets_and_rivals_have_names():
     [
         {"scenes": ()},
         {"methods": ("paper", "paper")},
-        {"methods": ("default", "mine/default.yaml")},  # one name in the table
+        {"methods": ("default", "mine/default.yaml")},  # both have the same name in the table
         {"methods": ()},
         {"processes": 0},
         {"seed": -1},
     ],
 )
-def test_a_table_that_makes_no_sense_is_refused(wrong):
+def test_inconsistent_settings_of_a_table_are_refused(wrong):
     with pytest.raises(ConfigError):
         BenchConfig(**wrong)

@@ -1,4 +1,4 @@
-"""The script that measures runs: benchmarks/speed.py."""
+"""The benchmark script benchmarks/speed.py."""
 
 import importlib.util
 import json
@@ -23,17 +23,17 @@ def speed():
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules["speed"] = module  # dataclasses look their module up
+    sys.modules["speed"] = module  # dataclasses look up their module
     spec.loader.exec_module(module)
     yield module
     del sys.modules["speed"]
 
 
-def told(stage, **figures):
+def report(stage, **figures):
     return StageReport(name=stage, seconds=0.0, peak_memory_mb=0.0, figures=figures)
 
 
-def test_rounds_of_a_stage_add_up_and_peaks_do_not(speed):
+def test_passes_of_a_stage_are_summed_and_peaks_are_not(speed):
     first, other, again = (
         speed.Cost(stage=stage, seconds=2, cpu_seconds=3, page_faults=5, peak_mb=peak)
         for stage, peak in (("warp", 70.0), ("fuse", 90.0), ("warp", 60.0))
@@ -43,7 +43,7 @@ def test_rounds_of_a_stage_add_up_and_peaks_do_not(speed):
     assert (warp.peak_mb, fuse.seconds, fuse.peak_mb) == (70.0, 2, 90.0)
 
 
-def test_a_round_without_a_floor_is_as_far_from_it_as_the_others(speed):
+def test_a_pass_without_a_lower_bound_has_the_ratio_of_the_others(speed):
     iterations = [
         speed.Cost(stage="fuse", seconds=seconds, cpu_seconds=1, page_faults=0, floor_seconds=floor)
         for seconds, floor in ((6.0, math.nan), (10.0, 0.1), (30.0, 0.7))
@@ -53,7 +53,7 @@ def test_a_round_without_a_floor_is_as_far_from_it_as_the_others(speed):
     assert math.isnan(speed.added("fuse", iterations[:1]).floor_seconds)
 
 
-def test_a_stage_has_the_peak_of_its_own_time_though_others_begin_in_it(speed):
+def test_a_stage_has_its_own_peak_although_others_start_within_it(speed):
     with peak_memory() as peak:
         if peak() is None:
             pytest.skip("this system does not let a process forget its peak")
@@ -63,8 +63,8 @@ def test_a_stage_has_the_peak_of_its_own_time_though_others_begin_in_it(speed):
     assert held.sum() == 300 * MB
     del held
     meter.started("inner")
-    meter.finished(told("inner"))
-    meter.finished(told("outer"))
+    meter.finished(report("inner"))
+    meter.finished(report("outer"))
     inner, outer = meter.costs
     assert (inner.stage, outer.stage) == ("inner", "outer")
     assert outer.peak_mb - inner.peak_mb > 250
@@ -73,9 +73,9 @@ def test_a_stage_has_the_peak_of_its_own_time_though_others_begin_in_it(speed):
 
 
 @pytest.mark.usefixtures("small_pictures")
-def test_a_run_is_measured_kept_and_compared(speed, reconstruction, monkeypatch, tmp_path, capsys):
+def test_a_run_is_measured_saved_and_compared(speed, reconstruction, monkeypatch, tmp_path, capsys):
     class Chain:
-        """The hand-overs of a run, without the work."""
+        """The stage calls of a run, without the computation."""
 
         def __init__(self, config, observer, cache):
             self.observer = observer
@@ -88,7 +88,7 @@ def test_a_run_is_measured_kept_and_compared(speed, reconstruction, monkeypatch,
                 ("fuse", {}),
             ):
                 self.observer.started(stage)
-                self.observer.finished(told(stage, **figures))
+                self.observer.finished(report(stage, **figures))
             return reconstruction
 
     monkeypatch.setattr(speed, "make_chain", Chain)
@@ -112,7 +112,7 @@ def test_a_run_is_measured_kept_and_compared(speed, reconstruction, monkeypatch,
     assert after.seconds < speed.gather_samples(kept)[-1].seconds
     assert after.seconds > kept["costs"][-1]["seconds"]
     whole = speed.gather_samples(kept)[-1].seconds
-    assert whole == pytest.approx(kept["clock_seconds"], abs=0.1 + 0.02 * whole)  # nothing hides
+    assert whole == pytest.approx(kept["clock_seconds"], abs=0.1 + 0.02 * whole)  # complete
     printed = capsys.readouterr().out
     measured, compared = printed.split("Over the earlier run's")
     assert measured.count("| fuse |") == compared.count("| fuse |") == 1

@@ -75,20 +75,20 @@ def table(*rows, **settings):
 
 
 def cells(text):
-    """Rows of the Markdown table, by heading."""
+    """Return the rows of the Markdown table by heading."""
     lines = [line for line in text.splitlines() if line.startswith("|")]
     split = [[word.strip() for word in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
     return [dict(zip(split[0], line, strict=True)) for line in split[2:]]
 
 
-def test_what_is_missing_is_a_dash_in_every_column():
+def test_missing_values_are_dashes():
     full, empty = cells(markdown(table(FULL, EMPTY)))
     words = {"scene": "mug", "method": "pmvs", "note": "not installed: pmvs2"}
     assert empty == dict.fromkeys(full, MISSING) | words
     assert MISSING not in [full[name] for name in full.keys() - words.keys()]
 
 
-def test_every_figure_stands_in_its_own_column():
+def test_every_figure_is_in_its_column():
     (full,) = cells(markdown(table(FULL)))
     assert full == {
         "scene": "mug",
@@ -121,7 +121,7 @@ def test_every_figure_stands_in_its_own_column():
     }
 
 
-def test_markdown_lines_are_of_one_width_and_numbers_stand_to_the_right():
+def test_markdown_lines_have_equal_width_and_numbers_are_right_aligned():
     text = markdown(table(FULL, EMPTY, FULL.replace(method="a much longer name", minutes=123.0)))
     lines = [line for line in text.splitlines() if line.startswith("|")]
     assert len({len(line) for line in lines}) == 1
@@ -129,19 +129,19 @@ def test_markdown_lines_are_of_one_width_and_numbers_stand_to_the_right():
     assert [word.strip().endswith(":") for word in rule] == [False] * 2 + [True] * 25 + [False]
 
 
-def test_columns_that_no_row_fills_are_left_out():
+def test_empty_columns_are_omitted():
     bare = FULL.replace(f_scores=(), chamfer=None, relative_error=math.nan)
     assert [len(part) for part in columns([bare, EMPTY]).values()] == [7, 6, 6, 2]
 
 
-def test_thresholds_that_differ_between_rows_have_columns_of_their_own():
+def test_different_thresholds_have_separate_columns():
     rows = (FULL, FULL.replace(method="paper", f_scores=((0.25, 50.0), (1.0, 60.0))))
     first, second = cells(markdown(table(*rows)))
     assert (first["F 0.25 %"], first["F 0.5 %"], first["F 1 %"]) == (MISSING, "97.5", "99.2")
     assert (second["F 0.25 %"], second["F 0.5 %"], second["F 1 %"]) == ("50.0", MISSING, "60.0")
 
 
-def test_nothing_in_a_name_or_a_note_breaks_the_table():
+def test_names_and_notes_are_escaped_in_the_table():
     odd = BenchRow(
         scene="a|b", method="x\ny", minutes=1.0, note="failed: one | two\nIts last lines:"
     )
@@ -153,7 +153,7 @@ def test_nothing_in_a_name_or_a_note_breaks_the_table():
     assert len(cells(markdown(table(long)))[0]["note"]) <= 60
 
 
-def test_published_rows_stand_before_ours_and_are_marked():
+def test_published_rows_come_first_and_are_marked():
     ours = [FULL, FULL.replace(scene="potatoes"), FULL.replace(method="paper"), FULL]
     rows = with_published(ours)
     assert [(row.scene, row.published) for row in rows] == [
@@ -183,7 +183,7 @@ def test_published_figures_are_shown_as_printed():
     assert shown["potatoes", "global-stereo †"]["minutes"] == "1,320.0"  # 22 hours
 
 
-def test_the_legend_says_where_it_was_measured():
+def test_the_legend_names_the_machine():
     text = markdown(table(FULL, seed=3))
     assert "Scale quick, 2026-11-21T10:00, on Abacus 12, 2 cores, 23 GB; Linux" in text
     assert "torch 2.13.0; seed 3." in text
@@ -195,16 +195,16 @@ def printed(shown, width):
     return console.file.getvalue()
 
 
-def test_the_terminal_shows_the_same_cells_in_tables_no_wider_than_it():
+def test_the_terminal_shows_the_same_cells_within_its_width():
     text = printed(terminal(table(*with_published([FULL]))), 80)
     assert "…" not in text
     for word in ("PiMPeR †", "6.69", "24.7", "1,234", "1.23", "0.125", "99.2"):
         assert word in text
     assert text.count("default") == 4
-    assert text.count("PiMPeR") == 2  # its distances of surfaces were not published
+    assert text.count("PiMPeR") == 2  # surface distances were not published
 
 
-def test_the_terminal_says_in_full_why_figures_are_missing():
+def test_the_terminal_gives_the_full_reason_of_missing_figures():
     note = "failed: one\nIts last lines:\n  [red]two[/red] " + "word " * 30
     odd = EMPTY.replace(method="[b]pmvs[/b]", note=note)
     text = printed(terminal(table(FULL, odd)), 60)
@@ -213,7 +213,7 @@ def test_the_terminal_says_in_full_why_figures_are_missing():
     assert text.count("word") == 30
 
 
-def test_json_holds_every_field_and_null_for_what_is_no_number(tmp_path):
+def test_json_has_every_field_and_null_for_nan(tmp_path):
     before = table(FULL, EMPTY, *PUBLISHED, seed=3, scenes=["mug", "jar"])
     write_json(before, tmp_path / "bench.json")
     report = json.loads((tmp_path / "bench.json").read_text())
@@ -225,7 +225,7 @@ def test_json_holds_every_field_and_null_for_what_is_no_number(tmp_path):
     assert row["minutes"] is row["chamfer"] is None
 
 
-def test_a_missing_program_is_told_from_a_failure():
+def test_a_missing_program_is_distinguished_from_a_failure():
     missing = row_of_failure("mug", "pmvs", MissingProgramError("pmvs2 is not on the PATH"))
     assert missing.note == "not installed\npmvs2 is not on the PATH"
     failed = row_of_failure("mug", "paper", ReconstructionError("no facet"), minutes=0.5)

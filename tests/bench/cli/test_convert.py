@@ -19,13 +19,13 @@ from pimper_torch.ground.radiometry import LINEAR, Encoding
 from pimper_torch.records import Mesh
 
 READERS = {"colmap": read_colmap, "idr": read_idr, "transforms": read_transforms}
-# From a camera with OpenGL's axes to the world: at (1, 2, 3 + number), looking along -z.
+# From OpenGL camera axes to the world: at (1, 2, 3 + number), looking along -z.
 POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 
 
 @pytest.fixture
 def data(tmp_path):
-    """A transforms.json set of three photographs of levels that 8 bits hold."""
+    """A transforms.json set of three photographs with 8-bit levels."""
     folder = tmp_path / "data"
     (folder / "images").mkdir(parents=True)
     frames = []
@@ -46,7 +46,7 @@ def data(tmp_path):
 
 @pytest.fixture
 def converted(data, tmp_path):
-    """Convert to ``out``; the status of the program."""
+    """Convert to ``out``, and return the exit code."""
 
     def convert(source, target, *options, folder=data):
         arguments = [str(folder), "-o", str(tmp_path / "out"), "--source", source]
@@ -56,7 +56,7 @@ def converted(data, tmp_path):
 
 
 @pytest.mark.parametrize("target", READERS)
-def test_a_set_goes_to_every_layout_and_comes_back_the_same(
+def test_a_set_survives_conversion_to_every_layout_and_back(
     data, converted, tmp_path, capsys, target
 ):
     assert converted("transforms", target) == 0
@@ -89,7 +89,7 @@ def test_options_reach_the_reader_and_the_writer(converted, tmp_path):
         ("llff", [], r"not the layout of an LLFF set"),
     ],
 )
-def test_what_cannot_be_read_is_refused_and_nothing_is_written(
+def test_an_unreadable_set_is_refused_without_writing(
     converted, tmp_path, capsys, source, options, told
 ):
     assert converted(source, "idr", *options) == 2
@@ -111,10 +111,10 @@ def test_the_encoding_of_the_files_reaches_the_reader(data, converted, tmp_path)
     assert converted("transforms", "idr", *options) == 0
     found = read_idr(tmp_path / "out").views.images
     expected = read_transforms(data, encoding=Encoding(**told)).views.images
-    assert_close(found, expected, rtol=0, atol=0.01)  # of 8 bits in sRGB
+    assert_close(found, expected, rtol=0, atol=0.01)  # 8 bits in sRGB
 
 
-def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
+def test_unset_options_keep_the_values_of_the_layout(data, monkeypatch):
     asked = {}
 
     def stand_in(folder, *, scan, encoding=LINEAR):
@@ -127,7 +127,7 @@ def test_what_is_not_told_stays_what_the_layout_holds(data, monkeypatch):
     assert asked["encoding"] == Encoding(response=2.2, saturation=LINEAR.saturation)
 
 
-def test_a_large_cloud_is_thinned_from_end_to_end():
+def test_a_large_cloud_is_thinned_evenly_over_its_length():
     points = torch.arange(3 * 250_001).reshape(-1, 3).float()
     thin = cloud(Truth(points_world=points))
     assert len(thin) == 100_000
@@ -137,7 +137,7 @@ def test_a_large_cloud_is_thinned_from_end_to_end():
     assert cloud(Truth()) is None
 
 
-def test_every_layout_that_is_offered_has_a_reader_that_knows_its_options():
+def test_every_offered_layout_has_a_reader_with_its_options():
     assert set(layouts()) == set(get_args(Source))
     for layout in layouts().values():
         known = dict(inspect.signature(layout.read).parameters)
@@ -149,7 +149,7 @@ def test_every_layout_that_is_offered_has_a_reader_that_knows_its_options():
         assert ("encoding" in known) == (layout.encoding is not None)
 
 
-def test_one_light_a_position_is_kept_of_a_set_of_many_lights(converted, tmp_path, capsys):
+def test_one_light_per_position_is_selected_from_a_multi_light_set(converted, tmp_path, capsys):
     photographs = tmp_path / "Rectified" / "scan9"
     calibration = tmp_path / "Calibration" / "cal18"
     photographs.mkdir(parents=True)

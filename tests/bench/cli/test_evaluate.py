@@ -38,31 +38,31 @@ def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
     # Facets of a ball of 1280 faces lie a little under it.
     (line,) = [line for line in told.splitlines() if line.split()[:1] == ["accuracy"]]
     assert float(line.split()[1]) == pytest.approx(0.1, rel=0.03)
-    assert "rays" not in told
+    assert "rays" not in printed
 
 
 @pytest.mark.usefixtures("small_pictures")
-def test_how_near_a_result_comes_to_photographs_is_told(ball, reconstruction, tmp_path, capsys):
+def test_the_prediction_error_of_a_result_is_reported(ball, reconstruction, tmp_path, capsys):
     write_result(reconstruction, CoarseToFineConfig(), tmp_path / "result")
     out = tmp_path / "report.json"
     assert run(tmp_path / "result", ball, "--samples", 3000, "-o", out) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     figures = json.loads(out.read_text())["relighting"]
-    assert "photographs used" in told
-    assert f"{figures['psnr_db']:.2f} dB" in told
-    assert f"{figures['psnr_matte_db']:.2f} dB" in told
-    assert "mean over 3 photographs" in told
+    assert "photographs used" in printed
+    assert f"{figures['psnr_db']:.2f} dB" in printed
+    assert f"{figures['psnr_matte_db']:.2f} dB" in printed
+    assert "mean over 3 photographs" in printed
     assert figures["materials"][0]["vertices"] == 1
 
 
-def test_icp_is_told_with_its_share_and_takes_out_the_size(ball, tmp_path, capsys):
+def test_icp_is_reported_with_its_trimmed_fraction_and_removes_scale(ball, tmp_path, capsys):
     larger = write_ball(tmp_path / "larger.ply", 1.1)
     out = tmp_path / "report.json"
     options = ["--alignment", "icp", "--trimmed-fraction", 0.1]
     assert run(larger, ball, "--samples", 3000, *options, "-o", out) == 0
-    told = capsys.readouterr().out
-    assert "similarity ICP, point to plane, 10 % of the estimate trimmed, from identity" in told
-    assert str(out) in told
+    printed = capsys.readouterr().out
+    assert "similarity ICP, point to plane, 10 % of the estimate trimmed, from identity" in printed
+    assert str(out) in printed
     report = json.loads(out.read_text())
     assert report["alignment"]["scale"] == pytest.approx(1 / 1.1, rel=5e-3)
     assert report["surface"]["accuracy"]["mean"] < 5e-3
@@ -73,15 +73,15 @@ def test_icp_is_told_with_its_share_and_takes_out_the_size(ball, tmp_path, capsy
 def test_the_true_mesh_of_a_rendered_scene_has_no_error(rendering, capsys):
     result = rendering / "truth" / "mesh.ply"
     assert run(result, rendering, "--samples", 3000, "--thresholds-percent", 0.1, 2) == 0
-    told = capsys.readouterr().out
-    assert "f_score at 0.1 %" in told
-    assert "f_score at 2 %" in told
-    assert "along the rays of view_001.png" in told  # the centre one
-    assert "100.0 %" in told
-    assert "seen from 3 positions" in told
+    printed = capsys.readouterr().out
+    assert "f_score at 0.1 %" in printed
+    assert "f_score at 2 %" in printed
+    assert "along the rays of view_001.png" in printed  # the centre one
+    assert "100.0 %" in printed
+    assert "seen from 3 positions" in printed
 
 
-def test_only_what_evaluate_wrote_is_replaced_and_only_on_demand(ball, tmp_path, capsys):
+def test_only_a_former_report_is_replaced_and_only_on_request(ball, tmp_path, capsys):
     mesh = read_mesh(ball)
     write_ply(mesh.replace(expected_error=0.05 * (2 + mesh.vertices_world[:, 2])), ball)
     out = tmp_path / "report.json"
@@ -118,7 +118,7 @@ def test_only_what_evaluate_wrote_is_replaced_and_only_on_demand(ball, tmp_path,
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-def test_a_disk_that_is_full_leaves_the_former_report(ball, tmp_path, capsys, monkeypatch):
+def test_a_full_disk_keeps_the_former_report(ball, tmp_path, capsys, monkeypatch):
     out = tmp_path / "report.json"
     assert run(ball, ball, "--samples", 500, "-o", out) == 0
     before = out.read_bytes()
@@ -134,7 +134,7 @@ def test_a_disk_that_is_full_leaves_the_former_report(ball, tmp_path, capsys, mo
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "report.json"]
 
 
-def test_views_may_be_named(rendering, tmp_path, capsys):
+def test_views_can_be_selected_by_name(rendering, tmp_path, capsys):
     result, out = rendering / "truth" / "mesh.ply", tmp_path / "report.json"
     views = ["--views", "view_000.png", "view_002"]
     assert run(result, rendering, "--samples", 3000, "-o", out, *views) == 0
@@ -145,7 +145,7 @@ def test_views_may_be_named(rendering, tmp_path, capsys):
     assert "no view 'nobody'" in capsys.readouterr().err
 
 
-def test_what_each_figure_says_stands_beside_it_where_there_is_room(ball, monkeypatch, capsys):
+def test_figures_have_their_meaning_next_to_them_if_it_fits(ball, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
     assert run(ball, ball, "--samples", 500) == 0
     (wide,) = [line for line in capsys.readouterr().out.splitlines() if "chamfer_mean" in line]
@@ -156,7 +156,7 @@ def test_what_each_figure_says_stands_beside_it_where_there_is_room(ball, monkey
     assert "mean of" not in narrow
 
 
-def test_a_result_is_judged_by_the_protocol_of_dtu(dtu, tmp_path, capsys):
+def test_a_result_is_evaluated_by_the_protocol_of_dtu(dtu, tmp_path, capsys):
     result, out = write_ball(tmp_path / "result.ply", 10.5, level=4), tmp_path / "report.json"
     options = ["--truth-layout", "dtu-mvs", "--scan", 9, "--samples", 3000, "-o", out]
     assert run(result, dtu, *options) == 0
@@ -168,7 +168,7 @@ def test_a_result_is_judged_by_the_protocol_of_dtu(dtu, tmp_path, capsys):
     assert "thinned to 0.2 mm" in capsys.readouterr().out
 
 
-def test_views_of_a_set_are_paired_by_position_whatever_their_light(ball):
+def test_views_of_a_set_are_paired_by_position_under_any_light(ball):
     names = ("rect_001_0_r5000.png", "rect_002_0_r5000.png", "rect_003_0_r5000.png")
     capture = mesh_capture(ball)
     capture = capture.replace(views=capture.views.replace(names=names))
@@ -190,7 +190,7 @@ def test_views_of_a_set_are_paired_by_position_whatever_their_light(ball):
         ("ball.ply", "empty", ["--truth-layout", "dtu-mvs"], "--scan with the number of one"),
     ],
 )
-def test_what_cannot_be_done_is_told_in_a_sentence(
+def test_invalid_requests_give_one_message(
     ball, tmp_path, monkeypatch, capsys, result, truth, options, words
 ):
     (tmp_path / "empty").mkdir()

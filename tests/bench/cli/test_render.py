@@ -24,12 +24,12 @@ def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
     assert settings["bits"] == 16
     assert settings["seed"] == 4
     assert settings["point_light_distance"] == 2.5
-    told = capsys.readouterr()
-    assert f"{tmp_path}/out/photos" in told.out
-    assert "--photographs.response linear" in told.out
-    assert "photographs 2" in told.err
+    printed = capsys.readouterr()
+    assert f"{tmp_path}/out/photos" in printed.out
+    assert "--photographs.response linear" in printed.out
+    assert "photographs 2" in printed.err
 
 
-def test_settings_that_exclude_one_another_are_told_in_a_sentence(ball, tmp_path, capsys):
+def test_mutually_exclusive_settings_give_one_message(ball, tmp_path, capsys):
     assert render(ball, tmp_path / "out", "--fixed-point-light") == 2
     assert "fixed_point_light is True; needed: path turntable" in capsys.readouterr().err

@@ -21,7 +21,7 @@ def generator():
 
 @pytest.fixture
 def paint():
-    """Write a photograph of one level with a brighter top-left quarter."""
+    """Write a uniform photograph with a brighter top-left quarter."""
 
     def write(path: Path, level: int, width: int = 16, height: int = 12, mode: str = "RGB") -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -34,7 +34,7 @@ def paint():
 
 @pytest.fixture
 def paint_deep():
-    """Write a 16-bit PNG of one colour, or of colours pixel by pixel."""
+    """Write a 16-bit PNG of one colour, or of one colour per pixel."""
 
     def write(path: Path, levels: object, width: int, height: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,13 +46,13 @@ def paint_deep():
 
 @pytest.fixture
 def rig():
-    """Three cameras round the origin, for photographs of 1600 x 1200."""
+    """Three cameras around the origin, for photographs of 1600 x 1200."""
     return arc_cameras(3, width=1600, height=1200, focal_px=2900.0, distance=0.7)
 
 
 @pytest.fixture
 def save_calibration(rig):
-    """Save the rig as Bouguet's toolbox does: pixel centres from 0."""
+    """Save the rig in the format of Bouguet's toolbox: pixel centres count from 0."""
 
     def save(path: Path, **more: object) -> None:
         K, pose = rig.intrinsics[0].numpy(), rig.cam_from_world.numpy()
@@ -70,7 +70,7 @@ def hand_camera():
     """``cam_from_world`` of a camera at (-4, 2, 3) that looks along the world's x.
 
     Its right is the world's y, its down the world's z. The point (6, 3, 5) is 1 to the right,
-    2 down and 10 ahead; no two of these numbers are alike, so that no axis may be swapped.
+    2 down and 10 ahead; the numbers differ, so that swapped axes are detected.
     """
     rows = [[0.0, 1, 0, -2], [0, 0, 1, -3], [1, 0, 0, 4], [0, 0, 0, 1]]
     return torch.tensor(rows, dtype=torch.float64)
@@ -78,7 +78,7 @@ def hand_camera():
 
 @pytest.fixture
 def sees():
-    """Tell where a view of a capture sees the point (6, 3, 5)."""
+    """Project the point (6, 3, 5) into a view of a capture."""
 
     def pixel(capture, view: int = 0) -> list[float]:
         point = torch.tensor([[6.0, 3.0, 5.0]], dtype=torch.float64)
@@ -92,7 +92,7 @@ def sees():
 
 @pytest.fixture
 def lens_of(monkeypatch):
-    """Tell where the first lens that a reader finds images the direction (x, y, 1)."""
+    """Project the direction (x, y, 1) by the first camera model of a reader."""
 
     def pixel(read, folder, x: float, y: float) -> list[float]:
         found = []

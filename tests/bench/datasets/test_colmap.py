@@ -10,7 +10,7 @@ POSE = "0.5 -0.5 -0.5 -0.5 -2 -3 4"
 
 @pytest.fixture
 def folder(tmp_path, paint):
-    """A text model in sparse/0 beside images, one of which is in a folder of its own."""
+    """A text model in sparse/0 next to images, one of which is in a subfolder."""
     for name in ("a.png", "left/b.png", "c.png"):
         paint(tmp_path / "images" / name, 100)
     write_text(tmp_path / "sparse" / "0")
@@ -31,10 +31,10 @@ def test_a_text_model_is_read_with_its_photographs(folder, sees, hand_camera):
     assert capture.views.names == ("a.png", "left/b.png", "c.png")
     assert sees(capture) == pytest.approx([9, 11])
     assert_close(capture.cameras.cam_from_world[1], hand_camera)
-    assert capture.truth.points_world is None  # found, not measured
+    assert capture.truth.points_world is None  # triangulated, not measured
 
 
-def test_the_model_itself_may_be_named_and_masks_lie_beside(folder, paint, sees):
+def test_a_path_to_the_model_is_accepted_and_masks_are_next_to_it(folder, paint, sees):
     paint(folder / "masks" / "a.png.png", 0)
     paint(folder / "masks" / "b.png", 0)
     paint(folder / "masks" / "c-mask.png", 0)
@@ -43,7 +43,7 @@ def test_the_model_itself_may_be_named_and_masks_lie_beside(folder, paint, sees)
     assert capture.views.masks.sum() == 48
 
 
-def test_photographs_may_lie_elsewhere(folder, sees):
+def test_photographs_may_be_in_a_different_folder(folder, sees):
     (folder / "images").rename(folder / "pictures")
     with pytest.raises(InputError, match="a folder `images`"):
         read_colmap(folder)
@@ -58,7 +58,7 @@ def test_photographs_may_lie_elsewhere(folder, sees):
         (lambda at: (at / "sparse").rename(at / "dense"), r"cameras\.bin or cameras\.txt"),
     ],
 )
-def test_read_colmap_refuses_what_leads_out_or_is_missing(folder, paint, spoil, needed):
+def test_read_colmap_refuses_outside_paths_and_missing_files(folder, paint, spoil, needed):
     paint(folder / "secret.png", 100)
     spoil(folder)
     with pytest.raises(InputError, match=needed):

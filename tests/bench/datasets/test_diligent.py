@@ -12,14 +12,14 @@ from pimper_torch.ground.geometry.projection import project
 from pimper_torch.runtime.errors import InputError
 
 WIDTH, HEIGHT = 20, 16
-# In the sets' axes (x right, y up, z to the viewer): from the right, from above, head on.
+# In the sets' axes (x right, y up, z to the viewer): from the right, from above, frontal.
 DIRECTIONS = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [0.0, 0.0, 1.0]])
 INTENSITIES = np.array([[0.5, 1.0, 2.0], [1.0, 1.0, 1.0], [3.0, 2.0, 1.0]])
 
 
 @pytest.fixture
 def viewpoint(paint_deep):
-    """Write one viewpoint as DiLiGenT has it; its normals look half up."""
+    """Write one viewpoint in the format of DiLiGenT; its normals point diagonally up."""
 
     def write(folder, *, named: bool = True) -> None:
         names = [f"{point_light:03d}.png" for point_light in (1, 2, 3)]
@@ -41,7 +41,7 @@ def viewpoint(paint_deep):
 
 @pytest.fixture
 def turntable(tmp_path, rig, viewpoint):
-    """Write an object of DiLiGenT-MV whose published rotations are a little stretched."""
+    """Write an object of DiLiGenT-MV with slightly scaled rotations, as published."""
     arrays = {"KK": rig.intrinsics[0].numpy().copy()}
     arrays["KK"][:2, 2] -= 0.5
     for view in (1, 2, 3):
@@ -53,7 +53,7 @@ def turntable(tmp_path, rig, viewpoint):
     return tmp_path
 
 
-def test_views_and_lights_are_told_apart_and_points_project_as_the_files_say(turntable, rig):
+def test_views_and_lights_are_separated_and_points_project_as_in_the_files(turntable, rig):
     capture = read_diligent_mv(turntable)
     assert capture.position.tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     assert capture.light.tolist() == [1, 2, 3] * 3
@@ -74,11 +74,11 @@ def test_views_and_lights_are_told_apart_and_points_project_as_the_files_say(tur
     assert_close(rotation @ rotation.mT, torch.eye(3).expand(9, 3, 3))
 
 
-def test_lights_and_normals_are_turned_into_the_world(turntable, rig):
+def test_lights_and_normals_are_rotated_to_the_world_frame(turntable, rig):
     capture = read_diligent_mv(turntable, positions=[3])
     lights = capture.truth.lights_world
     toward_camera = normalize(rig.centers_world[2].float(), dim=0)
-    # Light 3 comes from the camera, light 2 from above it: up is -y in our camera.
+    # Light 3 is at the camera, light 2 above it: up is -y in our camera.
     assert_close(normalize(lights[2, 1:], dim=0), toward_camera, atol=0.01, rtol=0)
     up = -rig.cam_from_world[2, 1, :3].float()
     assert_close(lights[1, 1:] @ up, torch.tensor(0.6), atol=0.01, rtol=0)
@@ -92,7 +92,7 @@ def test_lights_and_normals_are_turned_into_the_world(turntable, rig):
     assert capture.views.masks[0].sum() == 80
 
 
-def test_one_light_a_view_shrunk(turntable):
+def test_one_light_per_view_is_read_at_reduced_size(turntable):
     capture = read_diligent_mv(turntable, light_seed=2, max_size_px=10)
     assert capture.position.tolist() == [1, 2, 3]
     assert sorted(capture.light.tolist()) == [1, 2, 3]
@@ -119,13 +119,13 @@ def _saying(name, text):
         ),
     ],
 )
-def test_another_layout_is_refused_by_what_was_expected_and_found(turntable, break_it, message):
+def test_a_different_layout_is_refused_with_expected_and_found_files(turntable, break_it, message):
     break_it(turntable)
     with pytest.raises(InputError, match=message):
         read_diligent_mv(turntable)
 
 
-def test_a_normal_map_comes_with_its_depth_and_pinhole(tmp_path, paint_deep):
+def test_a_normal_map_has_its_depth_and_pinhole(tmp_path, paint_deep):
     levels = [round((component + 1) / 2 * 65535) for component in (0.6, 0.0, 0.8)]
     paint_deep(tmp_path / "normal_map.png", levels, WIDTH, HEIGHT)
     mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
@@ -146,7 +146,7 @@ def test_a_normal_map_comes_with_its_depth_and_pinhole(tmp_path, paint_deep):
     assert found.depth[8, 4].isposinf()
 
 
-def test_a_depth_file_with_objects_in_it_is_refused(tmp_path, paint_deep):
+def test_a_depth_file_with_pickled_objects_is_refused(tmp_path, paint_deep):
     paint_deep(tmp_path / "normal_map.png", (65535, 32768, 32768), WIDTH, HEIGHT)
     Image.fromarray(np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)).save(tmp_path / "mask.png")
     np.savez(tmp_path / "depth_gt.npz", depth_gt=np.array([{"a": 1}], dtype=object))
@@ -175,7 +175,7 @@ def test_the_uw_set_is_read_by_its_lists(tmp_path, paint):
         read_uw_ps(tmp_path, "cat")
 
 
-def test_a_yale_face_tells_its_lights_by_name(tmp_path, paint):
+def test_lights_of_a_yale_face_are_read_from_file_names(tmp_path, paint):
     paint(tmp_path / "yaleB02_P00A+090E+00.pgm", 100, mode="L")
     paint(tmp_path / "yaleB02_P00A-000E+90.pgm", 60, mode="L")
     paint(tmp_path / "yaleB02_P00_Ambient.pgm", 10, mode="L")

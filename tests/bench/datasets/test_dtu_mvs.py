@@ -21,7 +21,7 @@ end_header
 
 @pytest.fixture
 def folder(tmp_path, rig, paint):
-    """Scan 9: three places, lights 0, 3 and max, and the set's own files."""
+    """Scan 9: three positions, lights 0, 3 and max, and the files of the set."""
     photographs = tmp_path / "Rectified" / "scan9"
     for place in (1, 2, 3):
         for point_light in ("0_r5000", "3_r5000", "max"):
@@ -55,15 +55,15 @@ def check_cameras(capture, rig):
     assert_close(capture.cameras.intrinsics, scaled.float(), atol=1e-5, rtol=1e-5)
 
 
-def test_photographs_come_with_the_cameras_of_their_positions_and_the_scan(folder, rig):
+def test_photographs_have_the_cameras_of_their_positions_and_the_scan(folder, rig):
     capture = read_dtu_mvs(folder, 9)
     assert capture.position.tolist() == [1, 1, 2, 2, 3, 3]
-    assert capture.light.tolist() == [0, 3] * 3  # `max` is no light of its own
+    assert capture.light.tolist() == [0, 3] * 3  # `max` is not a separate light
     check_cameras(capture, rig)
     assert_close(capture.truth.points_world, torch.tensor([[1.0, 2, 3], [4, 5, 600]]))
 
 
-def test_the_brightest_of_all_lights_is_read_when_asked_for(folder):
+def test_the_brightest_light_is_read_on_request(folder):
     capture = read_dtu_mvs(folder, 9, lights=[ALL_LIGHTS])
     assert capture.views.names == tuple(f"rect_{place:03d}_max.png" for place in (1, 2, 3))
 
@@ -107,7 +107,7 @@ def _camera_of(text):
         (_matrices, read_dtu_protocol, 9, r"a grid as ObsMask.*3 x 3"),
     ],
 )
-def test_another_layout_is_refused_by_what_was_expected_and_found(
+def test_a_different_layout_is_refused_with_expected_and_found_files(
     folder, spoil, read, scan, needed
 ):
     spoil(folder)

@@ -30,19 +30,19 @@ def folder(tmp_path, save_calibration, paint):
     return tmp_path
 
 
-def test_all_photographs_come_with_position_point_light_camera_and_scan(folder, rig):
+def test_all_photographs_have_position_point_light_camera_and_scan(folder, rig):
     capture = read_dtu_points(folder, 4)
     assert capture.position.tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3]
     assert capture.light.tolist() == [1, 2, 19] * 3
     assert capture.views.names[4] == "Img002_02.bmp"
-    # Linear: 82 of 255, not what sRGB would make of it.
+    # Linear: 82 of 255, not decoded from sRGB.
     assert_close(capture.views.images[4, :, -1, -1], torch.full((3,), 82 / 255))
-    # Points are columns of both halves, of which only the first three rows are places.
+    # Points are columns of both halves; only the first three rows are coordinates.
     points = capture.truth.points_world
     assert points.shape == (6, 3)
     assert_close(points[1], torch.tensor([1.0, 5.0, 9.0]))
     assert_close(points[5], torch.full((3,), 7.0))
-    # The photographs are a hundredth as wide as the calibration's.
+    # The photographs have a hundredth of the calibration's width.
     at = torch.tensor([[0.02, -0.03, 0.01]], dtype=torch.float64)
     full, _ = project(at, rig.cam_from_world[1], rig.intrinsics[1])
     small, depth = project(at.float(), *_camera(capture, 4))
@@ -54,7 +54,7 @@ def _camera(capture, view):
     return capture.cameras.cam_from_world[view], capture.cameras.intrinsics[view]
 
 
-def test_only_the_chosen_photographs_are_decoded(folder, monkeypatch):
+def test_only_selected_photographs_are_decoded(folder, monkeypatch):
     decoded = []
     monkeypatch.setattr(
         radiance,
@@ -68,7 +68,7 @@ def test_only_the_chosen_photographs_are_decoded(folder, monkeypatch):
     assert len(decoded) == 3
 
 
-def test_the_calibration_may_bear_the_name_of_the_download(folder):
+def test_the_calibration_may_have_the_file_name_of_the_download(folder):
     (folder / "Calib_Results_11.mat").rename(folder / "calibrationFile.mat")
     assert read_dtu_points(folder, 4).cameras.num_views == 9
 
@@ -97,7 +97,7 @@ def test_a_scene_without_its_scan_has_no_points(folder):
         ),
     ],
 )
-def test_another_layout_is_refused_by_what_was_expected_and_found(
+def test_a_different_layout_is_refused_with_expected_and_found_files(
     folder, save_calibration, break_it, message
 ):
     break_it(folder, save_calibration)

@@ -32,7 +32,7 @@ def save(folder, name="cameras.npz", count=2, **more):
     np.savez(folder / name, **(arrays | more))
 
 
-def test_the_matrix_goes_from_the_world_to_pixels_counted_from_0(folder, sees, hand_camera):
+def test_the_matrix_maps_the_world_to_pixels_counted_from_0(folder, sees, hand_camera):
     capture = read_idr(folder)
     assert sees(capture) == pytest.approx([10, 11])
     assert_close(capture.cameras.cam_from_world[0], hand_camera)
@@ -62,13 +62,13 @@ def test_other_camera_files_are_found(folder, sees):
         (np.ones((3, 3)), "16 finite numbers"),
     ],
 )
-def test_a_matrix_of_no_camera_is_refused(folder, matrix, needed):
+def test_an_invalid_projection_matrix_is_refused(folder, matrix, needed):
     save(folder, world_mat_1=matrix)
     with pytest.raises(InputError, match=needed):
         read_idr(folder)
 
 
-def test_the_unit_sphere_holds_the_points():
+def test_the_unit_sphere_contains_the_points():
     _, cameras, points = photographed(4)
     unit_from_world = torch.linalg.inv(unit_sphere(cameras, points))
     radius = transform(unit_from_world, points.double()).norm(dim=-1).max()
@@ -77,14 +77,14 @@ def test_the_unit_sphere_holds_the_points():
     assert_close(unit_from_world[:3, :3], unit_from_world[0, 0] * torch.eye(3).double())
 
 
-def test_without_points_the_sphere_lies_where_the_cameras_look():
+def test_without_points_the_sphere_is_where_the_cameras_look():
     cameras = arc_cameras(5, width=160, height=120, focal_px=200.0, distance=4.0)
     world_from_unit = unit_sphere(cameras)
     assert_close(world_from_unit[:3, 3], torch.zeros(3).double(), rtol=0, atol=1e-9)
-    assert_close(float(world_from_unit[0, 0]), 4 * 100 / 200)  # to the corner, at (80, 60)
+    assert_close(float(world_from_unit[0, 0]), 4 * 100 / 200)  # up to the corner at (80, 60)
 
 
-def test_masks_tell_the_size_of_the_sphere():
+def test_masks_determine_the_size_of_the_sphere():
     cameras = arc_cameras(3, width=160, height=120, focal_px=200.0, distance=4.0)
     row, column = torch.meshgrid(torch.arange(120) + 0.5, torch.arange(160) + 0.5, indexing="ij")
     radius_px = torch.tensor([10.0, 20.0, 15.0])[:, None, None]
@@ -106,7 +106,7 @@ def test_read_idr_refuses_other_numbers_of_cameras_and_masks(folder, spoil, need
         read_idr(folder)
 
 
-def test_unit_sphere_refuses_what_has_no_size():
+def test_unit_sphere_refuses_a_scene_without_extent():
     _, cameras, _ = photographed(4)
     with pytest.raises(InputError, match="look the same way"):
         unit_sphere(cameras.take([0, 0]))

@@ -12,7 +12,7 @@ ROW = [[0, 0, -1, -4, 12], [0, 1, 0, 2, 16], [1, 0, 0, 3, 20]]
 
 @pytest.fixture
 def folder(tmp_path, paint):
-    """Two photographs whose plain and natural orders differ; the second camera is farther."""
+    """Two photographs with different lexicographic and natural order; the second is farther."""
     rows = np.zeros((2, 17))
     rows[:, :15] = np.array(ROW, dtype=float).reshape(-1)
     rows[1, 3] = -14.0
@@ -22,14 +22,14 @@ def folder(tmp_path, paint):
     return tmp_path
 
 
-def test_the_columns_are_down_right_and_back(folder, sees, hand_camera):
+def test_pose_columns_are_down_right_and_back(folder, sees, hand_camera):
     capture = read_llff(folder)
     # 1 right, 2 down, 10 ahead; focal length 20, principal point (8, 6).
     assert sees(capture) == pytest.approx([10, 10])
     assert torch.equal(capture.cameras.cam_from_world[0], hand_camera)
 
 
-def test_rows_belong_to_names_in_plain_order(folder):
+def test_rows_belong_to_lexicographically_sorted_names(folder):
     capture = read_llff(folder)
     assert capture.views.names == ("10.png", "9.png")
     assert capture.cameras.centers_world[:, 0].tolist() == [-4, -14]
@@ -45,7 +45,7 @@ def test_a_smaller_copy_of_the_photographs_has_smaller_cameras(folder, paint, se
     assert sees(read_llff(folder)) == pytest.approx([5, 5])
 
 
-def test_masks_beside_the_photographs_are_found(folder, paint):
+def test_masks_next_to_the_photographs_are_found(folder, paint):
     assert read_llff(folder).views.masks is None
     for name in ("10-removebg-preview.png", "9-removebg-preview.png"):
         paint(folder / "images_mask" / name, 0, 8, 6)
@@ -83,7 +83,7 @@ def test_read_llff_refuses_other_arrays(folder, spoil, needed):
     ("missing", "needed"),
     [("poses_bounds.npy", r"a file poses_bounds\.npy"), ("images", "a folder `images`")],
 )
-def test_read_llff_names_what_is_missing(folder, missing, needed):
+def test_read_llff_names_missing_files(folder, missing, needed):
     (folder / missing).rename(folder / "elsewhere")
     with pytest.raises(InputError, match=needed):
         read_llff(folder)

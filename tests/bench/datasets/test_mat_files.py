@@ -1,4 +1,4 @@
-"""MATLAB's files: as scipy reads them, and what a stranger wrote takes no memory."""
+"""MATLAB files are read as by scipy, and untrusted ones allocate no memory."""
 
 import struct
 import tracemalloc
@@ -25,7 +25,7 @@ ARRAYS = {
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_arrays_are_read_as_scipy_reads_them(tmp_path, packed):
+def test_arrays_are_read_as_by_scipy(tmp_path, packed):
     scipy.io.savemat(tmp_path / "a.mat", ARRAYS, do_compression=packed)
     oracle = scipy.io.loadmat(tmp_path / "a.mat")
     read = read_variables(tmp_path / "a.mat")
@@ -39,7 +39,7 @@ def test_arrays_are_read_as_scipy_reads_them(tmp_path, packed):
     assert [name for name, array in only.items() if array is not None] == ["one"]
 
 
-def test_what_says_too_much_is_refused_before_memory_is_taken(tmp_path, monkeypatch):
+def test_oversized_claims_are_refused_before_allocation(tmp_path, monkeypatch):
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"a": np.ones((3, 5))})
     data = path.read_bytes()

@@ -6,7 +6,7 @@ import torch
 from pimper_bench.datasets import read_camera_file
 from pimper_torch.runtime.errors import InputError
 
-# `hand_camera`, as the file has it: R column by column, and the camera's place.
+# `hand_camera` in the file's format: columns of R, and the camera's centre.
 ROTATION = ["0", "0", "1", "1", "0", "0", "0", "1", "0"]
 POSE = {"transform": {"rotation": ROTATION, "center": ["-4", "2", "3"]}, "locked": "0"}
 # Focal lengths 20 and 30 px of 16 px, on a sensor 32 mm wide; principal point (6.5, 4.5)
@@ -65,12 +65,12 @@ def test_every_version_of_the_file_gives_the_same_camera(
     save, sees, hand_camera, version, intrinsic, expected
 ):
     capture = read_camera_file(save(version, intrinsic))
-    assert capture.views.names == ("a.png", "b.png")  # the third view found no place
+    assert capture.views.names == ("a.png", "b.png")  # the third view is not registered
     assert sees(capture) == pytest.approx(expected)
     assert torch.allclose(capture.cameras.cam_from_world[0], hand_camera)
 
 
-def test_photographs_are_looked_up_by_name(save, sees, tmp_path, paint):
+def test_photographs_are_found_by_name(save, sees, tmp_path, paint):
     save()
     for name in ("a.png", "b.png"):
         (tmp_path / name).unlink()

@@ -6,7 +6,7 @@ import torch
 from pimper_bench.datasets import read_camera_file
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
-# `hand_camera` from camera to chunk, row by row: columns are its right, down, forward, place.
+# `hand_camera` from camera to chunk, row by row: columns are its right, down, forward, centre.
 TRANSFORM = "0 0 1 -4 1 0 0 2 0 1 0 3 0 0 0 1"
 # f + b1 = 20 along x, 30 along y; principal point (7, 5) of 16 x 12.
 LENS = "<f>30</f><b1>-10</b1><cx>-1</cx><cy>-1</cy>"
@@ -43,22 +43,22 @@ def save(tmp_path, paint):
     return write
 
 
-def test_the_transform_goes_from_the_camera_to_the_chunk(save, sees, hand_camera):
+def test_the_transform_maps_the_camera_to_the_chunk(save, sees, hand_camera):
     capture = read_camera_file(save())
-    assert capture.views.names == ("a.png", "b.png")  # `c` is not aligned, or switched off
+    assert capture.views.names == ("a.png", "b.png")  # `c` is not aligned, or disabled
     assert sees(capture) == pytest.approx([9, 11])
     assert torch.allclose(capture.cameras.cam_from_world[0], hand_camera)
 
 
 @pytest.mark.parametrize("where", ["component", "chunk"])
-def test_the_chunks_own_similarity_is_applied(save, where):
+def test_the_similarity_of_the_chunk_is_applied(save, where):
     # A quarter turn about z, twice the size, then a step.
     similarity = (
         "<transform><rotation>0 -1 0 1 0 0 0 0 1</rotation><translation>10 20 30</translation>"
         "<scale>2</scale></transform>"
     )
     cameras = read_camera_file(save(**{where: similarity})).cameras
-    # The camera's place (-4, 2, 3) goes to 2 (-2, -4, 3) + (10, 20, 30).
+    # The camera's centre (-4, 2, 3) maps to 2 (-2, -4, 3) + (10, 20, 30).
     assert cameras.centers_world[0].tolist() == pytest.approx([6, 12, 36])
     # Its forward, the chunk's x, is now the world's y.
     assert cameras.cam_from_world[0, 2, :3].tolist() == pytest.approx([0, 1, 0])
@@ -90,7 +90,7 @@ ANGLE = math.atan(math.sqrt(0.05))
         ),
     ],
 )
-def test_the_lens_is_that_of_the_manual(save, lens_of, kind, terms, x, y):
+def test_the_distortion_model_is_that_of_the_manual(save, lens_of, kind, terms, x, y):
     at = lens_of(read_camera_file, save(kind=kind, lens=LENS + terms), 0.1, 0.2)
     assert at == pytest.approx([8 - 1 + 30 * x - 10 * x, 6 - 1 + 30 * y])
 
@@ -117,23 +117,23 @@ def test_an_unknown_file_is_refused(save, pieces, needed):
         read_camera_file(save(**pieces))
 
 
-def test_of_several_chunks_with_cameras_none_is_guessed(save):
+def test_several_chunks_with_cameras_are_refused(save):
     camera = '<camera sensor_id="0" label="z"><transform/></camera>'
     other = f'</chunk><chunk label="roof"><cameras>{camera}</cameras>'
-    told = r"has 2 chunks: Chunk 1 \(2 cameras\), roof \(1 cameras\); needed: one.*Export the"
-    with pytest.raises(InputError, match=told):
+    message = r"has 2 chunks: Chunk 1 \(2 cameras\), roof \(1 cameras\); needed: one.*Export the"
+    with pytest.raises(InputError, match=message):
         read_camera_file(save(chunk=other))
     unaligned = other.replace("<transform/>", "")
     assert read_camera_file(save(chunk=unaligned)).views.names == ("a.png", "b.png")
 
 
-def test_of_several_components_the_largest_is_read(save):
+def test_the_largest_of_several_components_is_read(save):
     third = f'<camera sensor_id="0" component_id="1" label="d"><transform>{TRANSFORM}</transform>'
     folder = save()
     text = (folder / "cameras.xml").read_text().replace("</cameras>", f"{third}</camera></cameras>")
     (folder / "cameras.xml").write_text(text)
-    told = "2 components, each in a frame of its own; read is that of 2 cameras, not that of 1"
-    with pytest.warns(PimperWarning, match=told):
+    message = "2 components, each in a frame of its own; read is that of 2 cameras, not that of 1"
+    with pytest.warns(PimperWarning, match=message):
         assert read_camera_file(folder).views.names == ("a.png", "b.png")
 
 

@@ -40,7 +40,7 @@ def put(shots, folder, **options):
 
 @pytest.fixture
 def shot(tmp_path, paint, hand_camera):
-    """Make a photograph of the hand-worked camera."""
+    """Make a photograph of the camera computed by hand."""
 
     def make(name: str = "a.png", width: int = 16, height: int = 12, **more) -> PosedPhotograph:
         paint(tmp_path / name, 100, width, height)
@@ -64,21 +64,21 @@ def test_the_camera_stays_with_its_photograph(shot, tmp_path, sees):
 
 
 @pytest.mark.parametrize("option", [{"max_size_px": 8}, {}])
-def test_the_camera_follows_when_its_photograph_is_smaller(shot, tmp_path, sees, option):
+def test_the_camera_is_scaled_with_its_photograph(shot, tmp_path, sees, option):
     small = shot() if option else shot(width=8, height=6)
     capture = put([small], tmp_path, **option)
     assert sees(capture) == pytest.approx([4.5, 5.5])
     assert capture.cameras.sizes_px.tolist() == [[8, 6]] == capture.views.sizes_px.tolist()
 
 
-def test_the_skew_follows_a_resize(shot, tmp_path, sees):
+def test_the_skew_is_scaled_with_the_photograph(shot, tmp_path, sees):
     sheared = shot(skew_px=5.0)
     assert sees(put([sheared], tmp_path)) == pytest.approx([10, 11])
     small = put([sheared], tmp_path, max_size_px=8)
     assert sees(small) == pytest.approx([5, 5.5])
 
 
-def test_names_choose_and_order_photographs(shot, tmp_path):
+def test_names_select_and_order_photographs(shot, tmp_path):
     shots = [shot("a.png"), shot("b.png"), shot("c.png", skew_px=3.0)]
     capture = put(shots, tmp_path, names=["c.png", "a.png"])
     assert capture.views.names == ("c.png", "a.png")
@@ -86,7 +86,7 @@ def test_names_choose_and_order_photographs(shot, tmp_path):
     assert capture.position.tolist() == [0, 1] == capture.light.tolist()
 
 
-def test_a_lens_is_undistorted_to_the_pinhole_of_the_capture(tmp_path, hand_camera):
+def test_photographs_are_undistorted_to_the_pinhole_of_the_capture(tmp_path, hand_camera):
     lens = CameraModel(
         camera=1,
         model="OPENCV",
@@ -106,14 +106,14 @@ def test_a_lens_is_undistorted_to_the_pinhole_of_the_capture(tmp_path, hand_came
     capture = put([shot], tmp_path, encoding=LINEAR)
     cameras = capture.cameras
     expected, _ = project(dot, cameras.cam_from_world[0], cameras.intrinsics[0])
-    assert (expected - at).norm() > 1  # or the lens did nothing
+    assert (expected - at).norm() > 1  # distortion has an effect
     image = capture.views.images[0, 0].double()
     v, u = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     found = torch.stack([(u * image).sum(), (v * image).sum()]) / image.sum()
-    assert_close(found, expected[0], rtol=0, atol=0.15)  # the bump is stretched a little
+    assert_close(found, expected[0], rtol=0, atol=0.15)  # the bump is slightly stretched
 
 
-def test_a_mask_of_another_size_is_stretched_over_the_photograph(shot, tmp_path):
+def test_a_mask_of_a_different_size_is_resized_to_the_photograph(shot, tmp_path):
     drawn = np.zeros((6, 8), dtype=np.uint8)
     drawn[1:3, 4:7] = 1  # a label, not a brightness
     Image.fromarray(drawn).save(tmp_path / "m.png")
@@ -123,14 +123,14 @@ def test_a_mask_of_another_size_is_stretched_over_the_photograph(shot, tmp_path)
     assert torch.equal(masks[0], expected)
 
 
-def test_the_true_surface_comes_along(shot, tmp_path):
+def test_the_true_surface_is_kept(shot, tmp_path):
     (tmp_path / "true.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
     truth = put([shot()], tmp_path, mesh=tmp_path / "true.obj").truth
     assert truth.mesh.vertices_world.tolist() == [[0, 0, 0], [1, 0, 0], [0, 2, 0]]
 
 
-def test_links_to_images_are_followed_wherever_they_lie(tmp_path, paint):
-    """A link to a file, a link to a link, and a folder that is one."""
+def test_links_to_images_are_followed(tmp_path, paint):
+    """A link to a file, a link to a link, and a linked folder."""
     paint(tmp_path / "elsewhere" / "deep" / "0.png", 100)
     folder = tmp_path / "set"
     folder.mkdir()
@@ -153,7 +153,7 @@ def test_a_rounded_rotation_is_made_exact(tmp_path):
     rounded, place = (rotation * 1e4).round() / 1e4, DataSetPath(tmp_path, "a toy")
     exact = place.rigid(rounded, torch.ones(3).double(), "R")[:3, :3]
     assert_close(exact @ exact.T, torch.eye(3).double(), rtol=0, atol=1e-14)
-    assert_close(exact, rotation, rtol=0, atol=1e-4)  # what the rounding took
+    assert_close(exact, rotation, rtol=0, atol=1e-4)  # the rounding error
 
 
 def test_masks_are_found_by_name(tmp_path, paint):
@@ -162,8 +162,8 @@ def test_masks_are_found_by_name(tmp_path, paint):
     find = mask_finder(tmp_path / "m", "a toy")
     photographs = [tmp_path / name for name in ("1.jpg", "10.jpg", "2.jpg")]
     assert [find(path).name for path in photographs] == ["1.png", "10-cut.png", "2.jpg.png"]
-    for name, told in (("3.jpg", r"one mask for 3\.jpg"), ("4.jpg", r"4-a\.png, 4-b\.png")):
-        with pytest.raises(InputError, match=told):
+    for name, message in (("3.jpg", r"one mask for 3\.jpg"), ("4.jpg", r"4-a\.png, 4-b\.png")):
+        with pytest.raises(InputError, match=message):
             find(tmp_path / name)
     assert mask_finder(None, "a toy")(tmp_path / "3.jpg") is None
 
@@ -174,7 +174,7 @@ def _black(path):
 
 
 @pytest.mark.parametrize(
-    ("shots", "options", "told"),
+    ("shots", "options", "message"),
     [
         (
             [{}],
@@ -189,14 +189,14 @@ def _black(path):
         ([{"mask": "m.png"}], {}, r"m\.png: marks no pixel"),
     ],
 )
-def test_photographs_that_do_not_fit_are_refused(shot, tmp_path, shots, options, told):
+def test_mismatching_photographs_are_refused(shot, tmp_path, shots, options, message):
     _black(tmp_path / "m.png")
     made = [shot(**one) for one in shots]
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         put(made, tmp_path, **options)
 
 
-def test_a_missing_photograph_is_refused_unless_it_is_not_asked_for(shot, tmp_path):
+def test_a_missing_photograph_is_refused_if_it_is_requested(shot, tmp_path):
     shots = [shot("a.png"), shot("b.png")]
     (tmp_path / "b.png").unlink()
     with pytest.raises(InputError, match=r"no b\.png"):
@@ -218,7 +218,7 @@ def test_an_export_survives_a_round_trip(layout, seed, skewed, masked):
     write, read = LAYOUTS[layout]
     views, cameras, points = photographed(seed, skewed, masked)
     with TemporaryDirectory() as folder:
-        if skewed and layout != "idr":  # a layout without a place for it refuses it
+        if skewed and layout != "idr":  # layouts without skew refuse it
             with pytest.raises(InputError, match="a skew"):
                 write(views, cameras, Path(folder), points_world=points)
             return
@@ -228,7 +228,7 @@ def test_an_export_survives_a_round_trip(layout, seed, skewed, masked):
     assert again.views.names == tuple(f"{stem}.png" for stem in stems)
     assert_close(again.views.images, views.images)
     shown = views.inside if views.masks is None else views.masks & views.inside
-    if masked or layout == "idr":  # whose programs want some
+    if masked or layout == "idr":  # its programs require masks
         assert torch.equal(again.views.masks, shown)
     assert_close(again.cameras.intrinsics, cameras.intrinsics)
     assert_close(again.cameras.cam_from_world, cameras.cam_from_world)

@@ -30,7 +30,7 @@ def copy(rendering, tmp_path):
     return shutil.copytree(rendering, tmp_path / "copy")
 
 
-def test_what_is_read_is_what_was_rendered(rendering, ball):
+def test_a_rendering_survives_a_round_trip(rendering, ball):
     scene = build_scene(ball, CONFIG)
     capture = read_rendered(rendering)
     cameras, truth = capture.cameras, capture.truth
@@ -59,7 +59,7 @@ def test_what_is_read_is_what_was_rendered(rendering, ball):
     assert capture.position.tolist() == capture.light.tolist() == [0, 1, 2]
 
 
-def test_some_views_are_those_of_the_whole_in_the_order_wanted(rendering):
+def test_selected_views_equal_those_of_the_complete_set(rendering):
     whole, some = read_rendered(rendering), read_rendered(rendering, views=[2, 0])
     assert some.views.names == (whole.views.names[2], whole.views.names[0])
     assert_close(some.views.images, whole.views.images[[2, 0]])
@@ -82,7 +82,7 @@ def test_linear_deep_photographs_are_not_decoded_as_srgb(ball, tmp_path):
     assert_close(found, frame.image, atol=0.51 / 65535, rtol=0)
 
 
-def test_settings_that_have_gone_are_passed_over(copy):
+def test_removed_settings_are_ignored(copy):
     path = copy / "truth" / "scene.json"
     account = json.loads(path.read_text())
     account["settings"]["bounces"] = 0
@@ -91,7 +91,7 @@ def test_settings_that_have_gone_are_passed_over(copy):
 
 
 @pytest.mark.parametrize("views", [[3], [-1], [0, 0], []])
-def test_views_that_are_not_there_are_refused(rendering, views):
+def test_missing_views_are_refused(rendering, views):
     with pytest.raises(InputError, match="different views between 0 and 2"):
         read_rendered(rendering, views=views)
 
@@ -135,13 +135,13 @@ def _saying(name, **changes):
         ),
     ],
 )
-def test_a_folder_with_something_else_is_refused(copy, spoil, words):
+def test_a_folder_with_other_content_is_refused(copy, spoil, words):
     spoil(copy)
     with pytest.raises(InputError, match=words):
         read_rendered(copy)
 
 
-def test_what_is_not_wanted_takes_no_memory(rendering):
+def test_unrequested_maps_take_no_memory(rendering):
     lean = read_rendered(rendering, maps=False, photographs=False)
     assert lean.truth.depth is lean.truth.foreground is lean.views.masks is None
     assert lean.views.images.shape == (3, 3, 36, 50)

@@ -20,9 +20,7 @@ def grid(num_positions: int, num_lights: int) -> tuple[torch.Tensor, torch.Tenso
 
 @pytest.mark.parametrize(("num_positions", "num_lights"), [(119, 19), (49, 7), (20, 96), (5, 2)])
 @pytest.mark.parametrize("seed", range(5))
-def test_every_position_has_one_light_all_are_used_evenly_and_neighbours_differ(
-    num_positions, num_lights, seed
-):
+def test_lights_are_used_evenly_and_differ_between_neighbours(num_positions, num_lights, seed):
     position, light = grid(num_positions, num_lights)
     chosen = one_light_per_position(position, light, torch.Generator().manual_seed(seed))
     assert position[chosen].tolist() == list(range(1, num_positions + 1))
@@ -33,7 +31,7 @@ def test_every_position_has_one_light_all_are_used_evenly_and_neighbours_differ(
     assert all(one != other for one, other in itertools.pairwise(point_lights))
 
 
-def test_the_seed_decides_and_unlike_seeds_choose_unlike_lights():
+def test_the_seed_determines_the_lights():
     position, light = grid(40, 7)
     first, again, other = (
         one_light_per_position(position, light, torch.Generator().manual_seed(seed))
@@ -41,11 +39,11 @@ def test_the_seed_decides_and_unlike_seeds_choose_unlike_lights():
     )
     assert first.equal(again)
     assert not first.equal(other)
-    # Not the same cycle begun elsewhere: no order of the point lights is repeated.
+    # Not a shift of the same cycle: no order of the point lights is repeated.
     assert len({tuple(light[first][start : start + 7].tolist()) for start in range(0, 35, 7)}) == 5
 
 
-def test_a_position_with_a_single_light_takes_it_though_its_neighbour_has_it_too():
+def test_a_position_with_a_single_light_uses_it_even_if_its_neighbour_does():
     position, light = torch.tensor([1, 2, 2, 3]), torch.tensor([5, 5, 6, 6])
     chosen = one_light_per_position(position, light, torch.Generator().manual_seed(0))
     assert light[chosen].tolist() == [5, 6, 6]
@@ -64,6 +62,6 @@ def test_subsets_are_kept_in_order_of_position_and_light():
 @pytest.mark.parametrize(
     "asked", [{"positions": [4], "lights": None}, {"positions": None, "lights": [9]}]
 )
-def test_a_position_or_light_that_is_not_there_is_refused(asked):
+def test_a_missing_position_or_light_is_refused(asked):
     with pytest.raises(InputError, match=r"set: not the layout of a set.*(positions 4|lights 9)"):
         choose_photographs([1, 2], [0, 1], DataSetPath(Path("set"), "a set"), **asked)

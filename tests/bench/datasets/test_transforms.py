@@ -11,14 +11,14 @@ from pimper_bench.datasets import read_transforms
 from pimper_torch.doors.export.nerfstudio import write_transforms
 from pimper_torch.runtime.errors import InputError
 
-# `hand_camera`: columns are the camera's right, up (its down is the world's z), back, place.
+# `hand_camera`: columns are the camera's right, up (its down is the world's z), back, centre.
 MATRIX = [[0, 0, -1, -4], [1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]
 LENS = {"fl_x": 20, "fl_y": 30, "cx": 7, "cy": 5, "w": 16, "h": 12}
 
 
 @pytest.fixture
 def save(tmp_path, paint):
-    """Write transforms.json, one frame a file; values of the frames by keyword."""
+    """Write transforms.json with one frame per file; keywords set values of the frames."""
     for name in ("a.png", "b.png"):
         paint(tmp_path / "images" / name, 100)
 
@@ -30,19 +30,19 @@ def save(tmp_path, paint):
     return write
 
 
-def test_the_matrix_goes_from_the_camera_with_opengl_axes_to_the_world(save, sees, hand_camera):
+def test_the_matrix_maps_opengl_camera_axes_to_the_world(save, sees, hand_camera):
     capture = read_transforms(save())
     assert sees(capture) == pytest.approx([9, 11])
     assert_close(capture.cameras.cam_from_world[1], hand_camera)
     assert capture.views.names == ("a.png", "b.png")
 
 
-def test_a_frame_may_have_intrinsics_of_its_own(save, sees):
+def test_a_frame_may_have_its_own_intrinsics(save, sees):
     assert sees(read_transforms(save(cx=6, fl_y=25))) == pytest.approx([8, 10])
     assert sees(read_transforms(save({}, **LENS))) == pytest.approx([9, 11])
 
 
-def test_blender_gives_an_angle_and_no_suffix(save, sees, paint, tmp_path):
+def test_blender_files_have_an_angle_and_no_suffix(save, sees, paint, tmp_path):
     # 16 pixels wide, so the focal length is 8 / tan(angle / 2) = 20; the centre is (8, 6).
     angle = 2 * math.atan(8 / 20)
     files = ("./images/a", "./train/a")
@@ -59,7 +59,7 @@ def test_a_vertical_angle_gives_the_other_focal_length(save, sees):
     assert sees(read_transforms(save(angles))) == pytest.approx([10, 12])
 
 
-def test_alpha_is_the_mask_and_a_mask_file_goes_before_it(save, tmp_path):
+def test_alpha_is_the_mask_unless_there_is_a_mask_file(save, tmp_path):
     array = np.full((12, 16, 4), 200, dtype=np.uint8)
     array[:4, :, 3] = 0
     Image.fromarray(array).save(tmp_path / "images" / "a.png")
@@ -79,7 +79,7 @@ def test_alpha_is_the_mask_and_a_mask_file_goes_before_it(save, tmp_path):
         ({"k1": 0.0, "camera_model": "SIMPLE_PINHOLE"}, 1.0),
     ],
 )
-def test_the_lens_is_opencvs(save, lens_of, more, model):
+def test_the_distortion_model_is_that_of_opencv(save, lens_of, more, model):
     # The point is at x = 0.1, y = 0.2, so r^2 = 0.05; the lens moves it along the radius.
     found = lens_of(read_transforms, save(**more), 0.1, 0.2)
     assert found == pytest.approx([7 + 20 * 0.1 * model, 5 + 30 * 0.2 * model])
@@ -92,7 +92,7 @@ def test_tangential_terms_are_in_opencvs_order(save, lens_of):
     assert found == pytest.approx([7 + 20 * x, 5 + 30 * y])
 
 
-def test_a_fisheye_bends_by_the_angle(save, lens_of):
+def test_a_fisheye_distorts_by_the_angle(save, lens_of):
     more = {"camera_model": "OPENCV_FISHEYE", "k1": 0.5, "k4": 2.0}
     found = lens_of(read_transforms, save(**more), 0.1, 0.2)
     radius = math.sqrt(0.05)
@@ -121,12 +121,12 @@ def test_a_fisheye_bends_by_the_angle(save, lens_of):
         ),
     ],
 )
-def test_a_frame_of_anything_else_is_refused(save, more, needed):
+def test_an_invalid_frame_is_refused(save, more, needed):
     with pytest.raises(InputError, match=needed):
         read_transforms(save(files=("images/a.png",), **more))
 
 
-def test_intrinsics_shared_by_all_views_stand_once(tmp_path):
+def test_intrinsics_shared_by_all_views_are_written_once(tmp_path):
     views, cameras, _ = photographed(4)
     write_transforms(views.take([0]), cameras.take([0]), tmp_path / "one")
     said = json.loads((tmp_path / "one" / "transforms.json").read_text())

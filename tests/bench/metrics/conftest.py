@@ -22,7 +22,7 @@ def make():
 
 @dataclass(frozen=True)
 class Makers:
-    """Surfaces and captures whose figures can be computed by hand."""
+    """Surfaces and captures with figures that can be computed by hand."""
 
     def square(self, height=0.0, side=1.0):
         corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]).double()
@@ -34,13 +34,13 @@ class Makers:
         return Mesh(vertices_world=radius * vertices, faces=faces)
 
     def half_sphere(self, level=5):
-        """Keep the faces of a sphere whose centre is above z = 0."""
+        """Return the faces of a sphere with a centroid above z = 0."""
         mesh = self.sphere(level=level)
         above = mesh.vertices_world[mesh.faces].mean(dim=1)[:, 2] > 0
         return mesh.replace(faces=mesh.faces[above])
 
     def potato(self, level=4):
-        """An ellipsoid with bumps, which no similarity but the identity maps on itself."""
+        """Return an ellipsoid with bumps that has no symmetries."""
         vertices, faces = icosphere(level)
         x, y, z = vertices.unbind(dim=1)
         bumps = 1 + 0.15 * torch.sin(3 * x + 1) * torch.cos(2 * y) + 0.1 * torch.sin(4 * z + x)

@@ -59,11 +59,11 @@ def test_half_a_sphere_is_accurate_and_half_complete(make):
     assert found.whole.completeness.mean == pytest.approx(float(missing) / 2, rel=0.03)
     at = found.whole.thresholds[-1]
     assert at.precision == 1
-    rim = math.sin(2 * math.asin(at.threshold / 2)) / 2  # fraction of the sphere below it
+    rim = math.sin(2 * math.asin(at.threshold / 2)) / 2  # fraction of the sphere below the rim
     assert at.recall == pytest.approx(0.5 + rim, abs=0.01)
 
 
-def test_what_lies_on_the_table_is_left_out_of_accuracy_and_told(make):
+def test_points_on_the_table_are_excluded_from_accuracy_and_reported(make):
     table = make.square(side=3.0)
     table = table.replace(vertices_world=table.vertices_world - 1.0)  # at z = -1
     truth = Truth(mesh=make.square(), surroundings=table)
@@ -83,7 +83,7 @@ def test_what_lies_on_the_table_is_left_out_of_accuracy_and_told(make):
     assert only.surroundings_fraction == 1
 
 
-def test_completeness_of_the_seen_part_ignores_the_back(make):
+def test_completeness_of_the_visible_part_ignores_the_back(make):
     cameras = make.cameras(count=5, span_deg=1.0)
     front = make.sphere(level=4)
     towards = cameras.centers_world.mean(dim=0)
@@ -106,7 +106,7 @@ def test_views_from_one_position_count_once(make):
     assert compared(sphere, same, seen_from=2).seen_fraction > 0.3
 
 
-def test_something_in_front_hides_the_surface(make):
+def test_an_occluder_hides_the_surface(make):
     cameras = make.cameras(count=3, span_deg=1.0)
     sphere = make.sphere(level=3)
     shade = make.square(side=8.0)
@@ -120,7 +120,7 @@ def test_something_in_front_hides_the_surface(make):
     assert compared(sphere, hidden).seen_fraction == 0
 
 
-def test_clouds_stand_for_surfaces_on_both_sides(make):
+def test_clouds_can_replace_either_surface(make):
     points = make.square().replace(faces=torch.zeros(0, 3, dtype=torch.long))
     raised = make.square(height=0.1).replace(faces=points.faces)
     truth = Truth(points_world=points.vertices_world)
@@ -130,7 +130,7 @@ def test_clouds_stand_for_surfaces_on_both_sides(make):
     assert found.whole.chamfer_sum == pytest.approx(0.2)
 
 
-def test_estimates_are_measured_alike_in_any_order(make):
+def test_estimates_are_measured_equally_in_any_order(make):
     truth = TrueSurface(make.capture_of(make.sphere()), samples=500)
     first = truth.compare(make.sphere(1.1))
     truth.compare(make.sphere(1.2))

@@ -14,7 +14,7 @@ def cloud(points):
 
 
 def protocol_of(mask=None, plane=(0.0, 0.0, 1.0, 0.5), side=40):
-    """A mask of ones, voxels of 1 mm whose centres are at whole millimetres."""
+    """Return a protocol with a mask of ones; voxels of 1 mm have centres at integers."""
     return DtuProtocol(
         obs_mask=torch.ones(side + 1, side + 1, side + 1) > 0 if mask is None else mask,
         bounding_box=torch.tensor([[0.0, 0, 0], [side, side, side]], dtype=torch.float64),
@@ -30,7 +30,7 @@ def grid(spacing=1.0, count=20, z=10.0):
 
 def test_a_raised_grid_is_off_by_its_height_in_both_directions(generator):
     found = dtu_figures(cloud(grid(z=10.3)), grid(), protocol_of(), generator)
-    height = pytest.approx(0.3, abs=1e-6)  # the grid's 10.3 is float32
+    height = pytest.approx(0.3, abs=1e-6)  # 10.3 is float32 in the grid
     assert found.mean_accuracy == height
     assert found.median_accuracy == height
     assert found.mean_completeness == height
@@ -38,21 +38,21 @@ def test_a_raised_grid_is_off_by_its_height_in_both_directions(generator):
     assert found.points == found.evaluated == found.evaluated_true == 400
 
 
-def test_points_outside_the_mask_count_for_completeness_alone(generator):
+def test_points_outside_the_mask_count_only_for_completeness(generator):
     mask = torch.ones(41, 41, 41) > 0
     mask[:15] = False  # x below 14.5
     raised = grid(z=10.0)
-    raised[raised[:, 0] < 14.5, 2] += 3.0  # would spoil the accuracy
+    raised[raised[:, 0] < 14.5, 2] += 3.0  # would increase the accuracy error
     found = dtu_figures(cloud(raised), grid(), protocol_of(mask), generator)
     assert found.mean_accuracy == 0
     assert found.evaluated == 200
-    # Half the scan is 3 mm from its own point; the row next to the good half is 1 mm away.
+    # Half the scan is 3 mm from its point; the row next to the good half is 1 mm away.
     far = [min(3.0, float(rows)) for rows in range(1, 11)]
     assert found.mean_completeness == pytest.approx(sum(far) / 20, rel=1e-6)
     assert found.overall == pytest.approx(found.mean_completeness / 2)
 
 
-def test_the_scan_below_the_table_need_not_be_found(generator):
+def test_the_scan_below_the_table_is_ignored(generator):
     scan = torch.cat([grid(), grid(z=2.0)])
     found = dtu_figures(cloud(grid()), scan, protocol_of(plane=(0, 0, 1, -5.0)), generator)
     assert found.mean_completeness == 0
@@ -61,7 +61,7 @@ def test_the_scan_below_the_table_need_not_be_found(generator):
     assert whole.mean_completeness == pytest.approx(4.0)  # half is 8 mm off
 
 
-def test_outliers_of_twenty_millimetres_are_left_out_and_counted(generator):
+def test_outliers_of_twenty_millimetres_are_excluded_and_counted(generator):
     stray = torch.tensor([[10.0, 10.0, 29.9], [12.0, 10.0, 30.0]], dtype=torch.float64)
     found = dtu_figures(cloud(torch.cat([grid(), stray])), grid(), protocol_of(), generator)
     assert found.mean_accuracy == pytest.approx(19.9 / 401)
@@ -69,7 +69,7 @@ def test_outliers_of_twenty_millimetres_are_left_out_and_counted(generator):
 
 
 def test_dense_points_are_thinned_before_they_are_counted(generator):
-    # Ten points at one bad place weigh as much as one.
+    # Ten points at one bad position weigh as much as one.
     dense = torch.tensor([[10.0, 10.0, 15.0]]).double() + 0.01 * torch.arange(10)[:, None]
     found = dtu_figures(cloud(torch.cat([grid(), dense])), grid(), protocol_of(), generator)
     assert found.points == 401
@@ -86,7 +86,7 @@ def test_a_point_is_in_the_voxel_whose_centre_is_nearest():
     assert not observed(outside, protocol).any()
 
 
-def test_points_beyond_the_cells_of_the_box_are_not_evaluated(generator):
+def test_points_outside_the_cells_of_the_box_are_not_evaluated(generator):
     # A box of 40 mm has one cell of 60 mm; a mask may reach past it.
     scan = torch.cat([grid(), torch.tensor([[61.0, 10, 10]]).double()])
     found = dtu_figures(cloud(grid()), scan, protocol_of(), generator)
@@ -94,7 +94,7 @@ def test_points_beyond_the_cells_of_the_box_are_not_evaluated(generator):
     assert found.capped_fraction_true == pytest.approx(1 / 401)
 
 
-def test_faces_are_sampled_as_the_published_code_samples_them():
+def test_faces_are_sampled_as_in_the_published_code():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
     mesh = Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2]]))
     found = supersample(mesh, 0.24)  # 4 steps along each edge
@@ -106,7 +106,7 @@ def test_faces_are_sampled_as_the_published_code_samples_them():
     assert len(supersample(mesh, 5.0)) == 3
 
 
-def test_a_mesh_and_its_dense_points_are_judged_alike(generator):
+def test_a_mesh_and_its_dense_points_have_equal_figures(generator):
     corners = torch.tensor([[5.0, 5, 10.3], [24, 5, 10.3], [24, 24, 10.3], [5, 24, 10.3]])
     mesh = Mesh(vertices_world=corners.double(), faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
     found = dtu_figures(mesh, grid(), protocol_of(), generator)

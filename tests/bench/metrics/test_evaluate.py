@@ -15,7 +15,7 @@ FEW = {"samples": 3000}
 
 @pytest.fixture
 def parts(make, generator):
-    """A sphere with cameras and lights, and its own copy in another frame of half the size."""
+    """A sphere with cameras and lights, and its copy in a different frame at half the size."""
     truth, cameras = make.sphere(level=4), make.cameras()
     lights = torch.randn(5, 4, generator=generator, dtype=torch.float64)
     rotation = make.rotation(generator)
@@ -34,7 +34,7 @@ def parts(make, generator):
     return estimate, make.capture(Truth(mesh=truth, lights_world=lights), cameras=cameras)
 
 
-def test_a_copy_in_another_frame_has_no_error_anywhere(parts):
+def test_a_copy_in_a_different_frame_has_no_error(parts):
     found = evaluate(*parts, EvaluateConfig(**FEW))
     assert found.alignment.method == "cameras"
     assert found.alignment.scale == pytest.approx(2)
@@ -44,7 +44,7 @@ def test_a_copy_in_another_frame_has_no_error_anywhere(parts):
     (view,) = found.views
     assert view.name == "view_2.png"
     assert view.relative_error < 1e-3
-    assert view.transferred_normals.mean_deg < 0.5  # facets of the truth's shape
+    assert view.transferred_normals.mean_deg < 0.5  # the true shape has facets
     assert view.shape_normals.mean_deg < 0.1
     assert found.lights.mean_deg < 1e-5
     assert found.lights.lights == 3
@@ -54,7 +54,7 @@ def test_a_copy_in_another_frame_has_no_error_anywhere(parts):
     assert found.dtu is None
 
 
-def test_without_alignment_the_frames_are_taken_as_they_are(parts, make):
+def test_without_alignment_the_frames_are_used_unchanged(parts, make):
     estimate, capture = parts
     config = EvaluateConfig(alignment="none", **FEW)
     with pytest.raises(InputError, match=r"different frames.* common cameras"):
@@ -65,10 +65,10 @@ def test_without_alignment_the_frames_are_taken_as_they_are(parts, make):
     )
     found = evaluate(near, capture.replace(cameras=None), config)
     assert found.alignment.method == "none"
-    assert found.surface.accuracy.mean == pytest.approx(0.2, rel=0.05)  # of |0.4 cos|
+    assert found.surface.accuracy.mean == pytest.approx(0.2, rel=0.05)  # mean of |0.4 cos|
 
 
-def test_a_mesh_alone_is_judged_by_its_surface_and_the_centre_view(parts, make):
+def test_a_mesh_alone_is_evaluated_by_its_surface_and_the_centre_view(parts, make):
     _, capture = parts
     found = evaluate(Estimate(mesh=make.sphere(1.1, level=4)), capture, EvaluateConfig(**FEW))
     assert found.alignment.method == "none"
@@ -78,7 +78,7 @@ def test_a_mesh_alone_is_judged_by_its_surface_and_the_centre_view(parts, make):
     assert found.cameras is None
 
 
-def test_views_are_chosen_by_name_whatever_their_suffix(parts):
+def test_views_are_selected_by_name_with_any_suffix(parts):
     estimate, capture = parts
     config = EvaluateConfig(views=("view_4.jpg", "view_1.png", "view_4.png"))
     assert chosen_views(estimate, capture, config) == (4, 1)
@@ -96,7 +96,7 @@ def test_the_same_seed_gives_the_same_figures(parts):
     assert one != other
 
 
-def test_maps_of_a_few_views_may_come_apart_from_the_rest(parts):
+def test_maps_of_a_few_views_may_be_given_separately(parts):
     estimate, capture = parts
     only = capture.replace(
         views=capture.views.take([2]),
@@ -115,7 +115,7 @@ def test_the_account_is_json_with_null_for_what_is_not_finite(parts):
     assert plain["surface"]["whole"]["thresholds"][0]["threshold_percent"] == 0.25
     assert plain["dtu"] is None
     bare = capture.replace(truth=Truth(lights_world=capture.truth.lights_world))
-    found = evaluate(estimate, bare, EvaluateConfig(**FEW))  # cameras and lights alone
+    found = evaluate(estimate, bare, EvaluateConfig(**FEW))  # only cameras and lights
     assert (found.surface, found.views) == (None, ())
     assert found.lights.mean_deg < 1e-5
     assert report(found)["cameras"]["mean_center_percent"] is None

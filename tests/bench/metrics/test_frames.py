@@ -1,4 +1,4 @@
-"""Frames of a result and of the truth that do not meet are refused with the difference."""
+"""Different frames of a result and the truth are refused with their difference."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from pimper_torch.runtime.errors import InputError, PimperWarning
 
 FEW = {"samples": 3000}
 IDENTITY = torch.eye(3).double()
-# x, y, z of the truth are x, z, -y of the result: y up there, z up here.
+# x, y, z of the truth are x, z, -y of the result: y up in one, z up in the other.
 Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
 AROUND = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 
@@ -22,7 +22,7 @@ def by(linear, shift=(0.0, 0.0, 0.0)):
 
 @pytest.fixture
 def truth(make):
-    """A potato off its frame's origin, which no rotation of the axes maps on itself."""
+    """A potato away from the origin, without symmetries."""
     return make.moved(make.potato(), by(IDENTITY, (0.5, 1.0, 2.0)))
 
 
@@ -40,9 +40,9 @@ DIFFERENCES = [
 ]
 
 
-@pytest.mark.parametrize(("result_from_truth", "told"), DIFFERENCES)
-def test_other_units_axes_and_places_are_refused_with_the_guess(
-    make, truth, result_from_truth, told
+@pytest.mark.parametrize(("result_from_truth", "message"), DIFFERENCES)
+def test_different_units_axes_and_positions_are_refused_with_a_suggestion(
+    make, truth, result_from_truth, message
 ):
     estimate = Estimate(mesh=make.moved(truth, result_from_truth))
     with pytest.raises(InputError) as refused:
@@ -52,7 +52,7 @@ def test_other_units_axes_and_places_are_refused_with_the_guess(
 
 
 @pytest.mark.parametrize("result_from_truth", [one for one, _ in DIFFERENCES])
-def test_icp_begins_with_the_guess_and_finds_the_truth(make, truth, result_from_truth):
+def test_icp_starts_from_the_suggestion_and_converges_to_the_truth(make, truth, result_from_truth):
     estimate = Estimate(mesh=make.moved(truth, result_from_truth))
     config = EvaluateConfig(alignment="icp", **FEW)
     found = evaluate(estimate, make.capture_of(truth), config)
@@ -63,7 +63,7 @@ def test_icp_begins_with_the_guess_and_finds_the_truth(make, truth, result_from_
     )
 
 
-def test_what_is_apart_without_a_guess_is_refused_and_does_not_keep_searching(make, truth):
+def test_a_mismatch_without_a_suggestion_is_refused_quickly(make, truth):
     elsewhere = make.moved(make.half_sphere(level=6), by(IDENTITY, (1e5, 1e5, 0.0)))
     with pytest.raises(InputError, match=r"centres are 1\.414e\+05 apart\. Transform the result"):
         evaluate(Estimate(mesh=elsewhere), make.capture_of(truth), EvaluateConfig())
@@ -78,7 +78,7 @@ def test_what_is_apart_without_a_guess_is_refused_and_does_not_keep_searching(ma
     ],
     ids=["a third larger", "half of another object", "mostly the table"],
 )
-def test_bad_results_in_the_right_frame_are_measured(make, truth, bad):
+def test_inaccurate_results_in_the_right_frame_are_measured(make, truth, bad):
     where = by(IDENTITY, (-0.5, -1.0, -2.0))
     mesh = make.moved(truth, where)
     assert Frames(bad(make, mesh), mesh).guess() is None
@@ -87,7 +87,7 @@ def test_bad_results_in_the_right_frame_are_measured(make, truth, bad):
 
 
 def turned(cameras, turns):
-    """Turn each camera about its own axes, as photographs that are turned have them."""
+    """Rotate each camera about its axes, as for rotated photographs."""
     rotations = torch.stack([turns] * cameras.num_views) if turns.ndim == 2 else turns
     whole = rigid(rotations, torch.zeros(cameras.num_views, 3).double())
     return cameras.replace(cam_from_world=whole @ cameras.cam_from_world)
@@ -97,14 +97,14 @@ QUARTER = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64
 
 
 @pytest.mark.parametrize(
-    ("turns", "told"),
+    ("turns", "message"),
     [
         (QUARTER, "turned about their optical axes by 90 degrees in the median. Does one have"),
         (QUARTER @ QUARTER, "turned about their optical axes by 180 degrees"),
         (AROUND, "their axes are opposite. Does one have OpenGL's axes"),
     ],
 )
-def test_cameras_that_disagree_by_their_rolls_are_refused(make, truth, turns, told):
+def test_cameras_that_disagree_by_their_rolls_are_refused(make, truth, turns, message):
     cameras = make.cameras()
     capture = make.capture_of(truth, cameras=cameras)
     names = capture.views.names
@@ -122,7 +122,7 @@ def test_cameras_that_disagree_by_their_rolls_are_refused(make, truth, turns, to
         assert found.cameras is None
 
 
-def test_one_turned_photograph_is_no_reason_to_refuse(make, truth):
+def test_one_rotated_photograph_is_not_refused(make, truth):
     cameras = make.cameras()
     one = torch.stack([IDENTITY] * 5)
     one[2] = QUARTER

@@ -43,7 +43,7 @@ def with_outliers(mesh, generator, fraction):
 
 
 def error_of(found, known):
-    """Give scale, angle and shift of what is left of a similarity after its inverse."""
+    """Return scale, angle and shift of the residual of a similarity and its estimate."""
     left = found @ torch.linalg.inv(known)
     scale, rotation = split_similarity(left)
     return abs(scale - 1), float(rotation_angles_deg(rotation)), float(left[:3, 3].norm())
@@ -57,24 +57,24 @@ def test_a_known_similarity_is_found_among_a_third_of_outliers(generator, make):
     settings = {"trimmed_fraction": 0.35, "iterations": 150, "count": 600}
     found = fitted(estimate, truth, torch.eye(4).double(), generator=generator, **settings)
     scale, angle, shift = error_of(found.truth_from_world, known)
-    # What is trimmed is more than the outliers, so the rest lies exactly on the truth.
+    # More than the outliers is trimmed, so the rest is exactly on the truth.
     assert scale < 1e-6
     assert angle < 6e-5
     assert shift < 1e-6
 
 
-def test_a_blown_up_sphere_is_brought_to_size_and_not_turned(generator, make):
+def test_an_enlarged_sphere_is_scaled_and_not_rotated(generator, make):
     truth = make.sphere(level=4)
     settings = dict(trimmed_fraction=0.0, **FEW)
     start = torch.eye(4).double()
     found = fitted(make.sphere(1.2, level=4), truth, start, generator=generator, **settings)
     scale, rotation = split_similarity(found.truth_from_world)
-    assert scale == pytest.approx(1 / 1.2, rel=1e-3)  # facets of both
-    # Nothing tells how a sphere is turned; facets must not make up an answer.
+    assert scale == pytest.approx(1 / 1.2, rel=1e-3)  # both have facets
+    # The rotation of a sphere is undetermined; facets must not induce one.
     assert float(rotation_angles_deg(rotation)) < 3
 
 
-def test_a_plane_slides_and_grows_no_more_than_it_was_told(generator, make):
+def test_a_plane_does_not_slide_or_grow_beyond_the_limits(generator, make):
     start = rigid(torch.eye(3), torch.tensor([0.3, 0.2, 0.1])).double()
     settings = dict(trimmed_fraction=0.0, **FEW)
     found = fitted(make.square(), make.square(side=4.0), start, generator=generator, **settings)
@@ -93,7 +93,7 @@ def test_a_cloud_is_measured_by_points(generator, make):
 
 
 def aligned(make, generator, method, cameras_there=True):
-    """Carry a potato and five cameras off by a known similarity, and align them."""
+    """Transform a potato and five cameras by a known similarity, and align them."""
     truth, cameras = make.potato(level=2), make.cameras()
     rotation = make.rotation(generator, 50.0)
     shift = torch.tensor([3.0, -1.0, 2.0], dtype=torch.float64)
@@ -109,7 +109,7 @@ def aligned(make, generator, method, cameras_there=True):
 
 
 @pytest.mark.parametrize("method", ["auto", "cameras", "icp"])
-def test_cameras_of_the_same_names_align_the_frames(generator, make, method):
+def test_cameras_with_equal_names_align_the_frames(generator, make, method):
     found, truth_from_world = aligned(make, generator, method)
     assert_close(found.truth_from_world, truth_from_world, atol=1e-6, rtol=0)
     assert found.method == ("icp" if method == "icp" else "cameras")
@@ -119,7 +119,7 @@ def test_cameras_of_the_same_names_align_the_frames(generator, make, method):
     assert found.trimmed_fraction == (0.2 if method == "icp" else None)
 
 
-def test_without_cameras_nothing_is_aligned_and_that_is_told(generator, make):
+def test_without_cameras_frames_are_not_aligned_with_a_message(generator, make):
     found, _ = aligned(make, generator, "auto", cameras_there=False)
     assert found.method == "none"
     assert torch.equal(found.truth_from_world, torch.eye(4).double())

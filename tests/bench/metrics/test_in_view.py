@@ -11,7 +11,7 @@ from pimper_torch.ground.geometry.visibility import cast_view
 
 
 def with_maps(make, truth, cameras):
-    """Give a capture whose maps are those of a mesh."""
+    """Return a capture with maps rendered from a mesh."""
     hits = [cast_view(truth, cameras, view) for view in range(cameras.num_views)]
     return Truth(
         depth=torch.stack([hit.distance for hit in hits]),
@@ -24,23 +24,23 @@ def with_maps(make, truth, cameras):
     )
 
 
-def test_a_mesh_that_is_the_truth_has_no_error(make):
+def test_the_true_mesh_has_no_error(make):
     sphere, cameras = make.sphere(level=4), make.cameras(count=2)
     mesh = sphere.replace(albedo=3 * (sphere.vertices_world.abs() + 0.1))
     truth = with_maps(make, sphere, cameras)
     found = compare_along_rays(mesh, make.capture(truth, cameras=cameras), 1)
     assert found.name == "view_1.png"
-    assert found.relative_error < 1e-4  # float32 of the ray caster
+    assert found.relative_error < 1e-4  # the ray caster uses float32
     assert found.coverage == 1.0
     assert found.transferred_normals is None
     assert found.shape_normals.mean_deg < 0.5  # facets
     assert found.albedo.one_scale_percent < 1e-3
 
 
-def test_transferred_normals_and_those_of_the_shape_are_told_apart(make, generator):
+def test_transferred_normals_are_distinguished_from_those_of_the_shape(make, generator):
     sphere, cameras = make.sphere(level=4), make.cameras(count=1)
     tilt = make.rotation(generator, 10.0)
-    # About its axis the tilt turns nothing: the mean angle is below 10, the shape's is not.
+    # Normals at the tilt's axis do not change: the mean angle is below 10, the shape's is not.
     mesh = sphere.replace(normals_world=sphere.vertices_world @ tilt.mT)
     truth = with_maps(make, sphere, cameras)
     found = compare_along_rays(mesh, make.capture(truth, cameras=cameras), 0)
@@ -52,20 +52,20 @@ def test_transferred_normals_and_those_of_the_shape_are_told_apart(make, generat
     assert found.transferred_normals.median_deg == pytest.approx(float(expected.median()), abs=0.05)
 
 
-def test_a_true_mesh_serves_where_there_are_no_maps(make):
+def test_a_true_mesh_replaces_missing_maps(make):
     sphere, cameras = make.sphere(level=4), make.cameras(count=1)
     table = make.square(side=9.0)
     table = table.replace(vertices_world=table.vertices_world - 3.0)
     truth = Truth(mesh=sphere, surroundings=table)
     found = compare_along_rays(sphere, make.capture(truth, cameras=cameras), 0)
     alone = compare_along_rays(sphere, make.capture_of(sphere, cameras=cameras), 0)
-    assert found.coverage == 1.0  # the table counts for nothing
+    assert found.coverage == 1.0  # the table is ignored
     assert found.pixels == alone.pixels
     assert found.shape_normals.mean_deg < 1e-3
 
 
 def on_a_table(make):
-    """A ball on a large table, and cameras that look down on both."""
+    """Return a ball on a large table, and cameras above both."""
     ball = make.sphere(level=4)
     table = make.square(height=-1.0, side=20.0)
     table = table.replace(vertices_world=table.vertices_world - torch.tensor([10.0, 10.0, 0.0]))
@@ -77,7 +77,7 @@ def half_of(mesh):
     return mesh.replace(faces=mesh.faces[right])
 
 
-def test_rays_through_a_hole_that_meet_the_table_are_misses(make):
+def test_rays_through_a_hole_that_hit_the_table_are_misses(make):
     ball, table, cameras = on_a_table(make)
     half = half_of(ball)
     capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
@@ -87,11 +87,11 @@ def test_rays_through_a_hole_that_meet_the_table_are_misses(make):
     assert 0.4 < alone.coverage < 0.8
     assert found.coverage == alone.coverage
     assert found.relative_error == pytest.approx(alone.relative_error, abs=1e-6)
-    assert unknown.coverage == 1.0  # where nobody knows the table, its error is the object's
+    assert unknown.coverage == 1.0  # if the table is unknown, its error counts for the object
     assert unknown.relative_error > 20
 
 
-def test_a_surface_behind_the_true_one_is_no_table(make):
+def test_a_surface_behind_the_true_one_is_not_table(make):
     ball, table, cameras = on_a_table(make)
     small = ball.replace(vertices_world=0.9 * ball.vertices_world)
     capture = make.capture(Truth(mesh=ball, surroundings=table), cameras=cameras)
@@ -100,10 +100,10 @@ def test_a_surface_behind_the_true_one_is_no_table(make):
     assert found.coverage == alone.coverage
     raised = table.replace(vertices_world=table.vertices_world + torch.tensor([0.0, 0.0, 0.5]))
     before = compare_along_rays(join(ball, raised), capture, 0)
-    assert before.coverage == 1.0  # in front of the object it is an error, not a miss
+    assert before.coverage == 1.0  # in front of the object it is an error and not a miss
 
 
-def test_nothing_is_compared_where_nothing_is_known(make):
+def test_pixels_without_truth_are_not_compared(make):
     sphere, cameras = make.sphere(level=2), make.cameras(count=1)
     empty = make.capture(Truth(), cameras=cameras)
     assert compare_along_rays(sphere, empty, 0) is None
@@ -111,7 +111,7 @@ def test_nothing_is_compared_where_nothing_is_known(make):
     assert compare_along_rays(cloud, make.capture_of(sphere, cameras=cameras), 0) is None
 
 
-def test_albedo_is_judged_up_to_one_scale_and_up_to_one_a_channel():
+def test_albedo_is_evaluated_up_to_one_scale_and_one_per_channel():
     truth = torch.tensor([[0.2, 0.4], [0.6, 0.2], [0.4, 0.8]], dtype=torch.float64)
     scaled = compare_albedo(0.1 * truth, truth)
     assert scaled.one_scale_percent < 1e-10
@@ -123,7 +123,7 @@ def test_albedo_is_judged_up_to_one_scale_and_up_to_one_a_channel():
     assert tinted.one_scale_percent == pytest.approx(100 * (rest / 1.4) ** 0.5)
 
 
-def test_an_outlier_moves_the_mean_of_albedo_and_not_its_median():
+def test_an_outlier_changes_the_mean_of_albedo_and_not_its_median():
     truth = torch.full((101, 1), 0.5, dtype=torch.float64)
     ours = truth.clone()
     ours[0] = 50

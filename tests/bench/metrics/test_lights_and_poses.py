@@ -16,14 +16,14 @@ def lights_of(generator, count=12):
     return torch.randn(count, 4, generator=generator, dtype=torch.float64)
 
 
-def test_lights_turned_together_are_right_up_to_that_rotation(make, generator):
+def test_lights_rotated_together_are_right_up_to_that_rotation(make, generator):
     truth, joint = lights_of(generator), make.rotation(generator, 25.0)
     ours = truth.clone()
     ours[:, 1:] = 0.3 * truth[:, 1:] @ joint.mT
     found = compare_lights(ours, truth, torch.eye(3).double())
     assert found.mean_rotated_deg < 1e-6
     assert found.rotation_deg == pytest.approx(25.0)
-    # Lights near the axis are turned less.
+    # Lights near the axis are rotated less.
     assert 5 < found.mean_deg < 25
     assert found.lights == 12
 
@@ -37,14 +37,14 @@ def test_the_rotation_of_the_frames_is_undone_first(make, generator):
     assert compare_lights(ours, truth, frame.mT).mean_deg > 1
 
 
-def test_mirrored_lights_are_not_excused_by_a_reflection(generator):
+def test_mirrored_lights_are_not_aligned_by_a_reflection(generator):
     truth = lights_of(generator)
     ours = truth * truth.new_tensor([1.0, 1.0, 1.0, -1.0])
     found = compare_lights(ours, truth, torch.eye(3).double())
     assert found.mean_rotated_deg > 10
 
 
-def test_unknown_lights_are_left_out(generator):
+def test_unknown_lights_are_excluded(generator):
     truth = lights_of(generator, 4)
     ours = truth.clone()
     ours[0], ours[1, 1:] = torch.nan, 0
@@ -62,10 +62,10 @@ def cloud_diagonal(points):
     return float((points.amax(dim=0) - points.amin(dim=0)).norm())
 
 
-def test_a_turned_and_shifted_camera_is_off_by_just_that(make, generator):
+def test_a_rotated_and_shifted_camera_has_that_error(make, generator):
     truth = make.cameras()
     ours = truth.cam_from_world.clone()
-    # Turn camera 2 about its own centre by 3 degrees, and put camera 4 0.5 aside.
+    # Rotate camera 2 about its centre by 3 degrees, and shift camera 4 by 0.5.
     ours[2] = rigid(make.rotation(generator, 3.0), torch.zeros(3).double()) @ ours[2]
     ours[4, 0, 3] += 0.5
     cameras = truth.replace(
@@ -82,7 +82,7 @@ def test_a_turned_and_shifted_camera_is_off_by_just_that(make, generator):
     assert found.mean_focal_percent == pytest.approx(10.0)
 
 
-def test_cameras_in_another_frame_and_half_the_size_are_right_after_alignment(make, generator):
+def test_cameras_in_a_different_frame_have_no_error_after_alignment(make, generator):
     truth = make.cameras()
     rotation = make.rotation(generator)
     ours = make.transferred(truth, 0.2, rotation, torch.tensor([1.0, 2.0, 3.0]).double())
@@ -94,13 +94,13 @@ def test_cameras_in_another_frame_and_half_the_size_are_right_after_alignment(ma
     assert found.mean_rotation_deg < 1e-5
     assert found.mean_center < 1e-8
     assert found.mean_focal_percent < 1e-8
-    assert found.mean_center_percent != found.mean_center_percent  # nobody told the centre
+    assert found.mean_center_percent != found.mean_center_percent  # the centre is unknown
 
 
-def test_positions_are_off_by_the_similarity_and_bend_only_where_cameras_differ(make, generator):
+def test_positions_separate_the_similarity_from_the_deformation(make, generator):
     truth = make.cameras()
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64) - 0.5
-    points[:2] = torch.tensor([[-1.0, 0, 0], [1.0, 0, 0]])  # a diagonal of 2 and a little
+    points[:2] = torch.tensor([[-1.0, 0, 0], [1.0, 0, 0]])  # a diagonal slightly above 2
     shift = torch.eye(4).double()
     shift[0, 3] = 0.02
     found = compare_cameras(truth, truth, shift, views=5, surface=cloud(points))
@@ -114,7 +114,7 @@ def test_positions_are_off_by_the_similarity_and_bend_only_where_cameras_differ(
     assert found.mean_position_percent > found.mean_bend_percent
 
 
-def test_positions_of_resized_photographs_are_compared_in_their_own_pixels(make, generator):
+def test_positions_of_resized_photographs_are_compared_in_their_pixels(make, generator):
     truth = make.cameras()
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64) - 0.5
     half = truth.replace(

@@ -25,14 +25,14 @@ def test_distances_are_in_units_of_the_truth_after_the_similarity():
     errors = errors_of(ball(1.05), truth, placed)
     distance = errors["_DISTANCE_TO_TRUTH"]
     assert_close(distance, torch.full_like(distance, 0.1), atol=2e-3, rtol=0)
-    assert errors["_NORMAL_ERROR_DEG"].max() < 2.0  # of the truth's faces
+    assert errors["_NORMAL_ERROR_DEG"].max() < 2.0  # the true faces
     turned = ball().replace(normals_world=torch.tensor([[0.0, 0.0, 1.0]]).expand(2562, 3))
     angle = errors_of(turned, ball(1.0, 5), similarity(1.0, [0.0, 0.0, 0.0]))["_NORMAL_ERROR_DEG"]
     height = turned.vertices_world[:, 2].clamp(-1, 1)
     assert_close(angle, torch.rad2deg(height.arccos()).float(), atol=2.0, rtol=0)
 
 
-def test_points_tell_distances_alone():
+def test_points_give_only_distances():
     points = Mesh(vertices_world=torch.zeros(1, 3), faces=torch.zeros(0, 3, dtype=torch.long))
     errors = errors_of(ball(), points, torch.eye(4).double())
     assert list(errors) == ["_DISTANCE_TO_TRUTH"]

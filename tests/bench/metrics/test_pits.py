@@ -9,13 +9,13 @@ def everywhere():
     return torch.ones(80, 120, dtype=torch.bool)
 
 
-def test_only_what_is_off_more_than_its_surroundings_is_a_pit(everywhere):
+def test_a_pit_has_a_larger_error_than_its_surroundings(everywhere):
     angle = torch.full((80, 120), 30.0)
-    assert pitted_percent(angle, everywhere) == 0  # wrong all over, but not pitted
+    assert pitted_percent(angle, everywhere) == 0  # wrong everywhere, but not pitted
     angle[40:42, 50:53] = 60.0
-    assert pitted_percent(angle, everywhere) == 0  # nor a little more so
+    assert pitted_percent(angle, everywhere) == 0  # nor slightly larger
     angle = torch.linspace(0, 60, 120).expand(80, 120)
-    assert pitted_percent(angle, everywhere) == 0  # nor where it gets worse and worse
+    assert pitted_percent(angle, everywhere) == 0  # nor with a gradient
     angle = torch.full((80, 120), 2.0)
     angle[40:42, 50:53] = 12.0
     assert pitted_percent(angle, everywhere) == pytest.approx(100 * 6 / (80 * 120))
@@ -23,7 +23,7 @@ def test_only_what_is_off_more_than_its_surroundings_is_a_pit(everywhere):
     assert pitted_percent(angle, everywhere) == 0
 
 
-def test_what_is_not_known_is_neither_a_pit_nor_a_surrounding(everywhere):
+def test_unknown_pixels_are_neither_pits_nor_surroundings(everywhere):
     angle = torch.full((80, 120), 2.5)
     known = everywhere.clone()
     known[:, 60:] = False

@@ -1,4 +1,4 @@
-"""What cannot be measured is refused in a sentence."""
+"""Undefined measurements are refused with a message."""
 
 import pytest
 import torch
@@ -45,7 +45,7 @@ def _aligned(make, capture, method):
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (lambda make: TrueSurface(make.capture(Truth())), "neither a mesh nor points"),
         (lambda make: _aligned(make, make.capture(Truth()), "icp"), "neither a mesh nor points"),
@@ -62,11 +62,11 @@ def _aligned(make, capture, method):
         ),
     ],
 )
-def test_what_cannot_be_measured_is_refused(make, call, told):
-    with pytest.raises(InputError, match=told):
+def test_undefined_measurements_are_refused(make, call, message):
+    with pytest.raises(InputError, match=message):
         call(make)
 
 
-def test_a_threshold_of_nothing_is_refused():
+def test_a_zero_threshold_is_refused():
     with pytest.raises(ConfigError, match="thresholds_percent"):
         EvaluateConfig(thresholds_percent=(0.5, 0.0))

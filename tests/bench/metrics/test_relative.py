@@ -28,7 +28,7 @@ def raised(mesh, height):
     return mesh.replace(vertices_world=mesh.vertices_world + shift)
 
 
-def test_the_error_is_in_units_of_the_truth_not_of_the_estimate():
+def test_the_error_is_in_units_of_the_truth():
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0]], dtype=torch.float64)
     # S - S_hat = (0, 1): norm 1. S - mean = (-0.5, 0.5): norm sqrt 0.5.
     assert_close(relative_error(2 * points, points), points.new_tensor(100 / 0.5**0.5))
@@ -50,13 +50,13 @@ def test_a_raised_table_has_the_error_computed_by_hand(cameras):
     v = torch.arange(30).double() + 0.5 - 15
     across = (u[None] ** 2 + v[:, None] ** 2) / 80**2
     expected = 100 * (0.01 * (1 + across)).sum().sqrt() / (25 * across).sum().sqrt()
-    assert abs(found.relative_error - float(expected)) < 1e-3  # float32 of the ray caster
+    assert abs(found.relative_error - float(expected)) < 1e-3  # the ray caster uses float32
     assert found.coverage == 1.0
     assert found.mean_angle_deg < 1e-3
     assert found.num_pixels == 1200
 
 
-def test_rays_that_miss_count_against_the_coverage_alone(cameras):
+def test_rays_that_miss_reduce_only_the_coverage(cameras):
     truth = truth_of(EndlessPlane(), cameras)
     corners = torch.tensor([[0.0, -9, 0], [9, -9, 0], [9, 9, 0], [0, 9, 0]], dtype=torch.float64)
     half = Mesh(vertices_world=corners, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))

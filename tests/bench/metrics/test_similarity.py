@@ -12,14 +12,14 @@ from pimper_torch.ground.geometry.rigid import rigid, transform
 from pimper_torch.runtime.errors import InputError
 
 
-def test_points_transferred_by_a_similarity_are_transferred_back(make, generator):
+def test_a_similarity_of_points_is_recovered(make, generator):
     rotation = make.rotation(generator)
     known = rigid(2.5 * rotation, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64))
     points = torch.randn(20, 3, generator=generator, dtype=torch.float64)
     assert_close(similarity_between_points(points, transform(known, points)), known)
 
 
-def test_no_other_similarity_brings_noisy_points_nearer(generator):
+def test_the_similarity_of_noisy_points_is_optimal(generator):
     points = torch.randn(30, 3, generator=generator, dtype=torch.float64)
     target = 1.5 * points + 0.3 * torch.randn(30, 3, generator=generator, dtype=torch.float64)
     best = similarity_between_points(points, target)
@@ -42,7 +42,7 @@ def test_mirrored_points_still_get_a_rotation(generator):
 
 
 @pytest.mark.parametrize("num_views", [2, 3, 12])
-def test_cameras_on_an_arc_are_transferred_back_however_few_they_are(make, generator, num_views):
+def test_a_similarity_of_cameras_on_an_arc_is_recovered_from_any_number(make, generator, num_views):
     truth = arc_cameras(num_views, width=64, height=48, focal_px=70.0, distance=4.0, sway_deg=0.0)
     rotation, shift = make.rotation(generator), torch.tensor([0.4, 5.0, -1.0]).double()
     known = rigid(0.2 * rotation, shift)
@@ -60,7 +60,7 @@ def _facing(centers, facing):
 
 
 def _mirrored(cameras):
-    """Cameras that all look one way, and the same at the opposite places."""
+    """Cameras with one viewing direction, and the same at mirrored positions."""
     facing = cameras.cam_from_world[:1, :3, :3].expand(5, 3, 3)
     centers = cameras.centers_world
     return (
@@ -69,15 +69,15 @@ def _mirrored(cameras):
 
 
 @pytest.mark.parametrize(
-    ("cameras", "told"),
+    ("cameras", "message"),
     [
         (lambda: (_arc(2).take([0, 0]), _arc(2)), "scale is undetermined"),
         (lambda: _mirrored(_arc(5)), "do not correspond"),
         (lambda: (_arc(2), _arc(3)), "2 cameras and 3 true ones"),
     ],
 )
-def test_cameras_that_determine_no_similarity_are_refused(cameras, told):
-    with pytest.raises(InputError, match=told):
+def test_cameras_that_determine_no_similarity_are_refused(cameras, message):
+    with pytest.raises(InputError, match=message):
         similarity_between_cameras(*cameras())
 
 
@@ -89,15 +89,15 @@ def test_views_are_paired_by_name():
         pair_views(["p"], ["q"])
 
 
-def test_folder_and_suffix_do_not_part_views_of_one_name():
+def test_views_are_paired_without_folder_and_suffix():
     ours, truth = pair_views(["raw/07.tif", "08.png", "9.jpg"], ["08.png", "07.png", "9.png"])
     assert ours.tolist() == [0, 1, 2]
     assert truth.tolist() == [1, 0, 2]
 
 
-def test_a_stem_that_two_views_share_pairs_nothing():
+def test_an_ambiguous_stem_pairs_no_views():
     ours, truth = pair_views(["a/1.png", "b/1.png", "c.png"], ["1.jpg", "c.png"])
     assert ours.tolist() == [2]
     assert truth.tolist() == [1]
-    ours, truth = pair_views(["1.tif", "1.png"], ["1.png"])  # the same name comes first
+    ours, truth = pair_views(["1.tif", "1.png"], ["1.png"])  # equal names take precedence
     assert ours.tolist() == [1]

@@ -6,7 +6,7 @@ from pimper_torch.ground.geometry.pinholes import look_at
 from pimper_torch.ground.geometry.projection import project
 
 
-def test_looking_cameras_see_their_target_in_the_centre_with_up_upwards():
+def test_look_at_centres_the_target_with_up_upwards():
     eyes = torch.tensor([[3.0, 1.0, 2.0], [-1.0, 4.0, 0.5]], dtype=torch.float64)
     target = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -44,7 +44,7 @@ def sensor(**changes):
     return SensorConfig(**({"read_noise": 0.0, "shot_noise": 0.0} | changes))
 
 
-def test_sampling_finely_where_pixels_differ_is_as_good_as_everywhere(stage, monkeypatch):
+def test_adaptive_sampling_is_as_accurate_as_uniform(stage, monkeypatch):
     from pimper_bench.scenes import ray_tracing
 
     coarse = shot(stage, sensor(supersample=1)).image
@@ -52,7 +52,7 @@ def test_sampling_finely_where_pixels_differ_is_as_good_as_everywhere(stage, mon
     monkeypatch.setattr(ray_tracing, "_UNEVEN", -1.0)
     everywhere = shot(stage, sensor(supersample=3)).image
     gap = (adaptive - everywhere).abs()
-    assert gap.max() < 0.03  # what neighbours may differ by and not be looked at
+    assert gap.max() < 0.03  # the limit between neighbours below which pixels are not refined
     assert gap.mean() < 1e-3
     assert (coarse - everywhere).abs().mean() > 4 * gap.mean()
 
@@ -64,7 +64,7 @@ def test_exposure_multiplies_radiance_before_it_saturates(stage):
     assert (thrice == 1).any()
 
 
-def test_the_highlight_is_marked_where_gloss_makes_it(stage, objects):
+def test_highlights_are_marked(stage, objects):
     glossy = shot(stage, sensor(supersample=1))
     matte = [SceneObject(mesh=item.mesh, texture=item.texture) for item in objects]
     plain = shot(TracedObjects(matte), sensor(supersample=1))
@@ -77,7 +77,7 @@ def test_the_highlight_is_marked_where_gloss_makes_it(stage, objects):
     assert extra[~glossy.highlight].max() < 0.05
 
 
-def test_maps_are_the_same_whatever_the_sensor(stage):
+def test_maps_do_not_depend_on_the_sensor(stage):
     one = shot(stage, sensor(supersample=1))
     other = shot(stage, SensorConfig(supersample=2, read_noise=0.1), seed=5)
     for name in ("depth", "normals_world", "albedo", "foreground", "lit", "highlight"):

@@ -27,9 +27,9 @@ def volume(mesh):
     return float((a * torch.linalg.cross(b, c)).sum()) / 6
 
 
-def test_a_level_set_is_met_exactly_with_normals_outward():
+def test_a_level_set_is_meshed_exactly_with_outward_normals():
     def sphere(points):
-        return (points * points).sum(dim=-1) - 1  # of gradient 2, not 1
+        return (points * points).sum(dim=-1) - 1  # its gradient is 2, not 1
 
     mesh = mesh_level_set(sphere, (-1.2, -1.3, -1.1), (1.2, 1.2, 1.2), 0.1)
     ones = torch.ones(len(mesh.vertices_world), dtype=torch.float64)
@@ -42,7 +42,7 @@ def test_a_level_set_is_met_exactly_with_normals_outward():
 def test_a_cylinder_with_round_edges_has_its_distance():
     points = torch.tensor([[0.0, 0, 0.5], [2, 0, 0.5], [0, 0, 1.4], [1.0, 0, 1.0]]).double()
     found = rounded_cylinder(points, radius=1.0, low=0.0, high=1.0, rounding=0.25)
-    # The rim's corner is cut: sqrt(2) - 1 times the rounding away.
+    # The rim's corner is rounded: sqrt(2) - 1 times the radius away.
     expected = torch.tensor([-0.5, 1.0, 0.4, 0.25 * (2**0.5 - 1)]).double()
     assert_close(found, expected, atol=1e-7, rtol=0)
 
@@ -54,9 +54,9 @@ def test_smooth_joins_differ_from_sharp_ones_only_near_the_seam():
     assert_close(cut, torch.tensor([0.05, 0.1, -0.2875]))
 
 
-def test_a_mug_is_one_closed_solid_with_one_handle_that_stands_on_the_table():
+def test_a_mug_is_one_closed_solid_with_one_handle_on_the_table():
     mesh = mug_mesh(cell=0.04)
-    assert euler(mesh) == 0  # a torus, whatever its bulges
+    assert euler(mesh) == 0  # a torus, with any bulges
     normals = face_normals(mesh.vertices_world, mesh.faces)
     agree = (normals[:, None] * mesh.normals_world[mesh.faces]).sum(dim=-1) > 0
     assert agree.float().mean() > 0.999
@@ -72,6 +72,6 @@ def test_a_jar_is_closed_and_round():
     assert mesh.vertices_world[:, :2].mean(dim=0).norm() < 1e-9
 
 
-def test_a_turned_profile_has_the_volume_that_pappus_tells():
+def test_a_solid_of_revolution_has_the_volume_of_pappus():
     profile = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]]).double()
     assert_close(volume(lathe(profile, around=400)), 2 * torch.pi, rtol=1e-3, atol=0)

@@ -67,7 +67,7 @@ def test_depth_times_ray_is_the_surface_in_closed_forms(cameras):
 
 
 def photographed(*objects, lights, sensor=QUIET):
-    """Look down on white matte objects, or whatever objects are given."""
+    """Render objects from above, by default white matte ones."""
     items = [
         one if isinstance(one, SceneObject) else SceneObject(mesh=one, texture=white)
         for one in objects
@@ -76,15 +76,16 @@ def photographed(*objects, lights, sensor=QUIET):
     return render_objects(items, above(), lights, generator, sensor)
 
 
-def test_the_centre_of_a_lit_table_has_the_irradiance_and_falls_off_by_distance_squared():
+def test_a_lit_table_has_the_stated_irradiance_and_falloff():
     image = photographed(table(2.0), lights=point_light([0.0, 0.0, 2.0])).views.images[0, 0]
     assert_close(image[15, 15], torch.tensor(1.0), atol=1e-4, rtol=0)
-    # A pixel is 5/60 wide on the table; 12 pixels aside, x = 1: cos / d^2 = (2 / d) (2 / d)^2.
+    # A pixel is 5/60 wide on the table; 12 pixels from the centre, x = 1 and
+    # cos / d^2 = (2 / d) (2 / d)^2.
     distance = (1 + 4) ** 0.5
     assert_close(image[15, 27], torch.tensor((2 / distance) ** 3), atol=1e-4, rtol=0)
 
 
-def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
+def test_the_shadow_of_a_ball_follows_from_similar_triangles():
     above_table = SceneObject(mesh=ball(0.3, 4, (1.0, 0.0, 1.0)), texture=white, surroundings=True)
     # From (2, 0, 2) through the ball's centre (1, 0, 1) light would come to the origin.
     lights = point_light([2.0, 0.0, 2.0], ambient=torch.tensor([0.1]).double())
@@ -97,10 +98,10 @@ def test_a_ball_casts_the_shadow_that_similar_triangles_tell():
     assert scene.lit[0, 15, 1]
     assert scene.lit[0, 27, 15]
     assert scene.foreground[0, 15, 15]
-    assert not scene.foreground[0, 15, 30]  # the ball stands before the table there
+    assert not scene.foreground[0, 15, 30]  # the ball is in front of the table there
 
 
-def test_a_window_lights_by_the_square_of_half_of_one_plus_the_cosine_and_the_lamp_has_its_colour():
+def test_a_window_lights_by_its_closed_form_and_the_lamp_has_its_colour():
     lights = point_light(
         [0.0, 0.0, 2.0],
         irradiance=torch.tensor([0.2]).double(),
@@ -113,15 +114,15 @@ def test_a_window_lights_by_the_square_of_half_of_one_plus_the_cosine_and_the_la
     assert_close(scene.views.images[0, :, 15, 15], expected, atol=1e-4, rtol=0)
 
 
-def test_gloss_adds_a_highlight_where_the_mirror_direction_is():
+def test_gloss_adds_a_highlight_in_the_mirror_direction():
     glossy = SceneObject(mesh=table(3.0), texture=white, specular=0.04, roughness=0.3)
     lights = point_light([2.0, 0.0, 5.0], irradiance=torch.tensor([0.1]).double())
     matte, shiny = (
         photographed(item, lights=lights).views.images[0, 0] for item in (table(3.0), glossy)
     )
     extra = shiny - matte
-    assert (extra >= -0.012).all()  # what is mirrored is taken from the matte part
-    # Camera and point light stand 5 above x = 0 and x = 2: they mirror at x = 1, 12 pixels aside.
+    assert (extra >= -0.012).all()  # specular light is subtracted from the diffuse part
+    # Camera and point light are 5 above x = 0 and x = 2: the mirror point is x = 1, pixel 12.
     row, column = divmod(int(extra.argmax()), 31)
     assert row == 15
     assert abs(column - 27) <= 1
@@ -151,7 +152,7 @@ def test_a_ray_traced_ball_agrees_with_its_closed_form():
     assert normals.mean() < 2e-3
 
 
-def test_noise_and_saturation_are_those_of_the_sensor():
+def test_noise_and_saturation_follow_the_sensor():
     noisy = SensorConfig(supersample=1, read_noise=0.01, shot_noise=0.0)
     dim, bright = (
         point_light([0.0, 0.0, 50.0], irradiance=torch.tensor([strength]).double())
@@ -165,7 +166,7 @@ def test_noise_and_saturation_are_those_of_the_sensor():
     assert (photographed(table(3.0), lights=bright, sensor=noisy).views.images == 1).all()
 
 
-def test_a_pixel_gathers_the_light_of_its_whole_area():
+def test_a_pixel_integrates_over_its_area():
     def halves(points):  # black and white meet at x = 0, the centre of the centre pixel
         return (points[..., :1] > 0).to(points).expand_as(points)
 
@@ -178,20 +179,20 @@ def test_a_pixel_gathers_the_light_of_its_whole_area():
     assert_close(image[16], torch.tensor(0.8), atol=2e-3, rtol=0)
 
 
-def test_point_lights_wander_within_their_cone_and_differ(generator):
+def test_point_lights_stay_within_their_cone_and_differ(generator):
     lights = wandering_lights(12, generator, distance=4.0, toward=(0.0, -1.0, 1.0))
     toward = lights.positions_world / lights.positions_world.norm(dim=1, keepdim=True)
     axis = torch.tensor([0.0, -(0.5**0.5), 0.5**0.5], dtype=torch.float64)
     tilt = torch.rad2deg(torch.acos(toward @ axis))
     assert (tilt > 15 - 1e-6).all()
     assert (tilt < 65 + 1e-6).all()
-    assert torch.linalg.svdvals(lights.harmonics_world())[3] > 0.05  # four unlike lights at least
+    assert torch.linalg.svdvals(lights.harmonics_world())[3] > 0.05  # four independent lights
     distance = lights.positions_world.norm(dim=1)
     assert (distance >= 3).all()
     assert (distance <= 5).all()
 
 
-def test_a_potato_is_closed_rests_on_the_table_and_depends_on_its_seed_only():
+def test_a_potato_is_closed_on_the_table_and_depends_only_on_its_seed():
     first = potato(torch.Generator().manual_seed(70), subdivisions=3)
     assert_close(first.vertices_world[:, 2].min(), torch.tensor(0.0, dtype=torch.float64))
     edges = half_edges(first.faces).sort(dim=1).values

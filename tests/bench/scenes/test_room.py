@@ -15,7 +15,7 @@ from pimper_torch.ground.geometry.rigid import transform
 
 @pytest.fixture(scope="module")
 def egg(tmp_path_factory):
-    """Twice as long as wide, so that it looks and shadows differently when it has turned."""
+    """An egg twice as long as wide, so that its image and shadow change when it turns."""
     return write_ball(tmp_path_factory.mktemp("meshes") / "egg.ply", (1.0, 2.0, 1.0))
 
 
@@ -30,28 +30,28 @@ def photograph(scene, view):
     return render_frame(stage, scene.cameras, scene.lights, view, noise, scene.config.sensor)
 
 
-def test_all_but_the_object_and_its_shadow_is_the_same_in_every_photograph(egg):
+def test_the_background_is_static_except_for_the_shadow(egg):
     scene = build_scene(egg, settings(fixed_point_light=True, fixed_room=True, fixed_table=True))
     first, second = photograph(scene, 0), photograph(scene, 1)
     around = ~first.foreground & ~second.foreground
     alike = around & (first.lit == second.lit)
     assert alike.float().mean() > 0.3
-    assert (around & ~alike).any()  # the shadow turned
+    assert (around & ~alike).any()  # the shadow moved
     assert_close(first.image[:, alike], second.image[:, alike], atol=1e-4, rtol=0)  # float32
-    assert first.image[:, alike].std() > 0.02  # patterned, so that equality says something
+    assert first.image[:, alike].std() > 0.02  # patterned, so that equality is meaningful
     rotated = first.foreground & second.foreground
     assert (first.image - second.image).abs()[:, rotated].mean() > 0.05
     assert_close(scene.objects_in(0)[0].mesh.vertices_world, scene.object_mesh.vertices_world)
 
 
-def test_an_object_turned_over_is_where_the_cameras_see_it_and_shows_its_underside(egg):
+def test_an_object_turned_over_projects_correctly_and_shows_its_underside(egg):
     scene = build_scene(egg, settings(num_views=6, turned_over=True, table="patterned"))
     points = scene.object_mesh.vertices_world
     frames = [photograph(scene, view) for view in range(6)]
     for view, frame in enumerate(frames):
         pixels, _ = project(points, scene.cameras.cam_from_world[view], scene.cameras.intrinsics[0])
         rows = frame.foreground.nonzero()[:, 0].double()
-        assert_close(pixels[:, 1].amin(), rows.min(), atol=1.5, rtol=0)  # a pixel is found so
+        assert_close(pixels[:, 1].amin(), rows.min(), atol=1.5, rtol=0)  # rounding to pixels
         (table,) = scene.objects_in(view)[len(scene.objects) :]
         heights = table.mesh.vertices_world[:, 2]
         level = points[:, 2].max() if view >= 3 else points[:, 2].min()
@@ -59,12 +59,12 @@ def test_an_object_turned_over_is_where_the_cameras_see_it_and_shows_its_undersi
     eyes = scene.cameras.centers_world
     middle = (points[:, 2].min() + points[:, 2].max()) / 2
     assert ((eyes[:, 2] < middle) == torch.tensor([False] * 3 + [True] * 3)).all()
-    # The lamp is on the camera's side of the table, and lights what the camera sees.
+    # The lamp is on the camera's side of the table, and lights the visible side.
     assert ((scene.lights.positions_world[:, 2] < middle) == (eyes[:, 2] < middle)).all()
     assert all((frame.lit & frame.foreground).any() for frame in frames)
 
 
-def test_a_turning_table_is_where_the_true_cameras_see_it_and_the_room_is_not(egg):
+def test_a_turning_table_agrees_with_the_true_cameras_and_the_room_does_not(egg):
     scene = build_scene(egg, settings(fixed_point_light=True, fixed_room=True))
     first, second = photograph(scene, 0), photograph(scene, 1)
     cameras = scene.cameras
@@ -90,22 +90,22 @@ def test_a_turning_table_is_where_the_true_cameras_see_it_and_the_room_is_not(eg
     assert difference[beyond].mean() > 0.05
 
 
-def test_a_fixed_point_light_stands_still_before_the_camera(egg):
+def test_a_fixed_point_light_is_static_relative_to_the_camera(egg):
     scene = build_scene(egg, settings(fixed_point_light=True))
     point_lights = scene.lights.positions_world[:, None]
     before = transform(scene.cameras.cam_from_world, point_lights)[:, 0]
     assert_close(before, before[:1].expand(5, 3))
-    assert (point_lights[1:] - point_lights[:-1]).norm(dim=-1).min() > 1  # it goes round the object
+    assert (point_lights[1:] - point_lights[:-1]).norm(dim=-1).min() > 1  # around the object
     assert scene.lights.irradiance.std() == 0
     target = transform(scene.cameras.cam_from_world, scene.lights.target_world.expand(5, 1, 3))
-    assert_close(target, target[:1].expand(5, 1, 3))  # so the room is lit alike
+    assert_close(target, target[:1].expand(5, 1, 3))  # so the room's light is constant
     moving = build_scene(egg, settings())
     point_lights = moving.lights.positions_world[:, None]
     before = transform(moving.cameras.cam_from_world, point_lights)[:, 0]
     assert before.std(dim=0).min() > 0.1
 
 
-def test_a_constant_light_is_at_rest_with_the_object(egg):
+def test_a_constant_light_is_static_relative_to_the_object(egg):
     lights = build_scene(egg, settings(constant_light=True)).lights
     moving = build_scene(egg, settings()).lights
     assert_close(lights.positions_world, moving.positions_world[:1].expand(5, 3))
@@ -114,7 +114,7 @@ def test_a_constant_light_is_at_rest_with_the_object(egg):
 
 
 @pytest.mark.parametrize("fixed_table", [False, True])
-def test_the_truth_is_told_in_the_frame_of_the_object(egg, tmp_path, fixed_table):
+def test_the_truth_is_in_the_frame_of_the_object(egg, tmp_path, fixed_table):
     config = settings(
         num_views=3, fixed_point_light=True, fixed_room=True, fixed_table=fixed_table, bits=16
     )
@@ -137,7 +137,7 @@ def test_the_truth_is_told_in_the_frame_of_the_object(egg, tmp_path, fixed_table
 
 
 def seen_again(scene, first, second, view):
-    """Follow what stands still from photograph 0 to another; pixels in both, where seen."""
+    """Track static points between two photographs; return pixels in both, if visible."""
     cameras = scene.cameras
     at = pixel_centers(80, 60, like=cameras.intrinsics).reshape(-1, 2)
     rays = rays_through(at, cameras.cam_from_world[0], cameras.intrinsics[0])
@@ -155,7 +155,7 @@ def seen_again(scene, first, second, view):
     followed = (albedo - second.albedo[row, column]).abs().mean(dim=-1)[seen]
     unfollowed = (albedo - second.albedo.reshape(-1, 3)).abs().mean(dim=-1)[seen]
     assert seen.sum() > 200
-    # The finest pattern is less than a pixel, 0.07 wide here, so that parts of one show.
+    # The finest pattern is smaller than a pixel (0.07 wide).
     assert followed.mean() < 0.5 * unfollowed.mean()
     return at[seen], pixels[seen]
 
@@ -163,7 +163,7 @@ def seen_again(scene, first, second, view):
 FIXED = {"fixed_point_light": True, "fixed_room": True, "fixed_table": True}
 
 
-def test_a_crop_shifts_all_that_stands_still_by_one_vector_and_the_cameras_say_which(egg):
+def test_a_crop_shifts_the_static_background_as_in_the_cameras(egg):
     scene = build_scene(egg, settings(crop_jitter_px=9.0, **FIXED))
     shift = scene.cameras.intrinsics[:, :2, 2] - scene.cameras.intrinsics.new_tensor([40.0, 30.0])
     assert shift.norm(dim=1).max() < 9
@@ -174,7 +174,7 @@ def test_a_crop_shifts_all_that_stands_still_by_one_vector_and_the_cameras_say_w
         assert_close(after - before, (shift[view] - shift[0]).expand_as(before))
 
 
-def test_a_pan_leaves_the_camera_in_its_place_and_moves_what_stands_still_by_a_homography(egg):
+def test_a_pan_moves_the_static_background_by_a_homography(egg):
     scene, calm = (build_scene(egg, settings(pan_jitter_px=px, **FIXED)) for px in (9.0, 0.0))
     in_room = [
         transform(scene.world_from_room.inverse(), scene.cameras.centers_world[:, None])[:, 0]
@@ -191,11 +191,11 @@ def test_a_pan_leaves_the_camera_in_its_place_and_moves_what_stands_still_by_a_h
         mapped = homogeneous(before) @ (K @ turn @ K.inverse()).mT
         assert_close(mapped[:, :2] / mapped[:, 2:], after)
         assert (after - before).norm(dim=1).amin() > 0.5
-        assert (after - before).std(dim=0).max() < 1.5  # nearly one vector, for so small a turn
+        assert (after - before).std(dim=0).max() < 1.5  # nearly constant: small rotation
 
 
 @pytest.mark.parametrize("jitter", [{"crop_jitter_px": 12.0}, {"pan_jitter_px": 12.0}])
-def test_the_object_is_where_the_true_cameras_see_it_and_whole_in_every_photograph(egg, jitter):
+def test_the_object_projects_correctly_and_completely_in_every_photograph(egg, jitter):
     scene = build_scene(egg, settings(**FIXED, **jitter))
     cameras = scene.cameras
     places = []
@@ -207,7 +207,7 @@ def test_the_object_is_where_the_true_cameras_see_it_and_whole_in_every_photogra
         assert (pixels.amax(dim=0) < pixels.new_tensor([80, 60])).all()
         row, column = photograph(scene, view).foreground.nonzero().unbind(dim=1)
         shown = torch.stack([column, row], dim=1).double() + 0.5
-        assert_close(shown.amin(dim=0), pixels.amin(dim=0), atol=1.0, rtol=0)  # whole pixels
+        assert_close(shown.amin(dim=0), pixels.amin(dim=0), atol=1.0, rtol=0)  # integer pixels
         assert_close(shown.amax(dim=0), pixels.amax(dim=0), atol=1.0, rtol=0)
         places.append(pixels.mean(dim=0))
     assert torch.stack(places).std(dim=0).max() > 2

@@ -32,7 +32,7 @@ def egg(tmp_path):
     return write_ball(tmp_path / "egg.ply", (1.0, 2.0, 1.0), level=2, center=(9.0, 5.0, 7.0))
 
 
-def test_the_object_fills_every_picture_and_leaves_none(egg):
+def test_the_object_fills_every_image_and_stays_inside(egg):
     for path in ("arc", "turntable", "handheld"):
         scene = build_scene(egg, SceneConfig(num_views=7, width=80, height=60, path=path))
         points = scene.object_mesh.vertices_world
@@ -45,12 +45,12 @@ def test_the_object_fills_every_picture_and_leaves_none(egg):
 
 def test_an_aim_is_better_than_the_centre_of_the_box(generator):
     points = torch.rand(60, 3, generator=generator, dtype=torch.float64)
-    points[:, 2] **= 4  # most of it low
+    points[:, 2] **= 4  # mostly at low z
     toward = arc_directions(5, span_deg=50.0, elevation_deg=40.0, sway_deg=4.0)
     view = {"focal_px": 100.0, "width": 80.0, "height": 60.0, "fill": 0.9}
 
     def size(target, distance):
-        """Of a point of the centre in the pictures, on average."""
+        """Return the mean image scale at the object's centre."""
         eyes = target + distance * toward
         centre = (points.amin(dim=0) + points.amax(dim=0)) / 2
         return float((100 / ((eyes - centre) * toward).sum(dim=1)).mean())
@@ -65,7 +65,7 @@ def test_an_aim_is_better_than_the_centre_of_the_box(generator):
 
 
 @pytest.mark.parametrize(("up", "axis"), [("x", 0), ("y", 1), ("z", 2)])
-def test_the_axis_named_up_stands_on_the_table(egg, up, axis):
+def test_the_axis_given_as_up_is_vertical(egg, up, axis):
     scene = build_scene(egg, SceneConfig(num_views=2, width=40, height=30, up=up))
     extent = scene.object_mesh.vertices_world
     low, high = extent.amin(dim=0), extent.amax(dim=0)
@@ -85,20 +85,20 @@ def test_a_mesh_with_colours_keeps_them(tmp_path, generator):
     mesh = Mesh(vertices_world=vertices, faces=faces, albedo=albedo)
     write_ply(mesh, tmp_path / "painted.ply")
     found = build_scene(tmp_path / "painted.ply", SMALL).object_mesh.albedo
-    # Up to the scale that put the brightest at a byte's end, which cuts a few off.
+    # Up to the scale that maps the brightest to 255, which clips a few.
     scale = (found / albedo).median()
     assert ((found / albedo - scale).abs() < 0.05 * scale).float().mean() > 0.9
 
 
-def test_gloss_is_the_scenes_own_unless_told(egg):
+def test_gloss_is_that_of_the_scene_unless_given(egg):
     assert build_scene(egg, SMALL).objects[0].specular == 0
     glossy = SceneConfig(num_views=2, width=40, height=30, specular=0.1, roughness=0.5)
     scene = build_scene(egg, glossy)
     assert (scene.objects[0].specular, scene.objects[0].roughness) == (0.1, 0.5)
-    assert scene.objects[-1].specular == 0  # the table stays matte
+    assert scene.objects[-1].specular == 0  # the table remains matte
 
 
-def test_a_uniform_albedo_replaces_the_texture_of_the_object_alone(egg):
+def test_a_uniform_albedo_replaces_only_the_texture_of_the_object(egg):
     options = {"num_views": 2, "width": 40, "height": 30}
     plain = build_scene(egg, SceneConfig(albedo=(0.6, 0.5, 0.4), **options))
     textured = build_scene(egg, SceneConfig(**options))
@@ -125,11 +125,11 @@ def test_an_object_turns_counter_clockwise_with_its_texture(egg):
     quarter = still.vertices_world.new_tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # x to y
     assert_close(rotated.vertices_world, still.vertices_world @ quarter.mT)
     assert_close(rotated.normals_world.double(), still.normals_world.double() @ quarter.mT)
-    assert_close(rotated.albedo, still.albedo, atol=1e-4, rtol=0)  # the texture's float32
+    assert_close(rotated.albedo, still.albedo, atol=1e-4, rtol=0)  # the texture is float32
 
 
-def test_normals_of_a_file_that_contradict_its_faces_are_not_taken(tmp_path):
-    # A regular octahedron with one normal a face, as flat shading writes it.
+def test_normals_that_contradict_their_faces_are_ignored(tmp_path):
+    # A regular octahedron with one normal per face, as for flat shading.
     corners = "v 1 0 0\nv -1 0 0\nv 0 1 0\nv 0 -1 0\nv 0 0 1\nv 0 0 -1\n"
     flat = "".join(f"vn {x} {y} {z}\n" for x in (1, -1) for y in (1, -1) for z in (1, -1))
     order = [(1, 3, 5), (1, 6, 3), (1, 5, 4), (1, 4, 6), (2, 5, 3), (2, 3, 6), (2, 4, 5), (2, 6, 4)]
@@ -144,7 +144,7 @@ def test_normals_of_a_file_that_contradict_its_faces_are_not_taken(tmp_path):
     assert_close(mesh.normals_world, radial.float(), atol=1e-5, rtol=0)
 
 
-def test_of_a_pair_the_one_in_front_hides_part_of_the_other(generator):
+def test_the_front_object_of_a_pair_occludes_part_of_the_other(generator):
     scene = build_scene("pair", SceneConfig(num_views=5, width=80, height=60))
     behind, front = (TracedObjects([item]) for item in scene.objects[:2])
     gap = KDTree(scene.objects[0].mesh.vertices_world.numpy()).query(
@@ -162,7 +162,7 @@ def test_of_a_pair_the_one_in_front_hides_part_of_the_other(generator):
         assert hidden.sum() > 20
 
 
-def test_a_seed_decides_everything(egg):
+def test_the_seed_determines_the_scene(egg):
     first, again = build_scene(egg, SMALL), build_scene(egg, SMALL)
     other = build_scene(egg, SceneConfig(num_views=5, width=80, height=60, seed=1))
     assert_close(first.lights.positions_world, again.lights.positions_world)
@@ -180,7 +180,7 @@ def test_a_seed_decides_everything(egg):
         ("cloud.ply", "without faces"),
     ],
 )
-def test_what_is_no_object_is_refused(tmp_path, monkeypatch, name, words):
+def test_an_invalid_object_is_refused(tmp_path, monkeypatch, name, words):
     monkeypatch.chdir(tmp_path)
     points = ball(level=1)
     write_ply(points.replace(faces=points.faces[:0]), tmp_path / "cloud.ply")
@@ -218,12 +218,12 @@ BEFORE = ("fixed_point_light", "fixed_room", "fixed_table")
         ),
     ],
 )
-def test_settings_that_give_no_photographs_are_refused(setting, words):
+def test_settings_without_photographs_are_refused(setting, words):
     with pytest.raises(ConfigError, match=words):
         SceneConfig(**setting)
 
 
-def test_point_lights_stay_over_the_table_on_the_photographed_side(generator):
+def test_point_lights_stay_above_the_table_on_the_photographed_side(generator):
     azimuths = torch.linspace(0, 5, 12, dtype=torch.float64)
     target = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     lights = lights_round(
@@ -239,7 +239,7 @@ def test_point_lights_stay_over_the_table_on_the_photographed_side(generator):
     assert (facing > 0).all()
 
 
-def test_light_from_far_away_does_not_fall_off(generator):
+def test_distant_light_does_not_fall_off(generator):
     target = torch.zeros(3, dtype=torch.float64)
     azimuths = torch.zeros(1, dtype=torch.float64)
     lights = lights_round(
@@ -252,18 +252,18 @@ def test_light_from_far_away_does_not_fall_off(generator):
     assert_close(arriving, torch.ones(2), atol=1e-4, rtol=0)
 
 
-def test_a_hand_goes_all_round_at_three_heights(generator):
+def test_handheld_cameras_are_all_around_at_three_heights(generator):
     toward = handheld_directions(24, generator, elevation_deg=30.0)
     azimuth = torch.rad2deg(torch.atan2(toward[:, 0], -toward[:, 1])) % 360
     gaps = azimuth.sort().values.diff()
     assert gaps.max() < 60
-    assert gaps.std() > 1  # no machine
+    assert gaps.std() > 1  # irregular
     heights = torch.rad2deg(torch.asin(toward[:, 2])).reshape(3, 8).mean(dim=1)
     assert heights[1] > heights[0] + 10
     assert heights[2] < heights[0] - 6
 
 
-def test_paint_covers_and_marks_darken():
+def test_paint_replaces_albedo_and_marks_darken_it():
     points = torch.tensor([[0.0, -1.0, 0.5], [0.0, 1.0, 0.5], [0.0, -1.0, 2.0]])
 
     def white(at):
@@ -278,7 +278,7 @@ def test_paint_covers_and_marks_darken():
 
 
 @pytest.mark.parametrize("name", scene_objects.RECIPES)
-def test_every_object_stands_on_the_table_at_its_centre(name, monkeypatch, generator):
+def test_every_object_is_on_the_table_at_its_centre(name, monkeypatch, generator):
     monkeypatch.setattr(scene_objects, "mug_mesh", lambda: _MUG_MESH(cell=0.06))
     made = scene_objects.RECIPES[name](generator)
     points = torch.cat([item.mesh.vertices_world for item in made])
@@ -294,7 +294,7 @@ def test_every_object_stands_on_the_table_at_its_centre(name, monkeypatch, gener
 _MUG_MESH = scene_objects.mug_mesh
 
 
-def test_no_ball_cuts_another():
+def test_balls_do_not_intersect():
     made = scene_objects.balls(torch.Generator().manual_seed(1))
     corners = [item.mesh.vertices_world for item in made]
     centres = torch.stack([vertices.mean(dim=0) for vertices in corners])
@@ -303,7 +303,7 @@ def test_no_ball_cuts_another():
     assert gaps[~torch.eye(len(made), dtype=torch.bool)].min() > -1e-3
 
 
-def test_no_potato_cuts_another():
+def test_potatoes_do_not_intersect():
     meshes = [item.mesh for item in scene_objects.potatoes(torch.Generator().manual_seed(0))]
     nearest = []
     for first in range(4):
@@ -314,4 +314,4 @@ def test_no_potato_cuts_another():
             beyond = ((one[::10] - other[which]) * outward).sum(dim=1)
             assert beyond[near < 0.05].numel() == 0 or beyond[near < 0.05].min() > -0.02
             nearest.append(near.min())
-    assert len([gap for gap in nearest if gap < 0.05]) >= 3  # a heap, not a row
+    assert len([gap for gap in nearest if gap < 0.05]) >= 3  # a pile, not a row

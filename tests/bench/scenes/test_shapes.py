@@ -30,7 +30,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_a_hit_lies_on_the_surface_and_nothing_before_it_does(name, generator):
+def test_a_hit_is_the_first_point_on_the_surface(name, generator):
     origins, directions = rays_from_above(generator)
     distance = SHAPES[name].intersect(origins, directions)
     hit = distance.isfinite()
@@ -54,25 +54,25 @@ def test_normals_are_the_gradient_of_the_level_and_unit(name, generator):
     assert_close(SHAPES[name].normals(points.detach()), expected, atol=1e-12, rtol=0)
 
 
-def test_rays_that_pass_a_sphere_or_leave_a_plane_behind_meet_nothing():
+def test_rays_past_a_sphere_or_away_from_a_plane_have_no_hit():
     origins = torch.tensor([[0.0, 0.0, 4.0], [2.0, 0.0, 4.0]], dtype=torch.float64)
     directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
     assert Sphere().intersect(origins, directions).isinf().all()
     assert EndlessPlane().intersect(origins[:1], directions[:1]).isinf().all()
 
 
-def test_a_ray_from_inside_a_sphere_meets_its_far_side():
+def test_a_ray_from_inside_a_sphere_hits_its_far_side():
     origin = torch.zeros(1, 3, dtype=torch.float64)
     direction = torch.tensor([[0.0, 2.0, 0.0]], dtype=torch.float64)
     assert_close(Sphere(radius=3.0).intersect(origin, direction), torch.tensor([1.5]).double())
 
 
-def test_bumps_are_met_on_the_height_field_with_normals_across_it(generator):
+def test_bumps_are_hit_on_the_height_field_with_its_normals(generator):
     height_field = waves(generator)
     shape = WavyPlane(height_field=height_field)
     origins, directions = rays_from_above(generator)
     points = origins + shape.intersect(origins, directions)[:, None] * directions
-    assert points[:, 2].std() > 0.02  # a plane would pass otherwise
+    assert points[:, 2].std() > 0.02  # otherwise a plane would pass
     assert_close(points[:, 2], height_field(points[:, :2]), atol=1e-12, rtol=0)
     xy = points[:, :2].clone().requires_grad_()
     (slope,) = torch.autograd.grad(height_field(xy).sum(), xy)

@@ -20,7 +20,7 @@ def scene(generator):
     return render_shape(Sphere(), cameras, lights, random_speckle(generator))
 
 
-def test_points_lie_on_the_surface_and_project_on_their_observations(scene, generator):
+def test_points_are_on_the_surface_and_project_to_their_observations(scene, generator):
     sparse = exact_cloud(scene, 150, generator)
     assert len(sparse.points_world) == 150
     assert_close(sparse.points_world.norm(dim=1), torch.ones(150, dtype=torch.float64))
@@ -38,13 +38,13 @@ def test_no_point_is_observed_from_behind_the_sphere(scene, generator):
     points = sparse.points_world[sparse.observation_point]
     toward = sparse.cameras.centers_world[sparse.observation_view] - points
     assert ((points * toward).sum(dim=1) > 0).all()
-    # A camera at the arc's end does not see all that the other end sees.
+    # Cameras at both ends of the arc see different parts.
     assert not sparse.observed.all()
     fraction = sparse.observed.double().mean()
     assert fraction > 0.6
 
 
-def test_noise_is_on_the_observations_and_reaches_the_points(scene, generator):
+def test_noise_of_observations_propagates_to_points(scene, generator):
     sparse = exact_cloud(scene, 300, generator, noise_px=0.5)
     off = (sparse.points_world.norm(dim=1) - 1).abs()
     assert 1e-4 < off.mean() < 0.02
@@ -52,18 +52,18 @@ def test_noise_is_on_the_observations_and_reaches_the_points(scene, generator):
     assert 0.3 < sparse.reprojection_errors_px.mean() < 0.63
 
 
-def test_rays_through_noiseless_pixels_meet_in_their_points(generator):
+def test_rays_through_noiseless_pixels_intersect_in_their_points(generator):
     cameras = arc_cameras(4, width=80, height=60, focal_px=90.0, distance=4.0)
     points = torch.rand(30, 3, generator=generator, dtype=torch.float64) - 0.5
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
     seen = torch.ones(30, 4, dtype=torch.bool)
     seen[:10, 0] = False
     pixels = pixels.movedim(0, 1).clone()
-    pixels[:10, 0] = -1e4  # unseen, so it must not count
+    pixels[:10, 0] = -1e4  # unobserved, so it must not count
     assert_close(triangulate_rays(cameras, pixels, seen), points)
 
 
-def test_a_cloud_is_single_precision_as_structure_from_motion_gives_it(scene, generator):
+def test_a_cloud_is_float32_like_that_of_structure_from_motion(scene, generator):
     sparse = sparse_scene(scene, 10, generator)
     assert sparse.points_world.dtype == torch.float32
     assert sparse.cameras.cam_from_world.dtype == torch.float32

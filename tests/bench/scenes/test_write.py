@@ -28,7 +28,7 @@ def rendering(ball, tmp_path_factory):
     return render_scene(ball, tmp_path_factory.mktemp("out") / "scene", SMALL, processes=1)
 
 
-def test_a_rendering_holds_what_it_says(rendering):
+def test_a_rendering_has_the_documented_files(rendering):
     assert sorted(path.name for path in rendering.iterdir()) == [
         ".pimper.json",
         "masks",
@@ -44,13 +44,13 @@ def test_a_rendering_holds_what_it_says(rendering):
     assert report["settings"]["width"] == 48
 
 
-def test_true_points_lie_on_the_surface_that_the_maps_show(rendering):
+def test_true_points_are_on_the_surface_of_the_maps(rendering):
     model = read_model(rendering / "truth" / "sparse")
     assert model.names == tuple(f"view_{view:03d}.png" for view in range(3))
     assert len(model.points_world) > 500
     center = model.points_world.new_tensor([0.0, 0.0, 1.2])
     radius = (model.points_world - center).norm(dim=1)
-    assert ((radius < 1.2 + 1e-6) & (radius > 1.2 * 0.99)).all()  # facets lie inside the ball
+    assert ((radius < 1.2 + 1e-6) & (radius > 1.2 * 0.99)).all()  # facets are inside the ball
     compared = 0
     for view, lens in enumerate(model.lenses):
         with np.load(rendering / "truth" / "maps" / f"view_{view:03d}.npz") as arrays:
@@ -64,7 +64,7 @@ def test_true_points_lie_on_the_surface_that_the_maps_show(rendering):
         u, v = pixels.long().unbind(dim=-1)
         inner = maps["foreground"][v, u]
         gap = (maps["depth"][v, u].double() - depth).abs()[inner]
-        # Half a pixel is 0.04 wide here; the steepest facet that counts rises 5 times that.
+        # Half a pixel is 0.04 wide here; the steepest facet evaluated rises 5 times that.
         assert gap.max() < 0.25
         assert gap.median() < 0.03
         compared += int(inner.sum())
@@ -72,14 +72,14 @@ def test_true_points_lie_on_the_surface_that_the_maps_show(rendering):
 
 
 @pytest.mark.slow
-def test_the_files_are_the_same_whatever_the_number_of_processes(rendering, ball, tmp_path):
+def test_the_files_do_not_depend_on_the_number_of_processes(rendering, ball, tmp_path):
     render_scene(ball, tmp_path / "two", SMALL, processes=2)
     names = sorted(path.relative_to(rendering) for path in rendering.rglob("*") if path.is_file())
     assert len(names) > 10
     for name in names:
         if name.name == ".pimper.json":  # the times of the files
             continue
-        if name.suffix == ".npz":  # a zip notes the time of day
+        if name.suffix == ".npz":  # a zip contains the time
             with np.load(rendering / name) as one, np.load(tmp_path / "two" / name) as two:
                 assert all(np.array_equal(one[key], two[key], equal_nan=True) for key in one)
         else:
@@ -95,13 +95,13 @@ def test_a_folder_in_use_is_refused_before_any_work(ball, rendering, tmp_path):
         render_scene(ball, tmp_path / "mine", SMALL, processes=1, overwrite=True)
 
 
-def test_no_processes_are_refused(ball, tmp_path):
+def test_zero_processes_are_refused(ball, tmp_path):
     with pytest.raises(ConfigError, match="processes is 0"):
         render_scene(ball, tmp_path / "out", SMALL, processes=0)
     assert not (tmp_path / "out").exists()
 
 
-def test_several_lights_a_pose_are_one_camera_and_a_folder_each(ball, tmp_path):
+def test_several_lights_per_pose_have_one_camera_and_one_folder_each(ball, tmp_path):
     config = SceneConfig(num_views=6, lights_per_pose=2, width=48, height=36, supersample=1)
     folder = render_scene(ball, tmp_path / "scene", config, processes=1)
     with pytest.warns(PimperWarning, match="3 poses of the camera"):
