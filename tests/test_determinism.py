@@ -16,7 +16,7 @@ from tests.test_chain import photographed, small_chain
 from tests.threads import on_threads
 
 
-def of_every_stage(preset):
+def digests_of_stages(preset):
     """Run a chain with known cameras; return the digests of each stage's records.
 
     They are sorted: threads call stages that process parts in any order.
@@ -39,7 +39,7 @@ def of_every_stage(preset):
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_stages_are_reproducible_bit_for_bit_on_any_number_of_threads(preset):
-    first, *others = on_threads(lambda: of_every_stage(preset), 1, 2, 2)
+    first, *others = on_threads(lambda: digests_of_stages(preset), 1, 2, 2)
     assert None not in (one for records in first.values() for one in records)
     assert {name for name, records in first.items() if records} >= {"warp", "decompose", "extract"}
     assert others == [first, first]
@@ -50,8 +50,8 @@ def test_two_processes_give_the_same_bits():
     """Results must not depend on hashes and addresses of objects, which differ by process."""
     code = (
         "import hashlib, torch; torch.set_num_threads(2)\n"
-        "from tests.test_determinism import of_every_stage\n"
-        "print(hashlib.sha256(repr(of_every_stage('paper')).encode()).hexdigest())"
+        "from tests.test_determinism import digests_of_stages\n"
+        "print(hashlib.sha256(repr(digests_of_stages('paper')).encode()).hexdigest())"
     )
     path = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     printed = {

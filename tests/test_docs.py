@@ -164,7 +164,7 @@ def a_glance_at_photographs(monkeypatch: pytest.MonkeyPatch) -> dict[str, object
     return {}
 
 
-def nothing(_: pytest.MonkeyPatch) -> dict[str, object]:
+def no_names(_: pytest.MonkeyPatch) -> dict[str, object]:
     return {}
 
 
@@ -182,7 +182,7 @@ def a_scene_and_a_mesh(_: pytest.MonkeyPatch) -> dict[str, object]:
     }
 
 
-def a_data_set_of_ones_own(_: pytest.MonkeyPatch) -> dict[str, object]:
+def a_custom_data_set(_: pytest.MonkeyPatch) -> dict[str, object]:
     scene, found = photographed()
     folder = Path("mine")
     save_photographs(scene.views, folder)
@@ -267,7 +267,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/parts.md", 2): a_normal_map,
     ("docs/result.md", 0): a_result,
     ("docs/many.md", 0): two_objects,
-    ("docs/conventions.md", 0): nothing,
+    ("docs/conventions.md", 0): no_names,
     ("docs/priors.md", 0): photographs_and_maps,
     ("docs/priors.md", 1): photographs_and_maps,
     ("docs/priors.md", 2): photographs_and_maps,
@@ -276,7 +276,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/extending.md", 2): a_scene_and_a_mesh,
     ("docs/extending.md", 3): losses,
     ("docs/extending.md", 4): camera_formats,
-    ("docs/extending.md", 5): a_data_set_of_ones_own,
+    ("docs/extending.md", 5): a_custom_data_set,
 }
 
 

@@ -23,7 +23,7 @@ SCENES = {
     "mug": {},
     "a black photograph": {},
     "a saturated photograph": {},
-    "views that see nothing of most facets": {},
+    "views without most facets": {},
 }
 
 
@@ -43,7 +43,7 @@ def rendered(tmp_path_factory):
             images[2] = 0
         if name == "a saturated photograph":
             images[2] = 1
-        if name == "views that see nothing of most facets":
+        if name == "views without most facets":
             seen = (torch.arange(240) > 110) | (torch.arange(8)[:, None] < 4)
             views = views.replace(masks=views.masks & seen[:, None])
         views = views.replace(images=images, priors=prior_of("normals:5", read_rendered(folder)))

@@ -85,7 +85,7 @@ def test_factorization_agrees_with_finite_differences(light, loss, generator):
     assert_agree("factorize", found, STAGE)
 
 
-def with_constant_rooms(probe, monkeypatch):
+def with_constant_soft_light(probe, monkeypatch):
     """Return a probe that keeps the soft light of its first evaluation.
 
     For autograd these harmonics are constants (see ``fit_light_field``), but not for finite
@@ -117,7 +117,7 @@ def test_stages_agree_with_finite_differences_on_whole_scenes(
     stages = probes(chain_of("default", scales=[0.25, 0.5]), *rendered_scene(tmp_path))
     del stages["chain"]  # a step may change the set of vertices
     assert len(stages) == 7
-    stages["factorize"] = with_constant_rooms(stages["factorize"], monkeypatch)
+    stages["factorize"] = with_constant_soft_light(stages["factorize"], monkeypatch)
     for stage, probe in stages.items():
         steps = (3e-6, 1e-6) if stage == "fuse" else (1e-6, 1e-7)
         pairs = probe.check(generator, directions=1, weights=0, steps=steps)

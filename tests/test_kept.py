@@ -109,7 +109,7 @@ def test_different_photographs_rerun_everything(given, whole):
     assert "photometry" not in listener.kept
 
 
-class Doubtful(Extract):
+class Subclassed(Extract):
     """The package's stage, subclassed in a different module."""
 
     def forward(self, surface: Surface) -> Mesh:
@@ -120,7 +120,7 @@ class Doubtful(Extract):
 def test_a_custom_stage_is_called_every_time(given, whole):
     _, folder, _ = whole
     chain, listener = chain_of(given, folder)
-    chain.extract = Doubtful()
+    chain.extract = Subclassed()
     for _ in range(2):
         with pytest.warns(PimperWarning, match="doubtful"):
             chain(given[0].views)

@@ -66,7 +66,7 @@ def test_failed_and_nested_stages_have_no_report():
     assert listener.heard == ["started broken", "started outer", "1/1", "finished outer"]
 
 
-def test_threads_have_reports_of_their_own():
+def test_threads_have_separate_reports():
     names = {}
     inside = threading.Barrier(2, timeout=60)
     listeners = {"first": Listener(), "second": Listener()}

@@ -245,9 +245,9 @@ def test_the_glb_is_valid_and_has_the_baked_textures(asset, placement, tmp_path,
     assert extras["offset_world"] == list(OFFSET)
     normals = normalize(rotate(back, torch.tensor(shape.vertex_normals).float()), dim=1)
     assert_close(normals, asset.normals, atol=1e-6, rtol=0)
-    told = shape.vertex_attributes
-    assert np.allclose(np.ravel(told["_EXPECTED_ERROR"]), mesh.expected_error)
-    assert np.allclose(np.ravel(told["_SUPPORT"]), mesh.confidence)
+    attributes = shape.vertex_attributes
+    assert np.allclose(np.ravel(attributes["_EXPECTED_ERROR"]), mesh.expected_error)
+    assert np.allclose(np.ravel(attributes["_SUPPORT"]), mesh.confidence)
     material = shape.visual.material
     color, bumps = material.baseColorTexture, material.normalTexture
     away = torch.tensor(np.asarray(color)).float() - asset.base_color

@@ -17,15 +17,15 @@ def test_each_object_has_a_line_and_failures_set_the_exit_code(world, capsys, fa
     world.add("ball")
     world.add("cup", "fail('InputError', 2)" if failing else "end()")
     code = main(["batch", str(world.folder / "scans"), "-o", str(world.out), "--jobs", "1"])
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     assert code == (2 if failing else 0)
-    ball, cup, totals = told.out.splitlines()
+    ball, cup, totals = printed.out.splitlines()
     assert ball.split()[:2] == ["ball", "ended"]
     assert cup.split()[:2] == ["cup", "failed" if failing else "ended"]
     if failing:
         assert cup.endswith("it is so.")
         assert totals.startswith("1 ended, 1 failed; ")
-        assert "1 of 2 objects have no result, as cup: it is so." in " ".join(told.err.split())
+        assert "1 of 2 objects have no result, as cup: it is so." in " ".join(printed.err.split())
 
 
 def test_events_have_the_outcome_of_each_object(world, capsys):

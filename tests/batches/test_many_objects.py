@@ -138,15 +138,15 @@ def test_changes_since_the_result_are_named(world):
     (photos / "1.png").rename(photos / "5.png")
     (photos / "more.txt").touch()
     given[3] = "600"
-    (told,) = world.batch(settings=[*given, "--stl"]).values()
-    assert told.status == "failed"
-    assert told.message.endswith(
+    (outcome,) = world.batch(settings=[*given, "--stl"]).values()
+    assert outcome.status == "failed"
+    assert outcome.message.endswith(
         " Differences since it was made: without --faces 500; with --faces 600, --stl; changed "
         "0.png (--masks); added 5.png (PHOTOS), more.txt (PHOTOS); missing 1.png (PHOTOS)."
     )
     (world.out / ".stages" / "ball.key").write_text("0123456789abcdef0123456789abcdef")
-    (told,) = world.batch(settings=given).values()
-    assert "An earlier version made it, and did not record its settings" in told.message
+    (outcome,) = world.batch(settings=given).values()
+    assert "An earlier version made it, and did not record its settings" in outcome.message
 
 
 def test_results_inside_the_input_folder_are_not_objects(world):

@@ -115,7 +115,7 @@ def test_a_list_without_objects_is_refused(tmp_path, given):
         ("photos,watertight\nscans/cup,maybe\n", "row 2: "),
     ],
 )
-def test_a_wrong_setting_is_refused_by_its_row_before_anything_starts(world, scans, text, message):
+def test_a_wrong_setting_is_refused_with_its_row_before_the_first_run(world, scans, text, message):
     table = world.folder / "list.csv"
     table.write_text(text)
     with pytest.raises(ConfigError) as refused:

@@ -19,8 +19,8 @@ def offer(monkeypatch, *entries, installed=None):
 
 def helped(capsys):
     assert main(["--help"]) == 0
-    told = capsys.readouterr().out
-    return {line.split()[0]: line for line in told.splitlines() if line.startswith("  ")}
+    printed = capsys.readouterr().out
+    return {line.split()[0]: line for line in printed.splitlines() if line.startswith("  ")}
 
 
 @pytest.mark.parametrize("name", OF_BENCH)

@@ -30,7 +30,7 @@ REFUSED = [
 ]
 
 
-def test_help_and_refusals_load_nothing_heavy(tmp_path):
+def test_help_and_refusals_load_no_slow_modules(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.png").write_bytes(b"")
     found = answers(

@@ -184,7 +184,7 @@ def terminate():
         (terminate, "Interrupted", 143, "interrupted; no result was written"),
     ],
 )
-def test_a_run_that_ends_early_leaves_nothing(
+def test_a_run_that_ends_early_leaves_no_files(
     reconstruct, chain, tmp_path, capsys, work, kind, code, expected
 ):
     former = signal.getsignal(signal.SIGTERM)
@@ -290,7 +290,7 @@ def test_names_that_are_not_utf_8_are_refused(photos, chain, tmp_path, capsys, p
 
 
 @pytest.mark.slow
-def test_names_in_utf_8_are_written_whatever_the_locale(photos, tmp_path):
+def test_names_in_utf_8_are_written_in_any_locale(photos, tmp_path):
     """In the C locale Python uses UTF-8 for names, and so do its libraries."""
     folder = photos.rename(photos.with_name("h\u00e9"))
     (folder / "0.png").rename(folder / "\u00fc \u96ea.png")

@@ -23,17 +23,17 @@ def test_the_output_is_the_preset_with_a_comment_on_each_setting(preset, tmp_pat
 
 def test_a_single_section_is_printed(capsys):
     assert main(["config", "sweep", "--preset", "default"]) == 0
-    told = yaml.safe_load(capsys.readouterr().out)
-    assert told == {"sweep": to_mapping(load_config("default").sweep)}
+    printed = yaml.safe_load(capsys.readouterr().out)
+    assert printed == {"sweep": to_mapping(load_config("default").sweep)}
 
 
 def test_a_setting_is_described(capsys):
     assert main(["config", "reconstruct.shared-camera"]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     names = "--reconstruct.shared-camera, --reconstruct.no-shared-camera"
-    assert told.startswith(f"# option: {names}\n")
-    assert "One camera took all photographs" in told
-    assert yaml.safe_load(told) == {"reconstruct": {"shared_camera": False}}
+    assert printed.startswith(f"# option: {names}\n")
+    assert "One camera took all photographs" in printed
+    assert yaml.safe_load(printed) == {"reconstruct": {"shared_camera": False}}
 
 
 @pytest.mark.parametrize(

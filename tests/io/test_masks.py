@@ -192,15 +192,15 @@ def test_masks_are_rotated_by_their_exif_or_to_match_sizes(tmp_path_factory, tag
     """Masks are of the upright photograph, or of stored pixels if only that size matches."""
     shown = disc()
     stored = [rotated(shown, one) for one in tags]
-    for way in ("as photographs stand", "by an EXIF of their own", "of stored pixels"):
+    for way in ("upright", "with EXIF", "stored pixels"):
         root = tmp_path_factory.mktemp("turned")
         write_photographs(root / "photos", tags)
         for number, (upright, one) in enumerate(zip(stored, tags, strict=True)):
             drawn, exif = upright, tagged(1)
-            if way == "by an EXIF of their own":
+            if way == "with EXIF":
                 inverse = {6: 8, 8: 6}.get(tag, tag)
                 drawn, exif = rotated(upright, inverse), tagged(tag)
-            elif way == "of stored pixels" and one >= 5:
+            elif way == "stored pixels" and one >= 5:
                 drawn = shown
             save(root / "masks" / f"{number}.png", drawn.astype(np.uint8) * 255, exif=exif)
         views = load_views(root / "photos", masks=root / "masks")

@@ -54,10 +54,10 @@ def test_skipped_photograph_like_files_are_named_and_counted(photos, pixels):
     for name in ("5.gif", "1.HEIC", "2.heic", "8.avif", "10.CR2", "11.mp4"):
         (photos / name).write_bytes(b"")
     (photos / "12.jpg").symlink_to(photos / "nowhere.jpg")
-    with pytest.warns(PimperWarning, match=r"\(1\)") as told:
+    with pytest.warns(PimperWarning, match=r"\(1\)") as caught:
         assert load_views(photos).num_views == 3
-    assert len(told) == 1
-    text = str(told[0].message)
+    assert len(caught) == 1
+    text = str(caught[0].message)
     kinds = ("GIF (1)", "HEIC (2)", "AVIF (1)", "CR2 (1)", "MP4 (1)")
     assert all(kind in text for kind in (*kinds, "broken link (1)", "folder of images (1)"))
 
@@ -110,7 +110,7 @@ def test_shrinking_averages_radiance_and_scales_the_focal_length(tmp_path):
     assert views.focals_px[0].item() == pytest.approx(5000 / 3600 * 24)
 
 
-def test_shrinking_keeps_corners_where_they_are(photos):
+def test_shrinking_keeps_corners_in_place(photos):
     ramp = np.tile(np.arange(0, 240, 5, dtype=np.uint8)[None, :, None], (32, 1, 3))
     for name in ("1.png", "2.png", "10.png"):
         save(photos / name, ramp)
@@ -247,11 +247,11 @@ def test_a_subfolder_of_masks_or_maps_is_not_a_pose(tmp_path, pixels, beside):
     for pose in (1, 2, 3):
         save(tmp_path / f"pose_{pose}" / "1.png", pixels)
         save(tmp_path / beside / f"pose_{pose}.png", pixels[..., 0])
-    with pytest.warns(PimperWarning) as told:
+    with pytest.warns(PimperWarning) as caught:
         views = load_views(tmp_path, masks=tmp_path / beside)
     assert views.names == tuple(f"pose_{pose}/1.png" for pose in (1, 2, 3))
     assert views.poses.tolist() == [0, 1, 2]
-    passed = [str(one.message) for one in told if "were not read" in str(one.message)]
+    passed = [str(one.message) for one in caught if "were not read" in str(one.message)]
     assert len(passed) == 1
     assert f"folder of images (1); {beside}." in passed[0]
     shutil.rmtree(tmp_path / "pose_3")

@@ -58,7 +58,7 @@ def test_other_files_of_moge_are_not_unmatched_maps(tmp_path):
 
 
 ONE_A_PHOTOGRAPH = dict(zip(POSES, range(4), strict=True))
-ONE_A_POSE = {"p_1/a.png": 0, "p_2/a.png": 1}  # the first represents its pose
+ONE_PER_POSE = {"p_1/a.png": 0, "p_2/a.png": 1}  # the first represents its pose
 
 
 @pytest.mark.parametrize(
@@ -69,12 +69,12 @@ ONE_A_POSE = {"p_1/a.png": 0, "p_2/a.png": 1}  # the first represents its pose
         ([f"{name[:-4]}/depth.npy" for name in POSES], ONE_A_PHOTOGRAPH),
         (["p_1_a.npy", "p_1_b.npy", "p_2_a.npy", "p_2_b.npy"], ONE_A_PHOTOGRAPH),
         (["p_1-a_depth.npy", "p_1-b.npy", "p_2-a.npy", "p_2-b.npy"], ONE_A_PHOTOGRAPH),
-        (["p_1.npy", "p_2.npy"], ONE_A_POSE),
-        (["p_1_depth.npy", "p_2_depth.npy", "p_1_normal.npy", "p_2_normal.npy"], ONE_A_POSE),
-        (["p_1/depth.npy", "p_2/depth.npy", "p_1/normal.npy", "p_2/normal.npy"], ONE_A_POSE),
-        (["p_1/mean.npy", "p_2/mean.npy"], ONE_A_POSE),
-        (["p_1/b.npy", "p_2.npy"], ONE_A_POSE),
-        (["p_1/b.npy", "p_2/b.npy"], ONE_A_POSE),
+        (["p_1.npy", "p_2.npy"], ONE_PER_POSE),
+        (["p_1_depth.npy", "p_2_depth.npy", "p_1_normal.npy", "p_2_normal.npy"], ONE_PER_POSE),
+        (["p_1/depth.npy", "p_2/depth.npy", "p_1/normal.npy", "p_2/normal.npy"], ONE_PER_POSE),
+        (["p_1/mean.npy", "p_2/mean.npy"], ONE_PER_POSE),
+        (["p_1/b.npy", "p_2.npy"], ONE_PER_POSE),
+        (["p_1/b.npy", "p_2/b.npy"], ONE_PER_POSE),
         (["p_2/b.npy"], {"p_2/a.png": 0}),
     ],
 )
@@ -94,7 +94,7 @@ def test_photographs_named_like_maps_keep_their_names(tmp_path):
     assert numbers_of(tmp_path, names) == dict(zip(names, range(3), strict=True))
 
 
-def test_a_folder_with_only_one_kind_of_map_is_read_whatever_its_name(tmp_path):
+def test_a_folder_with_only_one_kind_of_map_is_read_with_any_name(tmp_path):
     write(tmp_path, ["cup_1_normal.npy", "cup_2_normal.npy"])
     assert numbers_of(tmp_path, FLAT) == dict(zip(FLAT, range(2), strict=True))
 

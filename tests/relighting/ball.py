@@ -24,7 +24,7 @@ def ring(views):
     return pinholes(pose, 1.6 * SIDE, SIDE, SIDE).to(torch.float32)
 
 
-def lights_beside(cameras):
+def lights_near(cameras):
     """Tinted lights, each about 40 degrees from its camera, on varying sides."""
     eyes = normalize(cameras.centers_world.double(), dim=1)
     aside = normalize(even_directions(len(eyes)), dim=1)
@@ -81,7 +81,7 @@ def textbook(normal, to_light, to_eye, base, material):
 def photographed(material, views=6, albedo=colours):
     """Return photographs of a ball of one material as a scene, and their lights."""
     cameras = ring(views)
-    lights = lights_beside(cameras)
+    lights = lights_near(cameras)
     pixels = pixel_centers(SIDE, SIDE, like=torch.zeros(1).double()).reshape(-1, 2)
     images = []
     for view in range(views):

@@ -64,10 +64,10 @@ def test_without_held_out_photographs_the_used_ones_are_predicted():
 
 def test_unobserved_surface_has_no_figure():
     scene = photographed((0.0, 1.0, 0.0), views=3)[0]
-    nothing = Silhouettes.everything(scene.views).replace(
+    empty = Silhouettes.everything(scene.views).replace(
         inside=torch.zeros_like(scene.views.images[:, 0])
     )
-    report = relighting_report(Relight()(ball_mesh(), scene, nothing))
+    report = relighting_report(Relight()(ball_mesh(), scene, empty))
     assert report["psnr_db"] is None
     assert not math.isnan(report["materials"][0]["roughness"])
 

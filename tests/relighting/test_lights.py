@@ -46,8 +46,8 @@ def test_highlights_hardly_move_a_light(ball):
 
 def test_a_photograph_without_the_object_gets_no_light(ball):
     scene, _ = photographed(MATTE, views=3)
-    nothing = torch.zeros_like(scene.views.images[:, 0], dtype=torch.bool)
-    scene = scene.replace(views=scene.views.replace(masks=nothing))
+    empty = torch.zeros_like(scene.views.images[:, 0], dtype=torch.bool)
+    scene = scene.replace(views=scene.views.replace(masks=empty))
     found = fit_lights(ball, scene)
     assert not found.ambient.any()
     assert not found.directed.any()

@@ -428,8 +428,8 @@ def test_two_clicks_measure_a_distance(opened, shown):
     scene = shown[2]
     behind(opened, 0)
     choose(opened, "measure")
-    told = opened.locator("#measured")
-    assert told.inner_text() == "Click the first point on the surface."
+    measured = opened.locator("#measured")
+    assert measured.inner_text() == "Click the first point on the surface."
     stage = opened.locator("#canvas").bounding_box()
     side = min(stage["width"], stage["height"])
 
@@ -446,19 +446,19 @@ def test_two_clicks_measure_a_distance(opened, shown):
         return eye + (along - (along**2 - eye @ eye + 1).sqrt()) * ray
 
     click(2.0, 2.0)  # beside the ball
-    assert told.inner_text() == "Click the first point on the surface."
+    assert measured.inner_text() == "Click the first point on the surface."
     first = click(30.0, 40.0)
-    assert told.inner_text() == "Click the second point on the surface."
+    assert measured.inner_text() == "Click the second point on the surface."
     second = click(52.0, 31.0)
     wanted = 100 * float((first - second).norm()) / (2 * 3**0.5)
-    value, _, unit = told.inner_text().partition(" ")
+    value, _, unit = measured.inner_text().partition(" ")
     assert float(value) == pytest.approx(wanted, rel=0.02)  # clicks are integer pixels
     assert unit == "% of the object's size"
     assert len(pressed(opened)) == 1  # no camera was clicked
     click(30.0, 40.0)  # begins anew
-    assert told.inner_text() == "Click the second point on the surface."
+    assert measured.inner_text() == "Click the second point on the surface."
     choose(opened, "measure")
-    assert not told.is_visible()
+    assert not measured.is_visible()
 
 
 def ball_pixels(picture):

@@ -125,12 +125,12 @@ def test_a_prediction_has_its_light(reconstruction):
         ambient=torch.tensor([[0.1]]),
         directed=torch.tensor([[0.5]]),
     )
-    told = Prediction(radiance=torch.full((1, 40, 60), 0.2), light=light, psnr_db=30.0)
+    predicted = Prediction(radiance=torch.full((1, 40, 60), 0.2), light=light, psnr_db=30.0)
     lights_world = torch.tensor([[math.nan] * 4, [0.2, 0.1, 0.0, 0.3], [0.1, 0.0, 0.2, 0.0]])
     first, second, third = view_entries(
         reconstruction.scene,
         reconstruction.silhouettes,
-        [None, told, told.replace(psnr_db=math.nan)],
+        [None, predicted, predicted.replace(psnr_db=math.nan)],
         lights_world,
     )
     assert not {"prediction", "psnr_db", "environment"} & set(first)

@@ -57,11 +57,11 @@ def test_two_marks_on_a_rendered_object_give_the_scale(tmp_path, capsys):
     line += ["--sparse", str(scene / "truth" / "sparse"), "--masks", str(scene / "masks")]
     assert main([*line, "--scale-bar", *words, f"{length:.9g}"]) == 0
     assert "hardly determine" not in capsys.readouterr().err
-    told = json.loads((out / "summary.json").read_text())["scale"]
-    assert (told["unit"], told["source"]) == ("mm", "scale bars")
-    log.info("potatoes: size off by %.2e", told["factor"] / 1000 - 1)
-    assert told["factor"] == pytest.approx(1000, rel=2e-3)
+    scale = json.loads((out / "summary.json").read_text())["scale"]
+    assert (scale["unit"], scale["source"]) == ("mm", "scale bars")
+    log.info("potatoes: size off by %.2e", scale["factor"] / 1000 - 1)
+    assert scale["factor"] == pytest.approx(1000, rel=2e-3)
     found = read_model(out / "sparse")
     true = capture.cameras.take([capture.views.names.index(name) for name in found.names])
     apart = torch.pdist(centers(found.cam_from_world)), torch.pdist(centers(true.cam_from_world))
-    assert float((apart[0] / apart[1]).median()) == pytest.approx(told["factor"], rel=1e-5)
+    assert float((apart[0] / apart[1]).median()) == pytest.approx(scale["factor"], rel=1e-5)

@@ -142,7 +142,7 @@ def test_a_click_on_a_frustum_moves_the_viewpoint_there(viewer, page, reconstruc
     fetched, errors = [], []
     page.on("request", lambda request: fetched.append(request.url))
     page.on("pageerror", lambda error: errors.append(error.message))
-    page.on("console", lambda told: errors.append(told.text) if told.type == "error" else None)
+    page.on("console", lambda entry: errors.append(entry.text) if entry.type == "error" else None)
     add_found(viewer, reconstruction)
     page.goto(viewer.address)
     until(page, drawn)

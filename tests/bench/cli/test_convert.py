@@ -81,7 +81,7 @@ def test_options_reach_the_reader_and_the_writer(converted, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("source", "options", "told"),
+    ("source", "options", "message"),
     [
         ("transforms", ["--light-seed", 0], "--light-seed: not supported for --source transforms"),
         ("rendered", ["--photographs.black", 2], "--photographs.black: not supported for --source"),
@@ -90,10 +90,10 @@ def test_options_reach_the_reader_and_the_writer(converted, tmp_path):
     ],
 )
 def test_an_unreadable_set_is_refused_without_writing(
-    converted, tmp_path, capsys, source, options, told
+    converted, tmp_path, capsys, source, options, message
 ):
     assert converted(source, "idr", *options) == 2
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

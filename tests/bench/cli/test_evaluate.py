@@ -33,10 +33,10 @@ def rendering(tmp_path_factory):
 def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
     larger = write_ball(tmp_path / "larger.ply", 1.1)
     assert run(larger, ball, "--samples", 3000) == 0
-    told = capsys.readouterr().out
-    assert "none: the frames are assumed to be the same" in told
+    printed = capsys.readouterr().out
+    assert "none: the frames are assumed to be the same" in printed
     # Facets of a ball of 1280 faces lie a little under it.
-    (line,) = [line for line in told.splitlines() if line.split()[:1] == ["accuracy"]]
+    (line,) = [line for line in printed.splitlines() if line.split()[:1] == ["accuracy"]]
     assert float(line.split()[1]) == pytest.approx(0.1, rel=0.03)
     assert "rays" not in printed
 

@@ -79,14 +79,14 @@ def test_expected_errors_are_in_the_unit_of_the_truth(make, generator):
     calibration = found.surface.calibration
     # Interpolation reduces the noise of vertices, by 1 / sqrt 2 in the mean over a face.
     assert calibration.ratio == pytest.approx(2**-0.5, abs=0.12)
-    told = {row.name: row for row in dict(rows(found))["surface"]}
-    assert told["expected_error"].value.startswith(f"{calibration.ratio:.2f};")
+    named = {row.name: row for row in dict(rows(found))["surface"]}
+    assert named["expected_error"].value.startswith(f"{calibration.ratio:.2f};")
     silent = evaluate(
         estimate.replace(mesh=mesh), capture, EvaluateConfig(samples=2000)
     ).surface.calibration
     assert silent is None
 
 
-@pytest.mark.parametrize("nothing", [0.0, math.inf])
-def test_without_expected_errors_there_is_no_calibration(nothing):
-    assert calibrate(torch.full((20,), nothing), torch.ones(20)) is None
+@pytest.mark.parametrize("constant", [0.0, math.inf])
+def test_without_expected_errors_there_is_no_calibration(constant):
+    assert calibrate(torch.full((20,), constant), torch.ones(20)) is None

@@ -41,7 +41,7 @@ def test_a_larger_square_is_inaccurate_and_complete(make):
     # distance to its vertex is (sqrt 2 + asinh 1) / 3.
     expected = (1 * 0.5 + 1 * 0.5 + (2**0.5 + math.asinh(1)) / 3) / 4
     assert found.accuracy.mean == pytest.approx(expected, rel=0.02)  # 8000 samples
-    # Its largest threshold is 1 % of sqrt 2 round a square of 1 in 4.
+    # Its largest threshold is 1 % of sqrt 2, around a square of 1 in 4.
     at = found.whole.thresholds[-1]
     assert at.precision == pytest.approx((1 + 2 * at.threshold) / 4, abs=0.01)
     assert at.recall == 1

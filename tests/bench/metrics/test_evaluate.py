@@ -108,7 +108,7 @@ def test_maps_of_a_few_views_may_be_given_separately(parts):
     assert found.cameras.views == 5
 
 
-def test_the_account_is_json_with_null_for_what_is_not_finite(parts):
+def test_the_report_is_json_with_null_for_values_that_are_not_finite(parts):
     estimate, capture = parts
     plain = report(evaluate(estimate, capture, EvaluateConfig(**FEW)))
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain

@@ -47,7 +47,7 @@ def test_different_units_axes_and_positions_are_refused_with_a_suggestion(
     estimate = Estimate(mesh=make.moved(truth, result_from_truth))
     with pytest.raises(InputError) as refused:
         evaluate(estimate, make.capture_of(truth), EvaluateConfig(**FEW))
-    for part in (*told, "`--alignment icp` starts from that"):
+    for part in (*message, "`--alignment icp` starts from that"):
         assert part in str(refused.value)
 
 
@@ -76,7 +76,7 @@ def test_a_mismatch_without_a_suggestion_is_refused_quickly(make, truth):
         lambda make, truth: make.half_sphere(),
         lambda make, truth: make.moved(make.square(side=12.0), by(IDENTITY, (-6.0, -6.0, 1.2))),
     ],
-    ids=["a third larger", "half of another object", "mostly the table"],
+    ids=["a third larger", "half of a different object", "mostly the table"],
 )
 def test_inaccurate_results_in_the_right_frame_are_measured(make, truth, bad):
     where = by(IDENTITY, (-0.5, -1.0, -2.0))
@@ -111,7 +111,7 @@ def test_cameras_that_disagree_by_their_rolls_are_refused(make, truth, turns, me
     estimate = Estimate(mesh=truth, names=names, cameras=turned(cameras, turns))
     with pytest.raises(InputError) as refused:
         evaluate(estimate, capture, EvaluateConfig(**FEW))
-    assert told in str(refused.value)
+    assert message in str(refused.value)
     assert "`--alignment icp` starts without their rolls" in str(refused.value)
     for method in ("icp", "none"):
         with pytest.warns(
