@@ -1,34 +1,34 @@
-"""Dense surfaces from photographs of many viewpoints under many unknown lights.
+"""Dense surfaces from photographs, each from a different viewpoint under a different unknown light.
 
 >>> import pimper_torch as pt
 >>> chain = pt.load_chain("default")
 >>> result = chain(pt.load_views("photos/"))  # doctest: +SKIP
 >>> pt.write_result(result, chain.config, "out/")  # doctest: +SKIP
 
-Photographs and cameras at hand come in by ``scene_of``. The rest is in rooms, which completion and
-``dir`` list:
+``scene_of`` takes images and cameras as tensors. Everything else is in subpackages, listed by
+completion and ``dir``:
 
-- ``records``: what goes in, what stages hand over, and what comes out, such as ``pt.records.Mesh``
-- ``stages``: what a chain is made of, to swap or to call alone, and the settings of each
-- ``priors``, ``prior_files``: guesses of networks, in memory and in folders
-- ``size``, ``viz``: real size by markers or lengths; figures
-- ``exchange``, ``radiometry``, ``store``: folders of results; response curves; kept stages
+- ``records``: inputs and outputs of stages and chains, such as ``pt.records.Mesh``
+- ``stages``: the stages of chains with their settings, to replace or to call alone
+- ``priors``, ``prior_files``: estimates of networks, in memory and in folders
+- ``scale``, ``viz``: real size from markers or lengths; figures
+- ``export``, ``radiometry``, ``store``: folders of results; response curves; kept records of stages
 - ``batches``, ``single_view``: many objects; one viewpoint under many lights
-- ``errors``: all that are raised on purpose are ``PimperError``
+- ``errors``: all errors raised on purpose are a ``PimperError``
 
-What documents call ``pt.Mesh`` or ``pt.Warp`` is that of its room.
+Public names of subpackages also work without it: ``pt.Mesh``, ``pt.Warp``.
 """
 
 from importlib import import_module
 
 import lazy_loader
 
-# Public names stand in `__init__.pyi`, for type checkers, too. What needs torch is imported when it
-# is asked for, so that the command line answers at once.
+# Public names are listed in `__init__.pyi`, also for type checkers. Modules that need torch are
+# imported on first use, so the command line starts fast.
 _public, _, _names = lazy_loader.attach_stub(__name__, __file__)
 
-# Rooms that users look into, and their floors; other modules stand where the tree shows them.
-_ROOMS = {
+# Public subpackages below a layer, and that layer.
+_LAYERS = {
     "batches": "cli",
     "errors": "runtime",
     "export": "doors",
@@ -58,8 +58,8 @@ def __getattr__(name: str) -> object:
         from pimper_torch.runtime.renamed import renamed
 
         return __getattr__(renamed(f"pimper_torch.{name}", _RENAMED[name]))
-    if name in _ROOMS:
-        return import_module(f"{__name__}.{_ROOMS[name]}.{name}")
+    if name in _LAYERS:
+        return import_module(f"{__name__}.{_LAYERS[name]}.{name}")
     return _public(name)
 
 

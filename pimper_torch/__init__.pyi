@@ -1,4 +1,4 @@
-# Public names, which are imported when they are asked for (`__init__.py`).
+# Public names, imported on first use (`__init__.py`).
 __all__: list[str]
 from . import priors as priors
 from . import records as records

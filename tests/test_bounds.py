@@ -85,7 +85,7 @@ class Ranged:
     ("values", "needed"),
     [
         ({"steps": 0}, "some.steps is 0; needed: 1 or more."),
-        ({"steps": 1001}, "some.steps is 1001; needed: 1,000 at most."),
+        ({"steps": 1001}, "some.steps is 1001; needed: at most 1,000."),
         ({"tilt": 90.0}, r"some.tilt is 90.0; needed: in \(0, 90\)."),
         ({"tilt": 0.0}, r"some.tilt is 0.0; needed: in \(0, 90\)."),
         ({"prior": 0.0}, "some.prior is 0.0; needed: above 0."),

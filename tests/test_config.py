@@ -69,8 +69,8 @@ def test_only_named_settings_change_and_integers_become_floats():
 @pytest.mark.parametrize(
     ("mapping", "field", "needed"),
     [
-        ({"inner": {"steps": 2.0}}, "inner.steps", "a whole number"),
-        ({"inner": {"steps": True}}, "inner.steps", "a whole number"),
+        ({"inner": {"steps": 2.0}}, "inner.steps", "an integer"),
+        ({"inner": {"steps": True}}, "inner.steps", "an integer"),
         ({"inner": {"tolerance": False}}, "inner.tolerance", "a number"),
         ({"inner": {"tolerance": "small"}}, "inner.tolerance", "a number"),
         ({"inner": {"robust": 1}}, "inner.robust", "true or false"),
@@ -78,11 +78,11 @@ def test_only_named_settings_change_and_integers_become_floats():
         ({"inner": {"solver": "newton"}}, "inner.solver", "'balm', 'descent'"),
         ({"inner": 3}, "inner", "steps, tolerance, robust, solver"),
         ({"name": 3}, "name", "a text"),
-        ({"window": [1, 2, 3]}, "window", "a list of a whole number, a whole number"),
+        ({"window": [1, 2, 3]}, "window", "a list of an integer, an integer"),
         ({"window": 5}, "window", "a list"),
         ({"scales": [1.0, "a"]}, "scales[1]", "a number"),
         ({"scales": None}, "scales", "a list"),
-        ({"limit": "many"}, "limit", "a whole number"),
+        ({"limit": "many"}, "limit", "an integer"),
         ({"cache": 3}, "cache", "a path"),
     ],
 )
@@ -144,18 +144,18 @@ def test_installed_presets_take_precedence_over_a_checkout(tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"a: 1\nb: 2\na: 3\n", "`a` is given twice"),
-        (b"a: {b: 1, b: 2}\n", "`b` is given twice"),
+        (b"a: 1\nb: 2\na: 3\n", "`a` occurs twice"),
+        (b"a: {b: 1, b: 2}\n", "`b` occurs twice"),
         (b"a: [1\n", "no valid YAML"),
-        (b"- a\n- b\n", "holds a list"),
+        (b"- a\n- b\n", "contains a list"),
         (b"!!python/object/apply:os.getcwd []\n", "no valid YAML"),
         (b"\xff\xfe\x00a", "cannot be read"),
-        (b"a: &a [x, x]\nb: *a\n", "aliases .* are not read"),
+        (b"a: &a [x, x]\nb: *a\n", "aliases .* are not supported"),
         (b"a: " + b"[" * 100_000, "nested too deeply"),
-        (b"a: " + b"9" * 5000, "holds a value that is none"),
+        (b"a: " + b"9" * 5000, "contains an invalid value"),
         (b"? [a, b]\n: 1\n", "a key is a list or a section"),
-        (b"a: 2001-99-99\n", "holds a value that is none"),
-        (b"# " + b"x" * 1_000_000, "1000002 bytes; needed: a file of settings"),
+        (b"a: 2001-99-99\n", "contains an invalid value"),
+        (b"# " + b"x" * 1_000_000, "1000002 bytes; needed: a YAML file with settings"),
     ],
 )
 def test_a_file_without_settings_is_refused_by_name(tmp_path, text, message):

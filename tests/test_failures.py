@@ -71,7 +71,7 @@ def test_earlier_failures_are_warned_of_before_a_fatal_error():
     for error in (MemoryError(), RuntimeError(NO_MEMORY)):
         with (
             pytest.warns(PimperWarning, match="fuse: 1 failed"),
-            pytest.raises(OutOfMemoryError, match=r"Memory did not suffice.*--max-size-px"),
+            pytest.raises(OutOfMemoryError, match=r"Memory ran out.*--max-size-px"),
         ):
             broken(error)
 

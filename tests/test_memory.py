@@ -29,7 +29,7 @@ def test_memory_decides_between_whole_blockwise_and_no_fusion(monkeypatch):
     assert largest_problem(resident_bytes() + 1e9, patches, 0.5, 1.0) == float("inf")
     monkeypatch.setattr("pimper_torch.runtime.memory.resident_bytes", lambda: 1e5)
     with pytest.raises(
-        ReconstructionError, match=r"by blocks.*in all.*by a factor of 0\.\d+ a side"
+        ReconstructionError, match=r"by blocks.*in total.*by a factor of 0\.\d+ per side"
     ):
         largest_problem(2e5, patches, 0.5, 1.0)
     with pytest.raises(ReconstructionError, match="photographs alone"):

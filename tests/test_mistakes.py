@@ -119,7 +119,7 @@ def test_a_misspelt_stage_or_setting_suggests_the_nearest(call, message):
         (Path("photos"), "views is PosixPath; .* `load_views` reads"),
         (torch.zeros(3, 3, 8, 8), "views is Tensor; .* `scene_of` puts images"),
         (np.zeros((3, 3, 8, 8)), "views is ndarray; .* `scene_of` puts images"),
-        (None, "views is NoneType; .*It comes from whoever"),
+        (None, "views is NoneType; .*The caller of the stage passed it"),
     ],
 )
 def test_a_wrong_argument_for_views_names_the_function_that_makes_views(preset, handed, message):

@@ -1,4 +1,4 @@
-"""The arguments of a command: its help on a page, and refusals in a paragraph."""
+"""Command-line arguments: help pages, and errors of one paragraph."""
 
 import dataclasses
 import inspect
@@ -24,19 +24,19 @@ Job = TypeVar("Job")
 
 REQUIRED = inspect.Parameter.empty
 Flag = tyro.conf.FlagCreatePairsOff[bool]
-# Several numbers are one word, 15000,15100,14900: a list would swallow PHOTOS behind it.
-LEVELS: Any = tyro.conf.UsePythonSyntaxForLiteralCollections  # typed as what it marks
+# Several numbers are one word, 15000,15100,14900: a list would swallow PHOTOS after it.
+LEVELS: Any = tyro.conf.UsePythonSyntaxForLiteralCollections  # has the type of the marked value
 _SWITCH = get_args(Flag)[1]
 _POSITIONAL = get_args(tyro.conf.Positional[int])[1]
 _WORDS: dict[object, str] = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 
 OF_EVERY_COMMAND = """\
 
-of every command:
-  -q, --quiet             Nothing but warnings, errors and what was asked for.
-  --json                  Events as JSON, one a line, on standard output.
+all commands:
+  -q, --quiet             Print only results, warnings and errors.
+  --json                  Print events as JSON, one per line, to standard output.
   --log-level LEVEL       error, warning, info or debug. (default: info)
-  -h, --help              This page.
+  -h, --help              Print this page.
 """
 _COLUMN, _WIDEST, _LONGEST = 26, 100, 60
 
@@ -46,10 +46,10 @@ class Option:
     """One option of a command.
 
     Attributes:
-        section: What it belongs to: a name and a dot for a setting of a stage, else a title.
-        names: As they are written; a positional argument has one without dashes.
-        value: What follows the name; empty where nothing does.
-        default: What holds where it is not given; :data:`REQUIRED` where it must be.
+        section: Title of its section on the help page.
+        names: All spellings; a positional argument has one, without dashes.
+        value: Placeholder for the value after the name; empty for a switch.
+        default: Value if the option is not given; :data:`REQUIRED` if it must be given.
     """
 
     section: str
@@ -62,31 +62,31 @@ class Option:
 def options_of(
     command: object, between: str = " ", section: str = "arguments", path: str = ""
 ) -> Iterator[Option]:
-    """List the options of a command as tyro makes them, in their order.
+    """List the options of a command as tyro names them, in the order of the signature.
 
     Args:
-        command: Whose parameters are options; or settings, whose fields are.
-        between: What stands between several values of one option.
-        path: Of settings: what stands before a field's name.
+        command: A function with options as parameters, or a settings object with options as fields.
+        between: Separator of the values of one option.
+        path: Prefix of the names of a settings object's fields.
     """
     settings = _is_settings(command)
     documented: Any = type(command) if settings else command
-    said, hints = meanings(documented), typing.get_type_hints(documented, include_extras=True)
-    for one in inspect.signature(documented).parameters.values():
-        default = getattr(command, one.name) if settings else one.default
-        hint = hints[one.name]
+    texts, hints = meanings(documented), typing.get_type_hints(documented, include_extras=True)
+    for parameter in inspect.signature(documented).parameters.values():
+        default = getattr(command, parameter.name) if settings else parameter.default
+        hint = hints[parameter.name]
         kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        known = next((mark for mark in marks if hasattr(mark, "aliases")), None)
-        name = one.name if known is None or known.name is None else known.name
-        meaning = said.get(one.name, "")
+        spec = next((mark for mark in marks if hasattr(mark, "aliases")), None)
+        name = parameter.name if spec is None or spec.name is None else spec.name
+        meaning = texts.get(parameter.name, "")
         if _is_settings(default):
             inner = f"{path}{name}." if name else path
             title = f"{inner[:-1]}: {summary(kind)}" if inner else meaning.lower()
             yield from options_of(default, between, title.rstrip(".") or "arguments", inner)
             continue
-        value = (known and known.metavar) or value_of(kind, between)
+        value = (spec and spec.metavar) or value_of(kind, between)
         stage, dot, last = f"{path}{name}".replace("_", "-").rpartition(".")
-        names = (*((known and known.aliases) or ()), f"--{stage}{dot}{last}")
+        names = (*((spec and spec.aliases) or ()), f"--{stage}{dot}{last}")
         if kind is bool:
             value = ""
             names = names if _SWITCH in marks else (*names, f"--{stage}{dot}no-{last}")
@@ -100,10 +100,10 @@ def _is_settings(value: object) -> bool:
 
 
 def meanings(documented: object) -> dict[str, str]:
-    """Read what arguments or attributes mean from a docstring in Google's form.
+    """Return the texts of the arguments or attributes of a docstring in Google style, by name.
 
     >>> meanings(Option)["value"]
-    'What follows the name; empty where nothing does.'
+    'Placeholder for the value after the name; empty for a switch.'
     """
     text = inspect.cleandoc(documented.__doc__ or "")
     listed = re.search(r"^(?:Args|Attributes):\n((?: .*\n|\n)*)", f"{text}\n", re.MULTILINE)
@@ -113,22 +113,22 @@ def meanings(documented: object) -> dict[str, str]:
 
 
 def summary(documented: object) -> str:
-    """Return the paragraphs of a docstring that come before its sections."""
+    """Return the paragraphs of a docstring above its sections."""
     text = inspect.cleandoc(documented.__doc__ or "")
     return plain(re.split(r"\n\n\w+:\n", text)[0])
 
 
 def plain(text: str) -> str:
-    """Take reStructuredText's marks out of a text.
+    """Remove reStructuredText markup from a text.
 
-    >>> plain("What :func:`~pimper_torch.doors.io.photographs.load_views` takes as ``encoding``.")
-    'What `load_views` takes as `encoding`.'
+    >>> plain("The ``encoding`` of :func:`~pimper_torch.doors.io.photographs.load_views`.")
+    'The `encoding` of `load_views`.'
     """
     return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", r"`\1`", text).replace("``", "`")
 
 
 def value_of(kind: object, between: str = " ") -> str:
-    """State in a word what a type's values are.
+    """Return the placeholder for values of a type.
 
     >>> value_of(Literal["auto", "none"] | float)
     '{auto,none}|FLOAT'
@@ -137,7 +137,7 @@ def value_of(kind: object, between: str = " ") -> str:
     if origin is Literal:
         return "{" + ",".join(map(str, args)) + "}"
     if origin in (Union, types.UnionType):
-        return "|".join(value_of(one, between) for one in args if one is not types.NoneType)
+        return "|".join(value_of(arg, between) for arg in args if arg is not types.NoneType)
     if origin is tuple:
         word = "FLOAT" if get_args(args[0]) else value_of(args[0])
         return f"{word}{between}..." if args[-1] is Ellipsis else between.join([word] * len(args))
@@ -152,25 +152,30 @@ def read_arguments(
     levels: bool = False,
     rare: Collection[str] = (),
 ) -> Job:
-    """Call a command with the arguments that were given, or answer ``--help``.
+    """Call a command with the given arguments, or print its help page.
 
     Args:
         command: Its parameters are the options; its docstring is their help.
         levels: Several numbers are one word, such as 15000,15100,14900.
-        rare: Options that ``--help`` leaves to ``--help-all``, as it leaves settings of stages.
+        rare: Options that only ``--help-all`` lists, like the settings of stages.
 
     Raises:
-        ConfigError: Unknown or wrong arguments.
-        SystemExit: ``--help`` was asked for.
+        ConfigError: Unknown or invalid arguments.
+        SystemExit: After the help page.
     """
     if {"-h", "--help", "--help-all"} & {*arguments}:
         options = list(options_of(command, "," if levels else " "))
-        shown = [one for one in options if "." not in one.names[-1] and one.names[-1] not in rare]
-        sys.stdout.write(page(name, summary(command), options, shown, "--help-all" in arguments))
+        everything = "--help-all" in arguments
+        listed = [
+            option
+            for option in options
+            if everything or ("." not in option.names[-1] and option.names[-1] not in rare)
+        ]
+        sys.stdout.write(page(name, summary(command), options, listed))
         raise SystemExit(0)
-    told = io.StringIO()
+    message = io.StringIO()
     try:
-        with redirect_stderr(told):
+        with redirect_stderr(message):
             return tyro.cli(
                 command,
                 prog=f"pimper {name}",
@@ -178,53 +183,50 @@ def read_arguments(
                 config=(LEVELS,) if levels else (),
             )
     except SystemExit:
-        known = options_of(command, "," if levels else " ")
-        raise ConfigError(_paragraph(told.getvalue(), name, known, arguments)) from None
+        options = list(options_of(command, "," if levels else " "))
+        raise ConfigError(_paragraph(message.getvalue(), name, options, arguments)) from None
 
 
-def _paragraph(told: str, name: str, options: Iterator[Option], arguments: Sequence[str]) -> str:
-    """Make one paragraph of what tyro says in a box."""
-    # A title, then rows between bars; or without any, where the terminal has no such characters.
-    rows = [row.strip(" │|") for row in told.strip().splitlines()[1:]]
+def _paragraph(message: str, name: str, options: Sequence[Option], arguments: Sequence[str]) -> str:
+    """Return tyro's boxed message as one paragraph."""
+    # A title, then rows between bars; without bars if the terminal lacks these characters.
+    rows = [row.strip(" │|") for row in message.strip().splitlines()[1:]]
     text = " ".join(row for row in rows if re.search(r"\w", row))
     text = text.partition("For full helptext")[0].strip()
     text = text.replace(f"Missing from pimper {name}:", "missing:")
-    wrong = re.match(r"Error parsing (?:-\w/)?(--[\w.-]+)", text)
-    for option in options if wrong else ():
-        if wrong and wrong[1] in option.names:  # tyro tells of its types, and of Python's
-            text = f"{wrong[1]} is {_given(wrong[1], arguments)}; needed: {option.value}. "
+    invalid = re.match(r"Error parsing (?:-\w/)?(--[\w.-]+)", text)
+    for option in options if invalid else ():
+        if invalid and invalid[1] in option.names:  # tyro's text names Python types
+            text = f"{invalid[1]} is {_given(invalid[1], arguments)}; needed: {option.value}. "
             text += option.meaning
     return f"{text} See `pimper {name} --help`."
 
 
 def _given(option: str, arguments: Sequence[str]) -> str:
-    """Return what stands behind an option, as it was written."""
+    """Return the value of an option as it was typed."""
     for index, argument in enumerate(arguments):
         name, equals, value = argument.partition("=")
         if name.replace("_", "-") == option:
-            behind = takewhile(lambda word: not word.startswith("--"), arguments[index + 1 :])
-            return repr(value if equals else " ".join(behind))
+            values = takewhile(lambda word: not word.startswith("--"), arguments[index + 1 :])
+            return repr(value if equals else " ".join(values))
     return "something else"
 
 
-def page(
-    name: str, about: str, options: Sequence[Option], shown: Sequence[Option], everything: bool
-) -> str:
-    """Write the help of a command, of some of its options or of ``everything``."""
+def page(name: str, about: str, options: Sequence[Option], listed: Sequence[Option]) -> str:
+    """Return the help page of a command with the ``listed`` ones of its options."""
     width = min(shutil.get_terminal_size().columns, _WIDEST)
-    needed = [one for one in options if one.default is REQUIRED or one.names[0][0] != "-"]
-    usage = [f"{one.names[0]} {_short(one, 0)}".strip() for one in needed]
+    needed = [arg for arg in options if arg.default is REQUIRED or arg.names[0][0] != "-"]
+    usage = [f"{option.names[0]} {_short(option, 0)}".strip() for option in needed]
     lines = [" ".join(["usage: pimper", name, *usage, "[options]"])]
     for paragraph in about.split("\n\n"):
         lines += ["", *textwrap.wrap(" ".join(paragraph.split()), width)]
-    some = options if everything else shown
-    for section in dict.fromkeys(one.section for one in some):
+    for section in dict.fromkeys(option.section for option in listed):
         lines += ["", *textwrap.wrap(f"{section}:", width)]
-        for one in some:
-            lines += _entry(one, width) if one.section == section else []
+        for option in listed:
+            lines += _entry(option, width) if option.section == section else []
     lines.append(OF_EVERY_COMMAND.rstrip())
-    if hidden := len(options) - len(some):
-        lines.append(f"  --help-all              This page with {hidden} more options.")
+    if hidden := len(options) - len(listed):
+        lines.append(f"  --help-all              Print this page with {hidden} more options.")
     return "\n".join(lines) + "\n"
 
 
@@ -246,7 +248,7 @@ def _entry(option: Option, width: int) -> list[str]:
 
 
 def _short(option: Option, longest: int) -> str:
-    """Return what follows an option; where its choices are too long, a word for them."""
+    """Return the placeholder of an option; its name in capitals if the choices are too long."""
     if option.value.startswith("{") and len(option.value) > longest:
         return option.names[-1].lstrip("-").upper()
     return option.value

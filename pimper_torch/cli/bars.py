@@ -1,4 +1,4 @@
-"""Progress of a run: bars on the terminal, or events for a machine."""
+"""Display of a run's progress: bars or lines on the terminal, or JSON events."""
 
 import time
 from collections.abc import Callable
@@ -12,14 +12,14 @@ from pimper_torch.records import StageReport
 
 
 class Bars:
-    """An observer with a bar for every stage, and next to it the time left for the run.
+    """Observer that displays a bar for every stage, and the time left for the run.
 
-    Where the output is no terminal, it writes lines instead: one when a stage ends, and in a long
-    stage one for each tenth that is done.
+    If the output is not a terminal, it writes lines instead: one at the end of a stage, and one per
+    tenth of a long stage.
 
     Args:
-        figures: How many of a stage's figures are shown at its end; ``None`` is all.
-        seconds: Lines inside a stage come no more often; a choice.
+        figures: Number of displayed figures of a finished stage; ``None`` for all.
+        seconds: Minimum time between lines within a stage; chosen by hand.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class Bars:
             progress.BarColumn(),
             progress.TaskProgressColumn(),
             progress.TimeElapsedColumn(),
-            progress.TextColumn("[dim]{task.fields[found]}"),
+            progress.TextColumn("[dim]{task.fields[text]}"),
             console=console,
             disable=not console.is_terminal,
         )
@@ -47,31 +47,31 @@ class Bars:
         self._progress.stop()
 
     def started(self, stage: str) -> None:
-        """Begin a bar; it moves to and fro until the stage reports progress."""
+        """Start a bar; it pulses until the stage reports progress."""
         self._forecast.started(stage)
         self._tenths, self._last = 0, time.perf_counter()
-        self._task = self._progress.add_task(stage, total=None, found=self._left())
+        self._task = self._progress.add_task(stage, total=None, text=self._left())
 
     def progressed(self, done: int, total: int) -> None:
-        """Fill the bar, or write a line."""
+        """Advance the bar, or write a line."""
         if self._task is None:
             return
         self._forecast.progressed(done, total)
-        self._progress.update(self._task, completed=done, total=total, found=self._left())
+        self._progress.update(self._task, completed=done, total=total, text=self._left())
         tenths, now = 10 * done // total, time.perf_counter()
         if self._tenths < tenths < 10 and now - self._last >= self._seconds:
             self._tenths, self._last = tenths, now
             self._line(self._progress.tasks[self._task].description, f"{done / total:9.0%}")
 
     def finished(self, report: StageReport) -> None:
-        """Complete the bar, and say what was found."""
+        """Complete the bar, and display figures of the stage."""
         self._forecast.finished(report)
         figures = list(report.figures.items())[: self._most]
-        found = ", ".join(f"{name.replace('_', ' ')} {_short(value)}" for name, value in figures)
+        text = ", ".join(f"{name.replace('_', ' ')} {_short(value)}" for name, value in figures)
         if self._task is not None:
-            self._progress.update(self._task, completed=1, total=1, found=found)
-        took = "     kept" if report.kept else f"{report.seconds:7.1f} s"
-        self._line(report.name, f"{took}  {found}")
+            self._progress.update(self._task, completed=1, total=1, text=text)
+        seconds = "     kept" if report.kept else f"{report.seconds:7.1f} s"
+        self._line(report.name, f"{seconds}  {text}")
         self._task = None
 
     def _line(self, stage: str, text: str) -> None:
@@ -90,11 +90,11 @@ def _short(value: float | int) -> str:
 
 
 class Events:
-    """An observer that writes when a stage begins, how far it is, and when it ends.
+    """Observer that writes the start, progress and end of stages as events.
 
     Args:
-        write: Called with every event's name, and what it is about by name.
-        seconds: Progress is written no more often; its end always is.
+        write: Called with the name of the event and its data as keywords.
+        seconds: Minimum time between progress events; the last one is always written.
     """
 
     def __init__(self, write: Callable[..., None], seconds: float, forecast: Forecast) -> None:
@@ -104,13 +104,13 @@ class Events:
         self._last = 0.0
 
     def started(self, stage: str) -> None:
-        """Write that a stage begins."""
+        """Write the start of a stage."""
         self._stage, self._last = stage, time.perf_counter()
         self._forecast.started(stage)
         self._write("stage-begin", stage=stage, seconds_left=self._left())
 
     def progressed(self, done: int, total: int) -> None:
-        """Write how far the stage is, unless that was written just now."""
+        """Write the progress of the stage, at most once per interval."""
         self._forecast.progressed(done, total)
         now = time.perf_counter()
         if now - self._last >= self._seconds or done == total:
@@ -119,7 +119,7 @@ class Events:
             self._write("progress", stage=self._stage, done=done, total=total, seconds_left=left)
 
     def finished(self, report: StageReport) -> None:
-        """Write that the stage ended, what it cost and what it found."""
+        """Write the end of the stage with its cost and figures."""
         self._forecast.finished(report)
         self._write(
             "stage-end",

@@ -1,4 +1,4 @@
-"""``pimper doctor``: what is installed, and what photographs are worth, before a run."""
+"""``pimper doctor``: check the installation, and photographs before a run."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -17,15 +17,15 @@ from pimper_torch.ground.radiometry import FROM_FILES, Encoding
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Report what is installed here, and whether photographs are fit for a run, in seconds.
+    """Check the installation, and whether photographs are suitable for a run, in seconds.
 
-    Of photographs: number, sizes, blur, saturation, exposure, overlap, and an estimate of time
-    and memory; each with what to do. Exit code 2 where a run would be refused.
+    Checks of photographs are number, sizes, blur, saturation, exposure and overlap, with advice,
+    and estimates of time and memory. The exit code is 2 if a run would be refused.
 
     Attributes:
-        photos: Folder of JPEG, PNG or TIFF files; without it, the machine alone.
-        max_size_px: As of `pimper reconstruct`.
-        photographs: As of `pimper reconstruct`.
+        photos: Folder of JPEG, PNG or TIFF files; without it, only the machine is checked.
+        max_size_px: Longer side to which larger photographs are scaled down; 0 keeps all sizes.
+        photographs: Encoding of the photographs.
     """
 
     photos: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="PHOTOS")] = None
@@ -34,7 +34,7 @@ class _Job:
 
 
 def run(job: _Job, output: Output) -> None:
-    """Carry out ``doctor``: tell each finding in a line, with what to do."""
+    """Run ``doctor``: print one line per finding, with advice."""
     from pimper_torch.cli.doctor.checks import examine_folder
     from pimper_torch.runtime.reporting import stage
 
@@ -42,10 +42,11 @@ def run(job: _Job, output: Output) -> None:
     _print(output, findings)
     if job.photos is not None:
         with output.observer(), stage("examine"):
-            found = examine_folder(job.photos, job.photographs, job.max_size_px)
-        _print(output, found)
-        findings += found
-    output.result(warnings=[one.check for one in findings if one.severity == "warning"])
+            photo_findings = examine_folder(job.photos, job.photographs, job.max_size_px)
+        _print(output, photo_findings)
+        findings += photo_findings
+    warnings = [finding.check for finding in findings if finding.severity == "warning"]
+    output.result(warnings=warnings)
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
@@ -57,6 +58,6 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
 
 def _print(output: Output, findings: Iterable[Finding]) -> None:
-    for one in findings:
-        output.event("finding", **dataclasses.asdict(one))
-        output.emit(f"{one.severity:<8} {one.check:<11} {one}")
+    for finding in findings:
+        output.event("finding", **dataclasses.asdict(finding))
+        output.emit(f"{finding.severity:<8} {finding.check:<11} {finding}")

@@ -1,11 +1,10 @@
-"""``pimper``: which command, and how it ends.
+"""``pimper``: run a command, and report how it ended.
 
-What takes long to import is imported when a command needs it.
+Slow imports are deferred until a command needs them.
 
-Exit codes: 0 where the command did what it was asked for; 2 for what the user can correct, in one
-paragraph; 130 when interrupted, 143 when terminated; 1 for anything unexpected, which is a fault of
-the package. :mod:`pimper_torch.cli.supervise` gives 128 and the number of the signal where the
-process was killed.
+Exit codes: 0 success; 2 an error that the user can correct, reported in one paragraph; 130
+interrupted, 143 terminated; 1 anything unexpected, which is a bug of the package.
+:mod:`pimper_torch.cli.supervise` returns 128 plus the signal's number if the process was killed.
 """
 
 import ctypes
@@ -37,35 +36,35 @@ _HELP = """\
 usage: pimper COMMAND [options]
        pimper --version
 
-Photographs from many viewpoints under many unknown lights, to a dense surface with normals,
-albedo and light.
+Reconstruct a dense surface with normals, albedo and lights from photographs, each from a different
+viewpoint under a different unknown light.
 
 {}
 
-`pimper COMMAND --help` tells the options, `--help-all` those of every stage, too.
+`pimper COMMAND --help` lists the options of a command, `--help-all` also those of all stages.
 
-Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpected; 130 interrupted;
-143 terminated; 137 killed and 139 crashed, as a rule for want of memory.
+Exit codes: 0 success; 2 bad input, a full disk or too little memory; 1 unexpected error;
+130 interrupted; 143 terminated; 137 killed and 139 crashed, usually because memory ran out.
 """
 _ABOUT = {
-    "reconstruct PHOTOS -o OUT": "a folder of photographs",
-    "batch LIST -o OUT": "many objects, on this machine or on an engine",
-    "doctor [PHOTOS]": "what is installed here, and what photographs are worth, before a run",
-    "demo": "the photographs of a skull that come with the package",
-    "config [NAME]": "the settings of a preset and what they mean, or one of them",
-    "render SCENE -o OUT": "photographs of a scene with known truth",
-    "export RESULT -o OUT": "a result in the layouts of other programs",
-    "evaluate RESULT TRUTH": "a result against the truth",
-    "bench": "the table: scenes, presets and baselines",
-    "convert DATA -o OUT": "a data set of another layout, or to one",
-    "gamma PHOTOS": "the response of photographs from a fixed camera under several lights",
-    "view OUT": "a result in the browser, to turn and to light",
-    "frames VIDEO -o OUT": "photographs out of a video: sharp frames, equally far apart on the way",
-    "markers -o SHEET": "a sheet to print and to photograph with an object, which tells its size",
-    "clean OUT": "what runs into a folder kept to go on from, and what killed runs left",
+    "reconstruct PHOTOS -o OUT": "reconstruct an object from a folder of photographs",
+    "batch LIST -o OUT": "reconstruct many objects, on this machine or on a cluster",
+    "doctor [PHOTOS]": "check the installation, and photographs before a run",
+    "demo": "reconstruct the skull whose photographs come with the package",
+    "config [NAME]": "print the settings of a preset with their meaning, or explain one",
+    "render SCENE -o OUT": "render photographs of a scene with ground truth",
+    "export RESULT -o OUT": "write a result in the formats of other programs",
+    "evaluate RESULT TRUTH": "compare a result with ground truth",
+    "bench": "run the benchmark: scenes, presets and baselines",
+    "convert DATA -o OUT": "convert a data set between layouts",
+    "gamma PHOTOS": "estimate the gamma of photographs: a fixed camera, several lights",
+    "view OUT": "show a result in the browser, to turn and light it",
+    "frames VIDEO -o OUT": "extract photographs from a video: sharp frames, evenly spaced",
+    "markers -o SHEET": "write a sheet of markers, printed and photographed for real size",
+    "clean OUT": "delete the records kept in a result folder, and files of killed runs",
 }
-# Where each of this package is carried out. `checked` reads and checks the arguments; `--help` ends
-# it with SystemExit. It and `run` refuse with PimperError before anything is written.
+# The module of each command of this package. Its `checked` reads and checks the arguments, and
+# raises SystemExit after `--help`. It and `run` raise PimperError before anything is written.
 _COMMANDS = {
     "reconstruct": "pimper_torch.cli.options",
     "batch": "pimper_torch.cli.batches.cli",
@@ -79,17 +78,17 @@ _COMMANDS = {
     "markers": "pimper_torch.cli.markers",
     "clean": "pimper_torch.cli.clean",
 }
-# Those of `pimper-bench`, which serve in a checkout that is not installed, too.
+# Commands of `pimper-bench`; they also work in a checkout that is not installed.
 OF_BENCH = {
     "render": "pimper_bench.cli.render_command",
     "evaluate": "pimper_bench.cli.evaluate",
     "bench": "pimper_bench.cli.bench",
     "convert": "pimper_bench.cli.convert",
 }
-_LIGHT = ("batch", "clean", "config")  # carried out without torch, too
+_LIGHT = ("batch", "clean", "config")  # run without torch
 _UNEXPECTED, _BAD_INPUT = 1, 2
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
-# What no program can help.
+# Errors of the system that are no bugs of the package.
 _REFUSALS = (
     *_FULL,
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG, errno.ELOOP),
@@ -101,13 +100,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line in this process.
 
     Args:
-        arguments: Those of the process unless given.
+        arguments: By default those of the process.
 
     Returns:
-        The exit code, see above. The traceback of anything unexpected is kept in a file.
+        The exit code, see above. Tracebacks of unexpected errors are written to a file.
     """
     if arguments is None:
-        _print_anything()
+        _make_streams_safe()
     try:
         try:
             return _main(list(sys.argv[1:] if arguments is None else arguments))
@@ -115,12 +114,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # flushed again at exit
-        if isinstance(error, BrokenPipeError):  # `pimper --help | head`: it has been read enough
+        if isinstance(error, BrokenPipeError):  # `pimper --help | head`: the reader has stopped
             return 0
         return _failed(Output(), error)
 
 
-def _print_anything() -> None:
+def _make_streams_safe() -> None:
     """Replace closed streams, and escape characters that a stream cannot print."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -140,13 +139,13 @@ def _main(given: list[str]) -> int:
     output = Output()
     try:
         output, arguments = split(given[1:])
-        home = commands().get(given[0])
-        if home is None:
+        module = commands().get(given[0])
+        if module is None:
             raise ConfigError(_no_command(given[0]))
         with _readable_warnings(output), stoppable():
-            _run(given[0], home, arguments, output)
+            _run(given[0], module, arguments, output)
     except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # rich's answer to it
+        if isinstance(error.__context__, BrokenPipeError):  # rich turns it into SystemExit
             raise error.__context__ from None
         raise
     except (Exception, KeyboardInterrupt) as error:
@@ -155,72 +154,72 @@ def _main(given: list[str]) -> int:
 
 
 def _help() -> str:
-    """List the commands that are there, those of other distributions that have no line last."""
-    home = commands()
-    lines = {usage: about for usage, about in _ABOUT.items() if usage.split()[0] in home}
-    others = {*home} - {usage.split()[0] for usage in lines}
-    lines |= {name: f"brought by {home[name].partition('.')[0]}" for name in sorted(others)}
+    """Return the help page: installed commands, those of other distributions at the end."""
+    modules = commands()
+    lines = {usage: about for usage, about in _ABOUT.items() if usage.split()[0] in modules}
+    others = {*modules} - {usage.split()[0] for usage in lines}
+    lines |= {name: f"provided by {modules[name].partition('.')[0]}" for name in sorted(others)}
     return _HELP.format("\n".join(f"  {usage:<26} {about}" for usage, about in lines.items()))
 
 
 def commands() -> dict[str, str]:
-    """List all commands, and where each is carried out.
+    """Return the module of each command, by the command's name.
 
-    Other distributions bring some by entry points of the group ``pimper.commands``: the name is the
-    command's, the value the module. Its ``checked(command, arguments)`` reads and checks the
-    arguments, and its ``run(job, output)`` carries the command out.
+    Other distributions add commands by entry points of the group ``pimper.commands``: the name is
+    the command's, the value the module. Its ``checked(command, arguments)`` reads and checks the
+    arguments, and its ``run(job, output)`` runs the command.
     """
-    found = {one.name: one.module for one in entry_points(group="pimper.commands")}
-    own = {} if find_spec("pimper_bench") is None else OF_BENCH
-    return own | found | _COMMANDS
+    installed = {entry.name: entry.module for entry in entry_points(group="pimper.commands")}
+    bench = {} if find_spec("pimper_bench") is None else OF_BENCH
+    return bench | installed | _COMMANDS
 
 
 def _no_command(name: str) -> str:
     if name in OF_BENCH:
         return (
-            f"`pimper {name}` comes with pimper-bench, which is not installed: `pip install "
-            "./bench` in a clone of the repository brings it."
+            f"`pimper {name}` comes with pimper-bench, which is not installed. Run `pip install "
+            "./bench` in a clone of the repository."
         )
     near = difflib.get_close_matches(name, commands(), n=1)
     hint = f" Did you mean `{near[0]}`?" if near else ""
     return f"there is no command `{name}`.{hint} See `pimper --help`."
 
 
-def _run(command: str, home: str, arguments: list[str], output: Output) -> None:
+def _run(command: str, name: str, arguments: list[str], output: Output) -> None:
     for argument in arguments:
         require_name(argument, InputError)
-    carried_out_by = import_module(home)
-    job = carried_out_by.checked(command, arguments)
+    module = import_module(name)
+    job = module.checked(command, arguments)
     output.event("start", command=command, arguments=arguments, versions=versions(), format=1)
     _prepare_threads()
     if command not in _LIGHT:
         _load_torch()
-    carried_out_by.run(job, output)
+    module.run(job, output)
 
 
 def _prepare_threads() -> None:
     """Set variables and options that torch and the C library read once."""
-    # Threads that spin while they wait take the processor from those they wait for when the
-    # machine is busy, and many small steps then take ten times as long.
+    # On a busy machine, threads that spin while they wait take the processor from the threads they
+    # wait for; many small steps then take ten times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # Pages of 2 MB where the system has them: a fifth of the demo's time went into 4 kB ones.
+    # Pages of 2 MB if the system has them: 4 kB pages cost a fifth of the demo's time.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
-    if usable_cores() < (os.cpu_count() or 1):  # OpenMP knows of affinity, not of quotas
+    if usable_cores() < (os.cpu_count() or 1):  # OpenMP respects affinity, but not quotas
         os.environ.setdefault("OMP_NUM_THREADS", str(usable_cores()))
-    # Places that memory is taken from, one for each core. The C library of Linux makes eight, and
-    # what runs leave in each adds up: from the second to the fourth run in one process memory grew
-    # by 2.0 %, with two of them by 0.2.
+    # One malloc arena per core. The C library of Linux makes eight, and memory that runs leave in
+    # each adds up: from the second to the fourth run in one process memory grew by 2.0 %, with two
+    # arenas by 0.2 %.
     with suppress(OSError, AttributeError):  # other systems have no such function
         ctypes.CDLL("libc.so.6").mallopt(-8, usable_cores())  # M_ARENA_MAX
 
 
 def _load_torch() -> None:
-    """Import torch whole before signals are heard: half of it would end in odd errors."""
+    """Import torch with signals blocked: an interrupted import leads to misleading errors."""
     blockable = hasattr(signal, "pthread_sigmask")
     former = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS) if blockable else None
     import torch  # noqa: F401
 
-    gc.freeze()  # what was imported is out of all searches for unused memory
+    gc.freeze()  # garbage collections skip the imported modules
     if former is not None:
         signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
@@ -233,10 +232,10 @@ def _failed(output: Output, error: BaseException) -> int:
         traceback.print_exception(error)
     notes = "".join(f" {note}" for note in getattr(error, "__notes__", ()))
     if isinstance(error, KeyboardInterrupt):
-        code, left = exit_code(error), getattr(error, "left", "no result was written.")
-        output.error("Interrupted", f"interrupted; {left}{notes}", code)
+        code, saved = exit_code(error), getattr(error, "left", "no result was written.")
+        output.error("Interrupted", f"interrupted; {saved}{notes}", code)
         return code
-    expected = str(error) if isinstance(error, PimperError) else _of_the_world(error)
+    expected = str(error) if isinstance(error, PimperError) else _system_advice(error)
     if expected is not None:
         kind = "MemoryError" if "can't allocate memory" in str(error) else kind
         output.error(kind, expected + notes, _BAD_INPUT)
@@ -245,39 +244,39 @@ def _failed(output: Output, error: BaseException) -> int:
     if report is None:
         traceback.print_exception(error)
     text = (
-        f"unexpected {kind}: {str(error).rstrip('.')}. This is a fault of pimper_torch; no result "
-        f"was written.{notes} {report or 'Above'} is what a report needs: please send it."
+        f"unexpected {kind}: {str(error).rstrip('.')}. This is a bug of pimper_torch; no result "
+        f"was written.{notes} Please report it with {report or 'the traceback above'}."
     )
     output.error(kind, text, _UNEXPECTED)
     return _UNEXPECTED
 
 
-def _of_the_world(error: BaseException) -> str | None:
-    """Return advice for an error that is not the package's fault; ``None`` for any other."""
+def _system_advice(error: BaseException) -> str | None:
+    """Return advice for an error that is not a bug of the package; ``None`` for any other."""
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return (
             "memory ran out; no result was written. Shrink the photographs (`--max-size-px`), "
-            "close other programs, or give `--max-memory` to be told beforehand."
+            "close other programs, or set a limit that is checked early (`--max-memory`)."
         )
     if isinstance(error, OSError) and error.errno in _REFUSALS:
-        place = "" if error.filename is None else f"{error.filename}: "
-        advice = " Make room." if error.errno in _FULL else ""
-        return f"{place}the system refuses ({error.strerror}); no result was written.{advice}"
+        path = "" if error.filename is None else f"{error.filename}: "
+        advice = " Free space." if error.errno in _FULL else ""
+        return f"{path}the system refuses ({error.strerror}); no result was written.{advice}"
     return None
 
 
 @contextmanager
 def _readable_warnings(output: Output) -> Iterator[None]:
-    """Show our warnings as sentences, without a line of source; others as Python does."""
+    """Print warnings of the package as sentences, without a line of source; others as usual."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", PimperWarning)
         usual = warnings.showwarning
 
-        def show(message: Warning | str, category: type[Warning], *at: Any, **where: Any) -> None:  # noqa: ANN401
+        def show(message: Warning | str, category: type[Warning], *args: Any, **rest: Any) -> None:  # noqa: ANN401
             if issubclass(category, PimperWarning):
                 output.warning(str(message))
             elif output.shows("warning"):
-                usual(message, category, *at, **where)
+                usual(message, category, *args, **rest)
 
         warnings.showwarning = show
         yield

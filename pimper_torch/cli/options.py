@@ -1,4 +1,4 @@
-"""The options of every command, and the settings of every stage as options."""
+"""Options of ``reconstruct`` and ``demo``, with the settings of all stages."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -29,8 +29,8 @@ def _word(kind: type, read: Callable[[str], object], metavar: str) -> Any:  # no
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: read(words[0]),
-        is_instance=lambda one: isinstance(one, kind),
-        str_from_instance=lambda one: [str(one)],
+        is_instance=lambda value: isinstance(value, kind),
+        str_from_instance=lambda value: [str(value)],
     )
 
 
@@ -47,32 +47,33 @@ CameraDistances = Annotated[
 ]
 Markers = Annotated[Literal["auto", "off"] | float, tyro.conf.arg(metavar="auto|off|MM")]
 
-# The demo keeps 0.5 GB. A choice: a few runs of twice as large photographs.
+# The demo keeps 0.5 GB. Chosen for a few runs with photographs of twice the size.
 MAX_KEPT = "8GB"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommonOptions:
-    """Options that every command has.
+    """Options of every reconstruction.
 
     Attributes:
-        preset: Settings to start from: default, fast, paper, or a YAML file of your own.
-        reference: Photograph that facets and pictures are seen from; chosen unless given.
-        device: Of all after structure from motion; cuda has never been run on a GPU.
-        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
-        overwrite: Replace a former result in OUT.
-        faces: Most that the mesh has, or all; as few as tell the surface unless given.
-        watertight: Close the mesh; caps are marked as not measured.
-        stl: Write the mesh as STL, too.
-        obj: Write mesh and asset as OBJ, too.
-        usdz: Write the asset as USDZ, too; needs pip install "pimper_torch[usd]".
-        texture: Of the pictures in asset.glb.
-        asset_cameras: Put the cameras of the photographs in asset.glb.
-        no_report: Leave out report.html.
-        fresh: Ignore what an earlier run kept.
-        cache: Folder that keeps what stages find, for the next run; OUT/.stages unless given.
-        max_kept: Size it may reach, such as 2GB.
-        view: Show cameras and every pass in the browser as soon as they are there.
+        preset: Settings to start from: default, fast, paper, or your own YAML file.
+        reference: Reference photograph, for sample spacing and rendered views; chosen automatically
+            by default.
+        device: Device of the stages after structure from motion; cuda has not been tested on a GPU.
+        max_size_px: Longer side to which larger photographs are scaled down; 0 keeps all sizes.
+        overwrite: Replace the result in OUT.
+        faces: Maximum number of faces of the mesh, or all; by default as few as the shape needs.
+        watertight: Close the mesh; the added caps are marked as not measured.
+        stl: Also write the mesh as STL.
+        obj: Also write mesh and asset as OBJ.
+        usdz: Also write the asset as USDZ; needs pip install "pimper_torch[usd]".
+        texture: Format of the textures in asset.glb.
+        asset_cameras: Include the cameras of the photographs in asset.glb.
+        no_report: Do not write report.html.
+        fresh: Recompute all stages, even if an earlier run kept their records.
+        cache: Folder for the records of stages, which later runs reuse; OUT/.stages by default.
+        max_kept: Maximum size of this folder, such as 2GB.
+        view: Show cameras and the surface of each pass in the browser during the run.
     """
 
     preset: str = "default"
@@ -96,13 +97,13 @@ class CommonOptions:
     def __post_init__(self) -> None:
         bytes_of(self.max_kept, "max_kept")
         _ = self.files  # refused before anything is read
-        # The smallest photographs in which depth is searched.
-        sound = self.max_size_px == 0 or self.max_size_px >= 32
-        require(sound, "max_size_px", self.max_size_px, "0, or 32 pixels at least")
+        # The smallest photographs for which depth maps are computed.
+        valid = self.max_size_px == 0 or self.max_size_px >= 32
+        require(valid, "max_size_px", self.max_size_px, "0, or at least 32 pixels")
 
     @property
     def files(self) -> MeshFiles:
-        """Form in which the surface is written."""
+        """Faces and file formats of the written surface."""
         wanted: dict[MeshFormat, bool] = {"stl": self.stl, "obj": self.obj, "usdz": self.usdz}
         return MeshFiles(
             faces=self.faces,
@@ -115,32 +116,31 @@ class CommonOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputOptions:
-    """Inputs beside the photographs.
+    """Optional inputs besides the photographs.
 
     Attributes:
         masks: Folder with a mask for each photograph, of the same name; zero off the object.
-        mask_object: How masks show the object; auto looks at all of them together.
-        sparse: Known cameras: a COLMAP model's folder, transforms.json, cameras.xml, .sfm or .npz.
-        mesh: A rough surface in that model's frame (PLY, OBJ, STL, GLB) to start from.
-        object: Find silhouettes of the object, take masks for them, or take everything for the
-            object, as of walls and scenes. (default: auto)
-        region: Box that the object is inside: smallest and largest corner in scene units, such as
+        mask_object: Brightness of the object in the masks; auto decides from all masks together.
+        sparse: Known cameras: folder of a COLMAP model, transforms.json, cameras.xml, .sfm or .npz.
+        mesh: Rough surface to start from (PLY, OBJ, STL, GLB), in the frame of these cameras.
+        object: Compute the object's silhouettes (auto), use the masks (masks), or reconstruct
+            everything in view (everything), such as walls and scenes. (default: auto)
+        region: Box around the object: smallest and largest corner in scene units, such as
             (-1,-1,0,1,1,2).
-        scale_bar: Two places in photographs, in pixels, and the length between them; again for
-            more.
-        camera_distance: Two photographs, and the length between their cameras; again for more.
-        markers: Markers printed by `pimper markers` tell the size; their sides in millimetres, if
-            others. With --sparse they count only where their sides are given.
-        unit: Of lengths that are given, and of the result where its size is known.
-        silhouettes: Folder of soft masks of a segmenter, for some photographs or all, any size:
-            PNG, JPEG, EXR, NPZ or NPY. What the other views deny is not followed.
-        object_at: Pixel of a photograph that shows the object; again for more.
-        normals: Folder of normal maps of an estimator, under the photographs' names: PNG, EXR, NPZ
-            or NPY.
-        axes: Of these normals; auto finds them by cloud and outlines.
-        normals_error_deg: Root mean square that they are off, where no file has their variance.
-        depth: Folder of depth maps of an estimator; what they hold is found by the cloud.
-        depth_error: Root mean square of the range of their values that they are off, where no file
+        scale_bar: Two points in photographs, in pixels, and their distance; may be repeated.
+        camera_distance: Two photographs and the distance between their cameras; may be repeated.
+        markers: Use markers printed by `pimper markers` for real size (auto), or not (off); or the
+            side of other markers in millimetres. With --sparse, only markers of a given side count.
+        unit: Unit of given lengths, and of the result if its size is known.
+        silhouettes: Folder of soft masks of a segmentation network, for all or some photographs, of
+            any size: PNG, JPEG, EXR, NPZ or NPY. Other views overrule them if they contradict.
+        object_at: Pixel of a photograph on the object; may be repeated.
+        normals: Folder of normal maps of a network, named like the photographs: PNG, EXR, NPZ or
+            NPY.
+        axes: Axes of these normals; auto detects them from point cloud and outlines.
+        normals_error_deg: Root mean square error of these normals, if no file has their variance.
+        depth: Folder of depth maps of a network; their kind is detected from the point cloud.
+        depth_error: Root mean square error of these depths as a fraction of their range, if no file
             has their variance.
     """
 
@@ -163,36 +163,36 @@ class InputOptions:
     depth_error: float = DEPTH_ERROR
 
     def __post_init__(self) -> None:
-        sound = isinstance(self.markers, str) or 0 < self.markers < float("inf")
-        require(sound, "markers", self.markers, "auto, off, or a length in millimetres above 0")
+        valid = isinstance(self.markers, str) or 0 < self.markers < float("inf")
+        require(valid, "markers", self.markers, "auto, off, or a length in millimetres above 0")
         require(
             self.masks is None or not (self.silhouettes or self.object_at),
             "--silhouettes or --object-at",
             str(self.silhouettes or (*self.object_at, "")[0]),
-            "none beside --masks, which are followed as they are",
+            "no value together with --masks, which are used unchanged",
         )
         _ = self.bars, self.distances  # refused before anything is read
 
     @property
     def bars(self) -> tuple[given.ScaleBar, ...]:
-        """Places in photographs with the lengths between them."""
-        bars = self.scale_bar
+        """Pairs of points in photographs with their distances."""
         return tuple(
-            given.ScaleBar(first=one, second=two, length=length) for one, two, length in bars
+            given.ScaleBar(first=first, second=second, length=length)
+            for first, second, length in self.scale_bar
         )
 
     @property
     def distances(self) -> tuple[given.CameraDistance, ...]:
-        """Photographs with the lengths between their cameras."""
-        pairs = self.camera_distance
+        """Pairs of photographs with the distances between their cameras."""
         return tuple(
-            given.CameraDistance(first=one, second=two, length=length) for one, two, length in pairs
+            given.CameraDistance(first=first, second=second, length=length)
+            for first, second, length in self.camera_distance
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """The arguments of a run."""
+    """Arguments of a run."""
 
     photos: Path
     out: Path
@@ -201,22 +201,22 @@ class Job:
     inputs: InputOptions = field(default_factory=InputOptions)
 
 
-# What few people need: `--help-all` tells of it.
+# Rarely used options, listed by `--help-all` only.
 _RARE = (
     *("--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
     *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
     *("--silhouettes", "--object-at", "--usdz", "--texture", "--asset-cameras"),
 )
 
-# The skull's cranium and face both show in this photograph.
+# Both cranium and face of the skull are visible in this photograph.
 SKULL = CommonOptions(reference="37")
 
 
 def parse(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments of a command.
+    """Return the run that the arguments of a command describe.
 
-    The preset is read first: its settings are the defaults that other options change, and
-    that ``--help-all`` shows.
+    The preset is read first: its settings are the defaults of the other options, also in
+    ``--help-all``.
     """
     name = _preset(arguments)
     _refuse_others(command, arguments, name)
@@ -228,18 +228,18 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
     if job.inputs.region:
         silhouettes = dataclasses.replace(silhouettes, region=tuple(map(float, job.inputs.region)))
     config = dataclasses.replace(job.config, silhouettes=silhouettes)
-    if named := job.common.reference:
-        surface = dataclasses.replace(config.coarse_surface, reference=named)
+    if reference := job.common.reference:
+        surface = dataclasses.replace(config.coarse_surface, reference=reference)
         config = dataclasses.replace(config, coarse_surface=surface)
         if isinstance(config, PublishedConfig):
-            triangulate = dataclasses.replace(config.triangulate, reference=named)
+            triangulate = dataclasses.replace(config.triangulate, reference=reference)
             config = dataclasses.replace(config, triangulate=triangulate)
     return dataclasses.replace(job, config=config)
 
 
 def _command(name: str, preset: Config) -> Callable[..., Job]:
-    """Make the command whose parameters are the options that a preset leaves open."""
-    settings: Any = type(preset)  # each chain has its own
+    """Return the command as a function, with the settings of a preset as default arguments."""
+    settings: Any = type(preset)  # chains have different settings
 
     def reconstruct(
         photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")],
@@ -248,12 +248,12 @@ def _command(name: str, preset: Config) -> Callable[..., Job]:
         common: Annotated[CommonOptions, tyro.conf.arg(name="")] = CommonOptions(),
         config: Annotated[settings, tyro.conf.arg(name="")] = preset,
     ) -> Job:
-        """Reconstruct the surface that a folder of photographs shows.
+        """Reconstruct the surface of an object from a folder of photographs.
 
         Args:
             photos: Folder of JPEG, PNG or TIFF files.
             out: Folder for the result; new or empty.
-            inputs: What the photographs come with.
+            inputs: Optional inputs besides the photographs.
         """
         return Job(photos=photos, out=out, common=common, inputs=inputs, config=config)
 
@@ -273,39 +273,43 @@ def _command(name: str, preset: Config) -> Callable[..., Job]:
 
 
 def every_option(command: str) -> list[Option]:
-    """List the options of a command, of each preset."""
-    return [one for name in presets() for one in options_of(_command(command, load_config(name)))]
+    """List the options of a command for all presets."""
+    return [
+        option for name in presets() for option in options_of(_command(command, load_config(name)))
+    ]
 
 
 def _refuse_others(command: str, arguments: Sequence[str], preset: str) -> None:
-    def options(name: str) -> set[str]:
-        every = options_of(_command(command, load_config(name)))
-        return {name for option in every for name in option.names}
+    """Refuse options that only other presets have."""
+
+    def options(preset: str) -> set[str]:
+        names = (option.names for option in options_of(_command(command, load_config(preset))))
+        return {name for spellings in names for name in spellings}
 
     written = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
     named = {argument for argument in written if argument.startswith("--")}
     for option in sorted(named - options(preset)):
-        if having := [name for name in presets() if option in options(name)]:
+        if others := [name for name in presets() if option in options(name)]:
             raise ConfigError(
-                f"{option} is no option of the preset {preset}, but of {', '.join(having)}. Leave "
-                f"it out, or choose `--preset {having[0]}`."
+                f"{option} is not an option of the preset {preset}, but of {', '.join(others)}. "
+                f"Remove it, or choose `--preset {others[0]}`."
             )
 
 
 def run(job: Job, output: Output) -> None:
-    """Carry out ``reconstruct`` or ``demo``."""
+    """Run ``reconstruct`` or ``demo``."""
     from pimper_torch.cli.run import carry_out
 
     carry_out(job, output)
 
 
 def checked(command: str, arguments: Sequence[str]) -> Job:
-    """Read the arguments, and check what can be checked without reading photographs."""
+    """Return the run of the arguments, after all checks that do not read photographs."""
     return check(parse(command, arguments))
 
 
 def check(job: Job) -> Job:
-    """Check of a run what can be checked without reading photographs, and return it."""
+    """Make all checks of a run that do not read photographs, and return the run."""
     if job.common.view:
         require_viser()
     require_apart(job.out, inputs_of(job))
@@ -318,8 +322,8 @@ def check(job: Job) -> Job:
     least = job.config.factorize.min_views
     if len(present) < least:
         raise InputError(
-            f"{job.photos}: the number of photographs is {len(present)}; needed: {least} at least, "
-            f"better 10 or more: a normal comes from {least} lights or more "
+            f"{job.photos}: the number of photographs is {len(present)}; needed: at least {least}, "
+            f"better 10 or more. A normal is computed from at least {least} lights "
             "(`factorize.min_views`)."
         )
     references = [job.config.coarse_surface.reference]
@@ -327,14 +331,14 @@ def check(job: Job) -> Job:
         references.append(job.config.triangulate.reference)
     for name in filter(None, references):
         view_named(name, present)
-    pointed = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
-    for name in (*given.measured_in(job.inputs.bars, job.inputs.distances), *pointed):
+    marked = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
+    for name in (*given.measured_in(job.inputs.bars, job.inputs.distances), *marked):
         given.number_of(name, present)
     return job
 
 
 def inputs_of(job: Job) -> dict[str, Path | None]:
-    """Return what a run reads, by what it is called."""
+    """Return the files and folders that a run reads, by option."""
     return {
         "PHOTOS": job.photos,
         "--masks": job.inputs.masks,
@@ -348,7 +352,7 @@ def inputs_of(job: Job) -> dict[str, Path | None]:
 
 
 def bundled_photographs() -> Path:
-    """Return the folder of the skull's photographs; their licence lies beside them."""
+    """Return the folder of the skull's photographs, which also contains their licence."""
     return Path(str(resources.files("pimper_torch"))) / "data" / "skull"
 
 

@@ -1,4 +1,4 @@
-"""Output of a command while it runs and at its end: sentences for people, or events as JSON."""
+"""Output of a command during and after its run: sentences for people, or events as JSON."""
 
 import json
 import math
@@ -26,25 +26,25 @@ class Output:
     """Form of a command's output.
 
     With ``as_json`` every line of standard output is an object with ``event``, ``elapsed`` in
-    seconds, and what :meth:`event` is called with:
+    seconds, and the arguments of :meth:`event`:
 
     - ``start``: ``command``, ``arguments``, ``versions``, ``format`` (1).
     - ``stage-begin``: ``stage``. ``progress``: ``stage``, ``done``, ``total``. Both and
-      ``stage-end``: ``seconds_left`` of a run, an estimate; ``null`` of other commands.
+      ``stage-end``: ``seconds_left`` of a run, estimated; ``null`` for other commands.
     - ``view``: ``address`` of the page of the viewer.
-    - ``preview``: ``path`` of a picture of the coarse surface, which is there until the run ends.
-    - ``stage-end``: ``stage``, ``seconds``, ``peak_memory_mb``, ``figures``, and ``kept``,
-      whether an earlier run found the record; time and memory are that run's then.
+    - ``preview``: ``path`` of an image of the coarse surface, deleted when the run ends.
+    - ``stage-end``: ``stage``, ``seconds``, ``peak_memory_mb``, ``figures``, and ``kept``:
+      whether the record is from an earlier run; time and memory are then those of that run.
     - ``warning``: ``message``. ``finding``, of ``doctor``: ``check``, ``severity``, ``found``,
       ``needed``, ``advice``.
     - ``object-end``, of ``batch``: ``name``, ``status``, ``message``, ``place``, ``seconds``,
       ``tries``.
     - ``result``: ``paths`` by name, and figures of the command.
-    - ``error``: ``kind``, ``message``, ``exit_code``; it is the last one then.
+    - ``error``: ``kind``, ``message``, ``exit_code``; always the last event.
 
     Attributes:
-        level: What is told on standard error: errors alone, warnings too, stages too (info), or
-            all figures of stages and tracebacks too (debug).
+        level: Detail of standard error: ``error``, errors only; ``warning``, also warnings;
+            ``info``, also stages; ``debug``, also all figures of stages and tracebacks.
     """
 
     as_json: bool = False
@@ -52,52 +52,52 @@ class Output:
     began: float = field(default_factory=time.perf_counter)
 
     def shows(self, level: Level) -> bool:
-        """Whether sentences of a level are told."""
+        """Return whether sentences of a level are printed."""
         return _LEVELS.index(level) <= _LEVELS.index(self.level)
 
     def event(self, event: str, **about: object) -> None:
-        """Write an event, if events are asked for."""
+        """Write an event if the output is JSON."""
         if self.as_json:
             elapsed = round(time.perf_counter() - self.began, 3)
-            # ASCII, whatever the encoding of standard output is.
+            # JSON is ASCII, so any encoding of standard output works.
             line = json.dumps(plain({"event": event, "elapsed": elapsed, **about}), allow_nan=False)
             sys.stdout.write(line + "\n")
             sys.stdout.flush()
 
     def emit(self, text: str) -> None:
-        """Report on standard output what a command was asked for."""
+        """Print the result of a command to standard output."""
         if not self.as_json:
             sys.stdout.write(text.rstrip("\n") + "\n")
 
     def remark(self, text: str) -> None:
-        """Report on standard output where a result is; ``--quiet`` leaves it out."""
+        """Print the location of a result to standard output, unless ``--quiet``."""
         if self.shows("info"):
             self.emit(text)
 
     def result(self, paths: Mapping[str, Path] | None = None, **figures: object) -> None:
-        """Write the event that a command succeeded."""
+        """Write the event of a command's success."""
         self.event("result", paths=paths or {}, **figures)
 
     def warning(self, message: str) -> None:
         """Report a warning."""
         self.event("warning", message=message)
         if not self.as_json and self.shows("warning"):
-            told("warning", message)
+            print_message("warning", message)
 
     def error(self, kind: str, message: str, exit_code: int) -> None:
-        """Report why a command failed: on standard error in any case."""
+        """Report why a command failed, always on standard error."""
         self.event("error", kind=kind, message=message, exit_code=exit_code)
-        told("error", message)
+        print_message("error", message)
 
     @contextmanager
     def observer(self, forecast: "Forecast | None" = None) -> Iterator["Observer"]:
-        """Let the stages of the ``with`` block be shown: a bar each, a line each, or events.
+        """Display the stages of the ``with`` block: a bar or a line per stage, or events.
 
         Args:
-            forecast: Tells the time left, if it can be told.
+            forecast: Estimates the time left.
 
         Yields:
-            Who hears of them.
+            The observer of the stages.
         """
         from rich.console import Console
 
@@ -106,33 +106,33 @@ class Output:
         from pimper_torch.runtime.reporting import Silent, recorded
 
         forecast = forecast or Forecast()
-        shown: AbstractContextManager[Observer] = nullcontext(Silent())
+        display: AbstractContextManager[Observer] = nullcontext(Silent())
         if self.as_json:
-            shown = nullcontext(Events(self.event, 0.5, forecast))
+            display = nullcontext(Events(self.event, 0.5, forecast))
         elif self.shows("info"):
-            shown = Bars(Console(stderr=True), forecast, None if self.shows("debug") else 3)
-        with shown as observer, recorded(observer):
+            display = Bars(Console(stderr=True), forecast, None if self.shows("debug") else 3)
+        with display as observer, recorded(observer):
             yield observer
 
 
 def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:
-    """Take the options that every command has from its arguments.
+    """Separate the options of all commands from the other arguments.
 
     >>> output, rest = split(["photos", "--json", "-o", "out"])
     >>> output.as_json, rest
     (True, ['photos', '-o', 'out'])
     """
-    level: str = "warning" if any(one in _QUIET for one in arguments) else "info"
+    level: str = "warning" if any(argument in _QUIET for argument in arguments) else "info"
     rest, waiting = [], False
-    for one in arguments:
-        name, equals, value = one.partition("=")
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
         if waiting or (name == "--log-level" and equals):
-            level, waiting = (one if waiting else value), False
-        elif one == "--log-level":
+            level, waiting = (argument if waiting else value), False
+        elif argument == "--log-level":
             waiting = True
-        elif one not in (*_QUIET, "--json"):
-            rest.append(one)
-    chosen = next((known for known in _LEVELS if known == level), None)
+        elif argument not in (*_QUIET, "--json"):
+            rest.append(argument)
+    chosen = next((valid for valid in _LEVELS if valid == level), None)
     if chosen is None or waiting:
         raise ConfigError(
             f"--log-level is {'nothing' if waiting else repr(level)}; needed: one of "
@@ -142,18 +142,18 @@ def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:
 
 
 def plain(value: object) -> object:
-    """Make what JSON can hold: paths are text, and numbers that are none are null."""
+    """Return a value as JSON types: paths as text, and numbers that are not finite as null."""
     if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if isinstance(value, str | int | float | bool | None) else str(value)
 
 
-def told(kind: str, message: str) -> None:
-    """Report something on standard error, in one paragraph."""
+def print_message(kind: str, message: str) -> None:
+    """Print a message to standard error, in one paragraph."""
     from rich.console import Console
     from rich.text import Text
 

@@ -1,4 +1,4 @@
-"""``pimper config``: the settings of a preset as YAML, or what some of them mean."""
+"""``pimper config``: print the settings of a preset as YAML, or explain some of them."""
 
 import dataclasses
 import textwrap
@@ -19,7 +19,7 @@ from pimper_torch.runtime.errors import ConfigError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Choice of all settings of a preset, a section of them, or one."""
+    """Arguments of ``config``; an empty ``path`` is the complete preset."""
 
     preset: str
     config: Config
@@ -27,7 +27,7 @@ class _Job:
 
 
 def run(job: _Job, output: Output) -> None:
-    """Carry out ``config``."""
+    """Run ``config``."""
     value: object = to_mapping(job.config)
     for name in job.path:
         assert isinstance(value, dict)
@@ -35,16 +35,16 @@ def run(job: _Job, output: Output) -> None:
     lines = [f"# {job.preset}: {summary(type(job.config))}"] * (not job.path)
     if not isinstance(value, dict):
         name = f"--{'.'.join(job.path).replace('_', '-')}"
-        for one in options_of(job.config, ","):
-            if name == one.names[0]:
-                lines.append(f"# option: {', '.join(one.names)} {one.value}".rstrip())
+        for option in options_of(job.config, ","):
+            if name == option.names[0]:
+                lines.append(f"# option: {', '.join(option.names)} {option.value}".rstrip())
         value = {".".join(job.path): value}
     output.emit("\n".join([*lines, *_yaml(job.config, job.path)]).lstrip("\n"))
     output.result(settings=value)
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and find what is asked for."""
+    """Read the arguments, and check that the preset or setting exists."""
 
     def config(
         name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "",
@@ -52,28 +52,29 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
     ) -> _Job:
         """Print the settings of a preset as YAML with their meaning, or explain one.
 
-        What is printed is a file of settings for `--preset`, which may be cut down to the lines
-        that differ: `pimper config paper > mine.yaml`.
+        The output is a valid file for `--preset`: `pimper config paper > mine.yaml`. Lines that you
+        do not change can be deleted.
 
         Args:
             name: A preset to print (default, fast, paper, or a YAML file); or a section or a
                 setting to explain, such as sweep or fuse.terms.
+            preset: Preset whose values an explained section or setting has.
         """
         is_preset = name in presets() or Path(name).suffix in (".yaml", ".yml")
-        chosen = name if is_preset else preset
-        settings = load_config(chosen)
+        preset = name if is_preset else preset
+        settings = load_config(preset)
         path = () if is_preset or not name else tuple(name.replace("-", "_").split("."))
         _require_setting(settings, path, name)
-        return _Job(preset=chosen, config=settings, path=path)
+        return _Job(preset=preset, config=settings, path=path)
 
     return read_arguments(config, command, arguments)
 
 
 def _require_setting(settings: object, path: Sequence[str], name: str) -> None:
-    known = ["", *_names(to_mapping(settings), "")]
-    if ".".join(path) not in known:
-        ends = [one for one in known if one.endswith(f".{path[-1]}")]
-        hint = f" Did you mean `{ends[0]}`?" if ends else nearest(name, [*known, *presets()])
+    paths = ["", *_names(to_mapping(settings), "")]
+    if ".".join(path) not in paths:
+        ends = [other for other in paths if other.endswith(f".{path[-1]}")]
+        hint = f" Did you mean `{ends[0]}`?" if ends else nearest(name, [*paths, *presets()])
         raise ConfigError(
             f"there is no setting or preset `{name}`.{hint} `pimper config` prints all settings."
         )
@@ -87,8 +88,8 @@ def _names(settings: Mapping[str, object], stem: str) -> Iterator[str]:
 
 
 def _yaml(settings: object, path: Sequence[str], depth: int = 0) -> Iterator[str]:
-    """Write settings as YAML, what each means above it; of ``path`` alone, if one is given."""
-    said, indent = meanings(type(settings)), "  " * depth
+    """Yield lines of YAML with the meaning above each setting; only of ``path`` if given."""
+    texts, indent = meanings(type(settings)), "  " * depth
     for name in typing.get_type_hints(type(settings)):
         value = getattr(settings, name)
         if path and name != path[0]:
@@ -99,7 +100,7 @@ def _yaml(settings: object, path: Sequence[str], depth: int = 0) -> Iterator[str
             yield f"{indent}{name}:"
             yield from _yaml(value, path[1:], depth + 1)
         else:
-            yield from _comment(said.get(name, ""), indent)
+            yield from _comment(texts.get(name, ""), indent)
             yield f"{indent}{name}: {written(to_mapping(settings).get(name, value))}"
 
 

@@ -1,6 +1,6 @@
-"""Errors of the package, in the caller's words.
+"""Errors and warnings of the package.
 
-Every message says where, what was found, what was needed, and what to do.
+Every message gives the location, the value, the requirement, and advice.
 """
 
 import warnings
@@ -12,46 +12,46 @@ from typing import Literal
 from pimper_torch.runtime.journal import current, writing
 
 OnFailure = Literal["skip", "fail"]
-"""Whether a patch, view or solver that fails is left out, or ends the run."""
+"""Whether a failed patch, view or solver is skipped, or ends the run."""
 
 
 class PimperError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base of all errors that this package raises on purpose."""
 
 
 class InputError(PimperError):
-    """Photographs, masks, models or meshes that cannot be used as they are."""
+    """Unusable photographs, masks, models or meshes."""
 
 
 class ConfigError(PimperError):
-    """A setting that does not exist or has an impossible value."""
+    """Unknown setting, or impossible value of a setting."""
 
 
 class OutputError(PimperError):
-    """Results that cannot be written where they were asked for."""
+    """Results cannot be written to the requested location."""
 
 
 class ReconstructionError(PimperError):
-    """Structure from motion, or a stage after it, found too little to go on."""
+    """Structure from motion, or a later stage, has too little data to continue."""
 
 
 class OutOfMemoryError(ReconstructionError):
-    """Memory that did not suffice."""
+    """Memory ran out."""
 
 
 class NumericalError(PimperError):
-    """Equations that the data leave open or contradict."""
+    """Equations that are singular or contradictory."""
 
 
 class PimperWarning(UserWarning):
-    """The result is delivered, but something about it should be known."""
+    """Warning about a result that is returned anyway."""
 
 
 def caution(message: str, stacklevel: int = 1) -> None:
-    """Warn of something, at once or, inside :func:`held`, when the block's owner says so.
+    """Warn immediately or, inside :func:`held`, record the message for the owner of the block.
 
     Args:
-        stacklevel: As of :func:`warnings.warn`, counted from the caller.
+        stacklevel: As for :func:`warnings.warn`, counted from the caller.
     """
     journal = current()
     journal.note(message)
@@ -60,18 +60,18 @@ def caution(message: str, stacklevel: int = 1) -> None:
 
 
 def cautioned() -> list[str]:
-    """Return what was cautioned of so far in this call."""
+    """Return the messages of :func:`caution` so far in this call."""
     return [event for event in current().so_far() if isinstance(event, str)]
 
 
 @contextmanager
 def held() -> Iterator[list[str]]:
-    """Hold back what is cautioned of inside the ``with`` block.
+    """Hold back the cautions of the ``with`` block.
 
-    Where the block ends in an error, it is told before.
+    If the block raises an error, the warnings are given first.
 
     Yields:
-        The list that holds the messages when the block has ended.
+        A list, filled with the messages at the end of the block.
     """
     messages, events = list[str](), current().so_far()
     before = len(events)
@@ -87,7 +87,7 @@ def held() -> Iterator[list[str]]:
 
 
 def some(names: Sequence[str], most: int = 8) -> str:
-    """List names for a message, the first few and how many more.
+    """Return the first names of a list for a message, and the number of others.
 
     >>> some(["a", "b", "c"], most=2)
     'a, b and 1 more'
@@ -97,5 +97,5 @@ def some(names: Sequence[str], most: int = 8) -> str:
 
 
 def shortened(text: str, most: int = 200) -> str:
-    """Cut a text that is longer."""
+    """Return a text, cut to at most ``most`` characters."""
     return text if len(text) <= most else f"{text[: most - 3]}..."

@@ -1,8 +1,7 @@
-"""One bad patch, view or solver does not end a run: it is left out, and told at the end.
+"""Failures of a patch, view or solver, which is skipped and reported at the end of the run.
 
-Only what data can cause is left out: numbers that are not finite, equations without a solution, and
-input of one part that cannot be used. Other errors are mistakes in a program, or a lack of memory,
-and end the run.
+Only failures caused by data are skipped: numbers that are not finite, equations without a solution,
+and unusable input of one patch or view. Other errors are bugs or a lack of memory, and end the run.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +25,7 @@ from pimper_torch.runtime.journal import current, writing
 
 Result = TypeVar("Result")
 
-# What torch says when an allocation fails on the CPU; CUDA's error has a class of its own.
+# Torch's messages for failed allocations on the CPU; CUDA has its own error class.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
 
@@ -34,19 +33,19 @@ _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 def collecting(
     on_failure: OnFailure = "skip", events: list[object] | None = None
 ) -> Iterator[list[object]]:
-    """Collect what is told inside the ``with`` block: what is skipped, left out, and so on.
+    """Collect the events of the ``with`` block, such as failures and entries of guards.
 
-    Where the block ends in an error, what was skipped before is told first.
+    If the block raises an error, warnings of the earlier failures come first.
 
     Args:
-        on_failure: ``"fail"`` refuses instead of skipping.
-        events: Those so far, which more are added to.
+        on_failure: ``"fail"`` raises an error instead of skipping.
+        events: Earlier events, to which new ones are appended.
 
     Yields:
-        The events so far, for :func:`warn_of` at the end.
+        The list of events, for :func:`warn_of` at the end.
 
     Raises:
-        OutOfMemoryError: In place of an error of memory.
+        OutOfMemoryError: Instead of other errors for failed allocations.
     """
     outer, events = current(), [] if events is None else events
     before, fail = len(events), on_failure == "fail"
@@ -55,11 +54,11 @@ def collecting(
             yield events
     except BaseException as error:
         warn_of(events)
-        failed = isinstance(error, RuntimeError) and any(one in str(error) for one in _NO_MEMORY)
+        failed = isinstance(error, RuntimeError) and any(text in str(error) for text in _NO_MEMORY)
         if failed or isinstance(error, MemoryError | torch.OutOfMemoryError):
             raise OutOfMemoryError(
-                f"Memory did not suffice: {reason_of(error)}. "
-                "Shrink the photographs (`--max-size-px`), take fewer samples "
+                f"Memory ran out: {reason_of(error)}. "
+                "Shrink the photographs (`--max-size-px`), use fewer samples "
                 "(`decompose.samples_per_pixel`), or close other programs."
             ) from error
         raise
@@ -69,17 +68,17 @@ def collecting(
 
 
 def skipped(*failures: Failure, error: BaseException | None = None) -> None:
-    """Note what failed and was left out; outside of :func:`collecting`, warn of it at once.
+    """Record failures that were skipped; outside of :func:`collecting`, warn immediately.
 
     Raises:
-        ReconstructionError: Failures are to end the run.
+        ReconstructionError: The journal requires that failures end the run.
     """
     journal = current()
     if failures and journal.fail:
         first = failures[0]
         raise ReconstructionError(
-            f"{first.stage}: {first.what} {first.name} failed: {first.reason}. Failures are to end "
-            f"the run (`on_failure` is fail); with skip it goes on: {first.done}."
+            f"{first.stage}: {first.what} {first.name} failed: {first.reason}. Failures end this "
+            f"run (`on_failure` is fail); with skip it would continue: {first.done}."
         ) from error
     if not journal.collects:
         warn_of(failures)
@@ -91,7 +90,7 @@ def skipped(*failures: Failure, error: BaseException | None = None) -> None:
 def skipped_patches(
     stage: str, facets: Int[torch.Tensor, " patch"], reason: str, done: str
 ) -> None:
-    """Note patches that were left out; see :func:`skipped`."""
+    """Record skipped patches; see :func:`skipped`."""
     skipped(
         *(
             Failure(stage=stage, what="patch", name=str(facet), reason=reason, done=done)
@@ -101,24 +100,24 @@ def skipped_patches(
 
 
 def skipped_solver(stage: str, name: str, error: BaseException, done: str) -> None:
-    """Note equations without a solution; see :func:`skipped`."""
+    """Record equations without a solution; see :func:`skipped`."""
     reason = reason_of(error)
     skipped(Failure(stage=stage, what="solver", name=name, reason=reason, done=done), error=error)
 
 
 def distinct(entries: Sequence[object]) -> tuple[Failure, ...]:
-    """List each failure once, in an order that threads do not change."""
-    return tuple(sorted({one for one in entries if isinstance(one, Failure)}, key=_order))
+    """Return the distinct failures, in an order that does not depend on threads."""
+    return tuple(sorted({event for event in entries if isinstance(event, Failure)}, key=_order))
 
 
 def warn_of(entries: Sequence[object]) -> None:
-    """Warn once of each kind of failure, with how many there are and the first of them."""
-    for (stage, what, done), some in groupby(distinct(entries), key=_kind):
-        kind = list(some)
-        names = list(dict.fromkeys(failure.name for failure in kind))
+    """Warn once for each kind of failure, with the number and the first names."""
+    for (stage, what, done), group in groupby(distinct(entries), key=_kind):
+        failures = list(group)
+        names = list(dict.fromkeys(failure.name for failure in failures))
         listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
         caution(
-            f"{stage}: {len(names)} failed ({what} {listed}): {kind[0].reason}. {done}. "
+            f"{stage}: {len(names)} failed ({what} {listed}): {failures[0].reason}. {done}. "
             "`failures` in summary.json lists all; `--on-failure fail` ends the run instead.",
             stacklevel=3,
         )
@@ -132,11 +131,7 @@ def solved_or(
     name: str,
     done: str,
 ) -> Result:
-    """Solve, or give something else where equations have no solution.
-
-    Args:
-        otherwise: Gives what stands in for the solution.
-    """
+    """Return the solution, or the result of ``otherwise`` if equations have no solution."""
     try:
         return solve()
     except NumericalError as error:
@@ -145,7 +140,7 @@ def solved_or(
 
 
 def reason_of(error: BaseException) -> str:
-    """Return an error in a line."""
+    """Return an error as one line of text."""
     text = " ".join(str(error).split()).rstrip(".")
     return f"{type(error).__name__.lstrip('_')}: {text}" if text else type(error).__name__
 

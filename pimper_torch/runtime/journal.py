@@ -1,9 +1,9 @@
-"""The journal: messages of a call while it works, and their listeners; no result depends on it.
+"""The journal: messages during a call, and their listeners. Results do not depend on it.
 
-Cautions (:mod:`~pimper_torch.runtime.errors`), failures (:mod:`~pimper_torch.runtime.failures`),
-what guards leave out (:mod:`~pimper_torch.runtime.ledger`), reports of stages
-(:mod:`~pimper_torch.runtime.reporting`) and progress (:mod:`~pimper_torch.runtime.progress`) are
-told to the journal of the call, in threads of it, too.
+The journal of a call, shared by its threads, receives cautions
+(:mod:`~pimper_torch.runtime.errors`), failures (:mod:`~pimper_torch.runtime.failures`), entries of
+guards (:mod:`~pimper_torch.runtime.ledger`), reports of stages
+(:mod:`~pimper_torch.runtime.reporting`) and progress (:mod:`~pimper_torch.runtime.progress`).
 """
 
 import time
@@ -13,29 +13,30 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-# Lines of a run's table for what no stage does: hashes of what stages are called with, and records
-# written and read.
+# Lines of a run's table outside of stages: hashing the inputs of stages, and writing and reading
+# records.
 HASH, KEEP = "hash", "keep"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Journal:
-    """Who hears of what.
+    """Events and listeners of a call.
 
     Attributes:
-        events: Cautions (texts), failures, entries of guards, and reports of stages, as they come;
-            ``None`` where nobody collects them.
-        collects: Whether failures and entries of guards are events; else failures are warned of at
-            once.
+        events: Cautions (texts), failures, entries of guards, and reports of stages, in order of
+            arrival; ``None`` if they are not collected.
+        collects: Whether failures and entries of guards are events; otherwise failures are warned
+            of immediately.
         fail: Whether a failure ends the run.
-        quiet: Whether cautions are events alone, and no warnings.
-        observer: Hears of stages; ``None`` within a stage, whose parts are no stages.
-        figures: Of the stage that runs, so far.
-        began: When the stages began, as :func:`time.perf_counter` counts.
-        aside: Seconds by line of what no stage does.
-        progress: Hears how many steps of how many are done.
-        masks: Hears of the masks of guards.
-        worker: Whether this thread is one of several: what it calls runs in it alone.
+        quiet: Whether cautions are only events, without warnings.
+        observer: Listener of stages; ``None`` within a stage, because nested stages are not
+            reported.
+        figures: Figures of the running stage so far.
+        began: Start of the stages, in seconds of :func:`time.perf_counter`.
+        aside: Seconds outside of stages, by line.
+        progress: Listener of the number of finished steps and of all steps.
+        masks: Listener of the masks of guards.
+        worker: Whether this thread is one of several, so that its calls must not start more.
     """
 
     events: list[object] | None = None
@@ -51,11 +52,11 @@ class Journal:
     worker: bool = False
 
     def so_far(self) -> list[object]:
-        """Return the list of events; a new one where nobody collects them."""
+        """Return the list of events; a new list if they are not collected."""
         return [] if self.events is None else self.events
 
     def note(self, event: object) -> None:
-        """Add an event, if anybody collects them."""
+        """Add an event if events are collected."""
         if self.events is not None:
             self.events.append(event)
 
@@ -64,13 +65,13 @@ _current: ContextVar[Journal] = ContextVar("journal", default=Journal())  # noqa
 
 
 def current() -> Journal:
-    """Return the journal of the call that this thread is in."""
+    """Return the journal of the current call in this thread."""
     return _current.get()
 
 
 @contextmanager
 def writing(journal: Journal) -> Iterator[Journal]:
-    """Write to another journal inside the ``with`` block, in threads of it, too."""
+    """Make a journal the current one inside the ``with`` block, including its threads."""
     token = _current.set(journal)
     try:
         yield journal
@@ -80,21 +81,21 @@ def writing(journal: Journal) -> Iterator[Journal]:
 
 @contextmanager
 def noted() -> Iterator[list[object]]:
-    """Note what is told inside the ``with`` block; it is told all the same.
+    """Copy the events of the ``with`` block; the current journal still receives them.
 
     Yields:
-        The list that holds the events when the block has ended.
+        A list, filled with the events at the end of the block.
     """
-    found, events = list[object](), current().so_far()
+    copies, events = list[object](), current().so_far()
     before = len(events)
     with writing(replace(current(), events=events)):
-        yield found
-    found += events[before:]
+        yield copies
+    copies += events[before:]
 
 
 @contextmanager
 def aside(line: str) -> Iterator[None]:
-    """Count what the ``with`` block takes to a line of its own, unless a stage is under way."""
+    """Add the seconds of the ``with`` block to a line of the table, unless a stage is running."""
     journal, began = current(), time.perf_counter()
     yield
     if journal.observer is not None:

@@ -1,7 +1,7 @@
-"""The ledger of guards: whatever leaves something out, or warns, records it here.
+"""The ledger of guards: every check that removes data, or warns, records it here.
 
-Entries of a call of a chain are in :attr:`~pimper_torch.records.Reconstruction.left_out`, in the
-order they were made: a guard that acts in several passes has one of each.
+:attr:`~pimper_torch.records.Reconstruction.left_out` lists the entries of a call of a chain in
+order; a guard that acts in several passes has one entry per pass.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,65 +17,65 @@ from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.journal import Journal, current, writing
 
 GUARDS: dict[str, tuple[What, str]] = {
-    "sfm.static_background": ("features", "static while others move"),
-    "sfm.moved_object": ("matches", "of the surroundings, between capture sessions"),
-    "sfm.weak_views": ("photographs", "see too few points"),
-    "sfm.misplaced": ("warning", "their strongest pairs contradict the model"),
-    "sfm.small_sessions": ("photographs", "of a capture session with few"),
-    "sfm.tracks": ("points", "reproject far off"),
+    "sfm.static_background": ("features", "on the static background"),
+    "sfm.moved_object": ("matches", "on the surroundings, between capture sessions"),
+    "sfm.weak_views": ("photographs", "too few points observed"),
+    "sfm.misplaced": ("warning", "their strongest image pairs contradict the model"),
+    "sfm.small_sessions": ("photographs", "in a capture session with few photographs"),
+    "sfm.tracks": ("points", "large reprojection error"),
     "sfm.missing": ("photographs", "not registered"),
     "sfm.diagnosis": ("warning", "point depths are undetermined"),
     "sfm.sound_points": ("points", "not finite"),
-    "sfm.sound_views": ("photographs", "show nothing or stand nowhere"),
-    "silhouettes.disagreement": ("warning", "silhouettes agree too little"),
+    "sfm.sound_views": ("photographs", "no usable pixels or no usable camera"),
+    "silhouettes.disagreement": ("warning", "silhouettes contradict each other"),
     "silhouettes.by_session": ("warning", "no silhouettes found in a capture session"),
-    "silhouettes.shadows": ("pixels", "dark, and the hull denies them"),
-    "silhouettes.unreliable": ("photographs", "their silhouette contradicts the others"),
-    "silhouettes.empty": ("photographs", "their silhouette is empty"),
-    "contours.hull": ("warning", "silhouettes have no place in common"),
-    "depth_points.disagreement": ("warning", "depth maps agree by chance"),
-    "depth_points.points": ("points", "too few views show them"),
+    "silhouettes.shadows": ("pixels", "dark and outside the visual hull"),
+    "silhouettes.unreliable": ("photographs", "silhouette contradicts the others"),
+    "silhouettes.empty": ("photographs", "silhouette is empty"),
+    "contours.hull": ("warning", "silhouettes do not intersect"),
+    "depth_points.disagreement": ("warning", "depth maps agree only by chance"),
+    "depth_points.points": ("points", "visible in too few views"),
     "coarse.reliable": ("points", "few views, large residuals or small angles"),
     "coarse.hull": ("points", "outside the silhouettes"),
     "coarse.cropping": ("pixels", "outside the silhouettes"),
-    "coarse.denied": ("points", "more views deny than confirm them"),
+    "coarse.denied": ("points", "contradicted by more views than confirmed"),
     "coarse.matched": ("points", "outside the silhouettes"),
-    "coarse.outside": ("faces", "outside the hull"),
+    "coarse.outside": ("faces", "outside the visual hull"),
     "coarse.far": ("faces", "far from points"),
-    "coarse.seen_through": ("faces", "views look through them"),
-    "coarse.unseen": ("faces", "no view sees them"),
+    "coarse.seen_through": ("faces", "views look through them to matched points"),
+    "coarse.unseen": ("faces", "not visible in any view"),
     "coarse.fringes": ("faces", "narrow strips"),
-    "coarse.components": ("faces", "small components"),
-    "coarse.crowded": ("facets", "a third at an edge"),
-    "coarse.pieces": ("facets", "small components"),
+    "coarse.components": ("faces", "small connected components"),
+    "coarse.crowded": ("facets", "third facet on an edge"),
+    "coarse.pieces": ("facets", "small connected components"),
     "triangulate.reliable": ("points", "far from the view, hidden, or unlike their neighbours"),
-    "triangulate.pieces": ("facets", "small components"),
-    "warp": ("pixels", "turned away, hidden, dark or saturated"),
-    "photometry.shadows": ("pixels", "in shadow of the fitted light"),
+    "triangulate.pieces": ("facets", "small connected components"),
+    "warp": ("pixels", "facing away, hidden, dark or saturated"),
+    "photometry.shadows": ("pixels", "in cast shadow of the fitted light"),
     "photometry.robust": ("pixels", "outliers of the fit"),
-    "photometry.undetermined": ("facets", "light tells no normals"),
-    "sweep.selection": ("pixels", "of more views than are compared"),
-    "sweep.heights": ("pixels", "no height agrees best"),
+    "photometry.undetermined": ("facets", "light does not determine normals"),
+    "sweep.selection": ("pixels", "not among the best views"),
+    "sweep.heights": ("pixels", "no height with a clear minimum"),
     "fuse.outvoted": ("points", "far from the median of patches"),
-    "fuse.support": ("points", "no patch has them"),
-    "fuse.normals": ("points", "without a photometric normal"),
-    "fuse.albedo": ("points", "without albedo"),
+    "fuse.support": ("points", "not covered by a patch"),
+    "fuse.normals": ("points", "no photometric normal"),
+    "fuse.albedo": ("points", "no albedo"),
     "repair": ("points", "in folds or spikes"),
     "remesh.data": ("facets", "no data"),
-    "extract.support": ("faces", "no photograph supports them"),
-    "extract.expected_error": ("faces", "expected to be far off"),
-    "extract.spikes": ("faces", "long edges, or turned over by a fold"),
-    "extract.borders": ("faces", "stick out of borders"),
-    "extract.pieces": ("faces", "small components"),
+    "extract.support": ("faces", "not supported by a photograph"),
+    "extract.expected_error": ("faces", "large expected error"),
+    "extract.spikes": ("faces", "long edges, or reversed by a fold"),
+    "extract.borders": ("faces", "protruding from a border"),
+    "extract.pieces": ("faces", "small connected components"),
 }
-"""All guards, in the order of the chain: what each leaves out or raises, and why."""
+"""All guards, in the order of the chain: the removed elements, or a warning, and the reason."""
 
 Places = Float[Tensor, "place 3"] | tuple[Vertices, Faces]
 Listener = Callable[[LeftOut, Tensor | None, Tensor | None], None]
-"""Takes an entry, the mask of what was left out, and where in the world each element is."""
+"""Receives an entry, the mask of removed elements, and their positions in the world."""
 
-# Fraction up to which the closing message is silent: a choice. It says nothing of pixels, as most
-# views see most facets from behind, and nothing of doubts, which are warned of.
+# Fraction up to which the closing message is silent; chosen by hand. Pixels are not listed, because
+# most facets face away from most views; warnings have their own messages.
 _NEGLIGIBLE = 0.05
 _SILENT = ("pixels", "warning")
 
@@ -88,14 +88,14 @@ def leave_out(
     names: Sequence[str] = (),
     at: Places | None = None,
 ) -> None:
-    """Record what a guard leaves out; a count of zero is recorded, too.
+    """Record the elements that a guard removes; a count of zero is also recorded.
 
     Args:
         guard: One of :data:`GUARDS`.
-        taken: True for each element that is left out; or their number.
-        total: Number of all elements, where ``taken`` is no mask.
-        names: Of photographs: of all with a mask, else of those left out.
-        at: Where each element of the mask is, world: points, or vertices and faces.
+        taken: Mask of the removed elements; or their number.
+        total: Number of all elements, if ``taken`` is a number.
+        names: Names of photographs: of all with a mask, otherwise of the removed ones.
+        at: World positions of the elements of the mask: points, or vertices and faces.
     """
     journal = current()
     if not journal.collects and journal.masks is None:
@@ -104,7 +104,7 @@ def leave_out(
     if mask is not None:
         taken, total = int(mask.count_nonzero()), mask.numel()
         if names:
-            names = [name for name, gone in zip(names, mask.tolist(), strict=True) if gone]
+            names = [name for name, removed in zip(names, mask.tolist(), strict=True) if removed]
     what, reason = GUARDS[guard]
     entry = LeftOut(
         guard=guard, what=what, count=int(taken), total=total, reason=reason, names=tuple(names)
@@ -116,17 +116,17 @@ def leave_out(
 
 
 def listening(listener: Listener) -> AbstractContextManager[Journal]:
-    """Hand every entry of the ``with`` block, with masks and places, to a listener, in threads too.
+    """Pass every entry of the ``with`` block and its threads to a listener, with masks.
 
-    What an earlier run kept (:mod:`pimper_torch.runtime.store`) has no masks any more: it is not
-    heard.
+    Entries of records kept by an earlier run (:mod:`pimper_torch.runtime.store`) have no masks and
+    are not passed on.
     """
     return writing(replace(current(), masks=listener))
 
 
 @contextmanager
 def added_up() -> Iterator[None]:
-    """Add up what each guard enters inside the ``with`` block, as threads work on parts."""
+    """Add up the entries of each guard in the ``with`` block, whose threads process parts."""
     events = current().so_far()
     before = len(events)
     yield
@@ -138,16 +138,16 @@ def added_up() -> Iterator[None]:
             entry = entry.replace(count=count, total=total, names=sums[key].names + entry.names)
         sums[key] = entry
     others = [entry for entry in events[before:] if not isinstance(entry, LeftOut)]
-    events[before:] = [*others, *(sums[key] for key in sorted(sums))]  # not as threads came
+    events[before:] = [*others, *(sums[key] for key in sorted(sums))]  # independent of threads
 
 
 def left_out_of(entries: Sequence[object]) -> tuple[LeftOut, ...]:
-    """List the entries of guards, in order."""
+    """Return the entries of guards, in order."""
     return tuple(entry for entry in entries if isinstance(entry, LeftOut))
 
 
 def closing_line(left_out: Sequence[LeftOut]) -> str:
-    """State in a line what guards left out, each in its last pass; empty where hardly anything.
+    """Return one line with the removed elements of each guard's last pass; empty if negligible.
 
     >>> cut = LeftOut(guard="extract.borders", what="faces", count=6, total=60, reason="narrow")
     >>> closing_line([cut])

@@ -1,7 +1,7 @@
-"""Tensors in files, so that photographs that are larger than memory are as others to every stage.
+"""Memory-mapped tensors, so that stages can process photographs larger than memory.
 
-A page is read when it is used, and the system writes and drops it when it needs the memory. The
-files have no names, so that nothing is left of them when the process ends, however it does.
+The system reads pages on use, and writes and drops them when it needs the memory. The files have no
+names, so they disappear when the process ends in any way.
 """
 
 import mmap
@@ -20,20 +20,20 @@ from torch import Tensor
 
 from pimper_torch.runtime.errors import OutputError
 
-# Bytes from which a tensor is in a file: a choice. Photographs of smaller sets stay in memory.
+# Minimum bytes of a tensor in a file, chosen by hand. Photographs of smaller sets stay in memory.
 LARGE = 2**26
 
 _mapped: WeakSet[mmap.mmap] = WeakSet()
-_lock = Lock()  # of the set, which no thread may add to while another goes through it
+_lock = Lock()  # of the set, which must not change during iteration
 
 
 def zeros(
     shape: Sequence[int], dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """Return zeros, in a file where they are large and on the CPU.
+    """Return zeros, in a file if they are large and on the CPU.
 
-    The file is in the folder for temporary files (``TMPDIR``), or in ``/var/tmp`` where that one is
-    itself in memory. Its space is reserved at once.
+    The file is in the folder for temporary files (``TMPDIR``), or in ``/var/tmp`` if that folder is
+    itself in memory. Its disk space is reserved immediately.
 
     Raises:
         OutputError: The disk has too little space.
@@ -44,14 +44,14 @@ def zeros(
         return torch.zeros(list(shape), dtype=dtype, device=device)
     try:
         with tempfile.TemporaryFile(prefix="pimper_", dir=folder) as file:
-            # Writing to pages for which there is no space would kill the process.
+            # Writing to pages without disk space would kill the process.
             getattr(os, "posix_fallocate", lambda *_: file.truncate(size))(file.fileno(), 0, size)
             pages = mmap.mmap(file.fileno(), size)
     except OSError as error:
         raise OutputError(
             f"{folder}: has no space for {size / 1e9:.1f} GB of photographs ({error.strerror}); "
-            "photographs that are large together are kept on disk. Free space, set TMPDIR to a "
-            "folder of another disk, or shrink the photographs (`--max-size-px`)."
+            "large sets of photographs are kept on disk. Free space, set TMPDIR to a folder on "
+            "another disk, or shrink the photographs (`--max-size-px`)."
         ) from error
     with _lock:
         _mapped.add(pages)
@@ -59,51 +59,51 @@ def zeros(
 
 
 def copied(tensor: Tensor) -> Tensor:
-    """Copy a tensor to contiguous memory, or a file where it is large. Differentiable."""
+    """Return a contiguous copy of a tensor, in a file if it is large. Differentiable."""
     return zeros(tensor.shape, tensor.dtype, tensor.device).copy_(tensor)
 
 
 def take_rows(tensor: Tensor, index: slice | Tensor) -> Tensor:
-    """Index the first axis, into a file where the result is large."""
+    """Return rows of the first axis, in a file if the result is large."""
     if isinstance(index, slice) or tensor.nbytes < LARGE or tensor.requires_grad:
         return tensor[index]
     rows = torch.arange(len(tensor), device=tensor.device)[index]
-    found = zeros((len(rows), *tensor.shape[1:]), tensor.dtype, tensor.device)
-    at_once = max(1, len(tensor) * LARGE // tensor.nbytes)
-    for into, some in zip(torch.split(found, at_once), torch.split(rows, at_once), strict=True):
-        into.copy_(tensor[some])
+    result = zeros((len(rows), *tensor.shape[1:]), tensor.dtype, tensor.device)
+    size = max(1, len(tensor) * LARGE // tensor.nbytes)
+    for chunk, indices in zip(torch.split(result, size), torch.split(rows, size), strict=True):
+        chunk.copy_(tensor[indices])
         drop_pages()
-    return found
+    return result
 
 
 def parts(shapes: Sequence[Sequence[int]], device: torch.device | str = "cpu") -> list[Tensor]:
-    """Return zeros of several shapes, together in a file where they are large together."""
+    """Return zeros of several shapes, in one file if they are large together."""
     sizes = list(map(prod, shapes))
     pieces = torch.split(zeros((sum(sizes),), device=device), sizes)
     return [piece.view(*shape) for piece, shape in zip(pieces, shapes, strict=True)]
 
 
 def by_view(work: Callable[..., Tensor], *rasters: Sequence[Tensor] | Tensor) -> Tensor:
-    """Stack what is computed of every view by itself.
+    """Return the stacked results of a function that is called for each view.
 
     Args:
-        work: Called with the view of every raster; gives tensors of one shape.
-        rasters: Of at least one view.
+        work: Receives the view's entry of every raster; returns tensors of one shape.
+        rasters: Rasters of at least one view.
     """
-    return stacked((work(*some) for some in each(*rasters)), len(rasters[0]))
+    return stacked((work(*views) for views in each(*rasters)), len(rasters[0]))
 
 
 def stacked(tensors: Iterator[Tensor], count: int) -> Tensor:
-    """Stack tensors of one shape as they come, in a file where they are large together."""
+    """Stack ``count`` tensors of one shape as they arrive, in a file if they are large together."""
     first = next(tensors)
-    found = zeros((count, *first.shape), first.dtype, first.device)
-    for place, one in enumerate(chain([first], tensors)):
-        found[place] = one
-    return found
+    result = zeros((count, *first.shape), first.dtype, first.device)
+    for index, tensor in enumerate(chain([first], tensors)):
+        result[index] = tensor
+    return result
 
 
 def drop_pages() -> None:
-    """Let go of the pages of all files; what was written to them stays."""
+    """Release the pages of all files from memory; their data stays in the files."""
     if hasattr(mmap, "MADV_DONTNEED"):
         with _lock:
             mapped = list(_mapped)
@@ -112,24 +112,25 @@ def drop_pages() -> None:
 
 
 def each(*rasters: Sequence[Tensor] | Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Go through the views of rasters together, and drop the pages of each behind it."""
+    """Iterate over the views of several rasters, and drop the pages of each view afterwards."""
     for views in zip(*rasters, strict=True):
         yield views
         drop_pages()
 
 
 def _folder() -> str | None:
-    """Return the first folder for temporary files that is on a disk."""
+    """Return the first writable folder for temporary files that is on a disk."""
     folders = (tempfile.gettempdir(), "/var/tmp")
-    return next((one for one in folders if os.access(one, os.W_OK) and not _in_memory(one)), None)
+    on_disk = (path for path in folders if os.access(path, os.W_OK) and not _in_memory(path))
+    return next(on_disk, None)
 
 
 def _in_memory(folder: str) -> bool:
-    """Return whether files of a folder take memory; false where the system does not say."""
+    """Return whether a folder is in memory; false if the system does not report it."""
     with suppress(OSError):
         lines = Path("/proc/mounts").read_text(encoding="utf-8").splitlines()
         kinds = {line.split()[1]: line.split()[2] for line in lines}
-        place = Path(folder).resolve()
-        points = [str(one) for one in (place, *place.parents) if str(one) in kinds]
-        return bool(points) and kinds[points[0]] in ("tmpfs", "ramfs")
+        path = Path(folder).resolve()
+        mounts = [str(parent) for parent in (path, *path.parents) if str(parent) in kinds]
+        return bool(mounts) and kinds[mounts[0]] in ("tmpfs", "ramfs")
     return False

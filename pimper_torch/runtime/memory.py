@@ -19,65 +19,65 @@ from pimper_torch.runtime.mapped import drop_pages
 Given = TypeVarTuple("Given")
 Result = TypeVar("Result")
 
-# Bytes that the fusion's last round takes for each vertex, on top of what the process holds when
-# the first round begins: 0.8 kB in the demo and for a jar of 0.7 million vertices, 1.2 for one of
-# 3.0 million (benchmarks/speed.py).
+# Bytes per vertex of the fusion in the last pass, in addition to the memory of the process at the
+# start of the first pass: 0.8 kB in the demo and for a jar of 0.7 million vertices, 1.2 kB for one
+# of 3.0 million (benchmarks/speed.py).
 _BYTES_PER_VERTEX = 1200
 
-# Bytes for each vertex where it goes by blocks, for the coarser mesh that is solved whole; what is
-# kept of all vertices meanwhile; and bytes for each vertex of a block: 740, 285 and 1,370 for a jar
-# of 1.06 million in 8 blocks.
+# Bytes of the fusion by blocks: per vertex for the coarser mesh, which is solved in one piece; per
+# vertex for data kept meanwhile; and per vertex of a block. Measured: 740, 285 and 1,370 for a jar
+# of 1.06 million vertices in 8 blocks.
 _BYTES_BY_BLOCKS, _BYTES_KEPT, _BYTES_OF_BLOCK = 750, 300, 1400
 
-# Vertices of the surface for each square of their spacing: 1.6 in the demo. Equilateral triangles
-# have 1.15, but an edge is cut as the finer of its facets asks for.
+# Vertices of the surface per square of their spacing: 1.6 in the demo. Equilateral triangles have
+# 1.15, but an edge is divided as its finer facet requires.
 _PER_SQUARE = 1.6
 
 
 def largest_problem(limit: float, patches: PatchSet, scale: float, last: float) -> float:
-    """Return how many vertices the fusion may solve for at once; infinite where all fit.
+    """Return the maximum number of vertices that the fusion solves for at once.
 
-    Blocks take a half, a quarter or a smaller such part of the limit, so that their number does not
-    depend on a few bytes that are held.
+    It is infinite if all vertices fit. The memory for blocks is a half, a quarter or a smaller
+    power of two of the limit, so their number does not depend on small changes of used memory.
 
     Args:
-        limit: Bytes that the process may hold.
-        scale: Of the photographs in this round.
-        last: Of the photographs in the last one.
+        limit: Maximum bytes of the process.
+        scale: Scale of the photographs in this pass.
+        last: Scale of the photographs in the last pass.
 
     Raises:
-        ReconstructionError: The last round would take more memory than it may, by blocks too.
+        ReconstructionError: The last pass would exceed the limit even by blocks.
     """
     mesh, spacing = patches.coarse.mesh, float(patches.buckets[0].spacing[0].detach())
     area = float(face_normals(mesh.vertices_world.detach(), mesh.faces).norm(dim=1).sum()) / 2
     vertices = _PER_SQUARE * area / (spacing * scale / last) ** 2
-    held = resident_bytes()
-    if held + _BYTES_PER_VERTEX * vertices <= limit:
+    used = resident_bytes()
+    if used + _BYTES_PER_VERTEX * vertices <= limit:
         return math.inf
-    room = limit - held - _BYTES_KEPT * vertices
-    parts = [limit / 2**power for power in range(1, 7)]
-    part = next((part for part in parts if part <= room), None)
-    needed = held + _BYTES_BY_BLOCKS * vertices
-    if part is None or needed > limit:
-        fraction = max(limit - held, 0.0) / (_BYTES_BY_BLOCKS * vertices)
+    free = limit - used - _BYTES_KEPT * vertices
+    sizes = (limit / 2**power for power in range(1, 7))
+    block = next((size for size in sizes if size <= free), 0.0)
+    needed = used + _BYTES_BY_BLOCKS * vertices
+    if not block or needed > limit:
+        fraction = max(limit - used, 0.0) / (_BYTES_BY_BLOCKS * vertices)
         advice = (
-            f"Shrink the photographs (`--max-size-px`) or take fewer samples "
-            f"(`decompose.samples_per_pixel`) by a factor of {fraction**0.5:.2f} a side."
+            f"Shrink the photographs (`--max-size-px`) or use fewer samples "
+            f"(`decompose.samples_per_pixel`), by a factor of {fraction**0.5:.2f} per side."
             if fraction > 0
-            else "The photographs alone take that: shrink them (`--max-size-px`)."
+            else "The photographs alone need that much: shrink them (`--max-size-px`)."
         )
         raise ReconstructionError(
             f"max_memory is {limit / 1e9:.1f} GB, but the surface will have about "
-            f"{vertices / 1e6:.1f} million vertices, and its fusion by blocks takes about "
-            f"{needed / 1e9:.1f} GB in all, {held / 1e9:.1f} of which are held now. {advice}"
+            f"{vertices / 1e6:.1f} million vertices, and its fusion by blocks needs about "
+            f"{needed / 1e9:.1f} GB in total, {used / 1e9:.1f} of which are in use now. {advice}"
         )
-    return part / _BYTES_OF_BLOCK
+    return block / _BYTES_OF_BLOCK
 
 
 def resident_bytes() -> float:
-    """Return what the process holds now, 0 where the system does not tell.
+    """Return the resident memory of the process in bytes; 0 if the system does not report it.
 
-    Pages of files do not count, as the system drops them where memory is needed.
+    Pages of files do not count, because the system drops them when memory is needed.
     """
     with suppress(OSError, IndexError, ValueError):
         fields = Path("/proc/self/status").read_text(encoding="ascii")
@@ -87,10 +87,10 @@ def resident_bytes() -> float:
 
 
 def release_memory() -> None:
-    """Return memory that was freed to the system, where glibc can.
+    """Return freed memory to the system, if glibc is available.
 
-    With 30 photographs of 1600x1200 the threads that write them leave 400 MB, COLMAP's as much
-    again, and patches before the fusion some 200, which would add to what comes after.
+    With 30 photographs of 1600x1200 the threads that write them leave 400 MB, those of COLMAP
+    another 400 MB, and patches before the fusion 200 MB, in addition to the memory of later stages.
     """
     drop_pages()
     forget_casters()
@@ -99,10 +99,10 @@ def release_memory() -> None:
 
 
 def recomputed(work: Callable[[*Given], Result], *given: *Given) -> Result:
-    """Call a function whose intermediate results, most of autograd's memory, are computed again.
+    """Return the result of a function; the backward pass recomputes intermediate results.
 
     Args:
-        work: Fast, and without side effects.
+        work: A fast function without side effects, whose graph would take most memory.
     """
     if not any(getattr(leaf, "requires_grad", False) for leaf in pytree.tree_leaves(given)):
         return work(*given)  # the first checkpoint of a process imports a compiler, for seconds

@@ -1,4 +1,4 @@
-"""NumPy's files from strangers: sizes are checked first, pickles are not opened."""
+"""Safe reading of NumPy files: sizes are checked first, pickles are not opened."""
 
 import zipfile
 from collections.abc import Callable
@@ -6,43 +6,43 @@ from pathlib import Path
 
 import numpy as np
 
-# A choice: depth of 100 million pixels takes as much.
+# Chosen for depth maps of up to 100 million pixels.
 MAX_BYTES = 2**29
 
 
 def read_npy(path: Path | str) -> np.ndarray:
-    """Read an array of numbers, truth values or texts.
+    """Return an array of numbers, booleans or texts from a NPY file.
 
     Raises:
-        ValueError: It is none, is larger than its file or than 512 MB, or is cut short.
+        ValueError: It is not such an array, is larger than 512 MB, or does not match its file.
     """
     _require_small(Path(path).stat().st_size)
     try:
-        # Where a file is mapped, NumPy compares its size with what its header says.
+        # When NumPy maps a file, it compares the size with that in the header.
         return np.array(_plain(np.lib.format.open_memmap(path, mode="r")))
-    except Exception as error:  # a header is a literal of Python, whose parser raises whatever
-        raise ValueError(f"it is no array of NumPy ({error})") from error
+    except Exception as error:  # the header is a Python literal; its parser raises any error
+        raise ValueError(f"it is not a NumPy array ({error})") from error
 
 
 def read_npz(
     path: Path | str, wanted: Callable[[str], bool] = lambda name: True
 ) -> dict[str, np.ndarray]:
-    """Read arrays of an archive that :func:`numpy.savez` wrote, compressed or not.
+    """Return arrays of an archive written by :func:`numpy.savez`, compressed or not, by name.
 
     Args:
-        wanted: Tells the names of arrays to read; others are not looked at.
+        wanted: Returns whether to read the array of a name.
 
     Raises:
-        ValueError: As :func:`read_npy`, and for what is no such archive.
+        ValueError: The file is not such an archive, or as for :func:`read_npy`.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            entries = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
-            _require_small(sum(one.file_size for name, one in entries.items() if wanted(name)))
+            sizes = {e.filename.removesuffix(".npy"): e.file_size for e in archive.infolist()}
+            _require_small(sum(size for name, size in sizes.items() if wanted(name)))
         with np.load(path, allow_pickle=False) as arrays:
             return {name: _plain(arrays[name]) for name in arrays.files if wanted(name)}
     except Exception as error:
-        raise ValueError(f"it is no archive of arrays ({error})") from error
+        raise ValueError(f"it is not a NumPy archive ({error})") from error
 
 
 def _require_small(size: int) -> None:
@@ -52,5 +52,5 @@ def _require_small(size: int) -> None:
 
 def _plain(array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "biufcSU" or array.itemsize == 0:
-        raise ValueError(f"it holds {array.dtype}, which are no numbers")
+        raise ValueError(f"it contains {array.dtype} instead of numbers")
     return array

@@ -1,4 +1,4 @@
-"""Reports of a run's stages: time, memory, and the figures of each record."""
+"""Stage reports: time, memory, and figures of the returned record."""
 
 import math
 import sys
@@ -41,20 +41,20 @@ _counting = Lock()
 
 @runtime_checkable
 class Observer(Protocol):
-    """Whoever wants to show how a run is going."""
+    """Receiver of the progress of a run, for display."""
 
     def started(self, stage: str) -> None:
-        """Hear that a stage begins."""
+        """Receive the name of a stage that starts."""
 
     def progressed(self, done: int, total: int) -> None:
-        """Hear that the stage has done some of its batches."""
+        """Receive the number of finished batches of the stage."""
 
     def finished(self, report: StageReport) -> None:
-        """Hear that a stage ended, what it cost and what it found."""
+        """Receive the report of a finished stage: its cost and figures."""
 
 
 class Silent:
-    """An observer that shows nothing."""
+    """Observer that ignores everything."""
 
     def _hear(self, *_: object, **__: object) -> None:
         pass
@@ -62,7 +62,7 @@ class Silent:
     started = progressed = finished = _hear
 
 
-# What neither stages nor other lines of a run's table do.
+# Line of a run's table for the time outside of stages and of its other lines.
 BETWEEN = "between stages"
 ASIDE = HASH, KEEP, BETWEEN
 
@@ -70,33 +70,33 @@ ASIDE = HASH, KEEP, BETWEEN
 def reported(
     name: str, seconds: float, figures: dict[str, int | float] | None = None
 ) -> StageReport:
-    """Return the report of what has just ended."""
+    """Return the report of a stage or line that has just ended."""
     return StageReport(
         name=name, seconds=seconds, peak_memory_mb=peak_memory_mb(), figures=figures or {}
     )
 
 
 def seconds_of(reports: Iterable[StageReport]) -> float:
-    """Add up what stages took in this run; those of kept records took their time in another."""
+    """Return the seconds of all stages in this run; stages with kept records ran earlier."""
     return sum(report.seconds for report in reports if not report.kept)
 
 
 def gathered(reports: Sequence[StageReport]) -> tuple[StageReport, ...]:
-    """Put the lines of what no stage did at the end, each once."""
-    parts = {name: [one for one in reports if one.name == name] for name in ASIDE}
-    lines = [some[-1].replace(seconds=seconds_of(some)) for some in parts.values() if some]
-    return (*(one for one in reports if one.name not in ASIDE), *lines)
+    """Return the reports with the lines outside of stages added up, at the end."""
+    groups = [[report for report in reports if report.name == name] for name in ASIDE]
+    lines = [group[-1].replace(seconds=seconds_of(group)) for group in groups if group]
+    return (*(report for report in reports if report.name not in ASIDE), *lines)
 
 
 @contextmanager
 def recorded(observer: Observer) -> Iterator[list[StageReport]]:
-    """Report the stages of the ``with`` block; see :func:`stage`.
+    """Collect the reports of the stages in the ``with`` block; see :func:`stage`.
 
-    A block inside another one that is in no stage is part of it.
+    A nested block outside of a stage is part of the outer block.
 
     Yields:
-        The list that holds the reports when the block has ended, and one of each line of what no
-        stage did.
+        A list, filled at the end of the block with the reports and with one report for each line
+        outside of stages.
     """
     events, reports = current().so_far(), list[StageReport]()
     before = len(events)
@@ -110,13 +110,13 @@ def recorded(observer: Observer) -> Iterator[list[StageReport]]:
     )
     with writing(journal):
         yield reports
-    own = _reports(events[before:])
-    reports += _lines(journal, own)
-    events += reports[len(own) :]
+    stages = _reports(events[before:])
+    reports += _lines(journal, stages)
+    events += reports[len(stages) :]
 
 
 def accounted() -> tuple[StageReport, ...]:
-    """Return all lines of the call so far, which make up its seconds."""
+    """Return all lines of the call so far; their seconds add up to those of the call."""
     journal = current()
     return () if journal.observer is None else gathered(_lines(journal, journal.so_far()))
 
@@ -126,18 +126,18 @@ def _reports(events: Iterable[object]) -> list[StageReport]:
 
 
 def _lines(journal: Journal, events: Iterable[object]) -> list[StageReport]:
-    """Return the reports, and lines of what no stage did: they make up the call's seconds."""
-    lines = [*_reports(events), *(reported(name, took) for name, took in journal.aside.items())]
+    """Return the reports and the lines outside of stages; they add up to the call's seconds."""
+    lines = [*_reports(events), *(reported(name, time) for name, time in journal.aside.items())]
     rest = time.perf_counter() - journal.began - seconds_of(lines)
     return [*lines, reported(BETWEEN, rest)]
 
 
 @contextmanager
 def stage(name: str) -> Iterator[dict[str, int | float]]:
-    """Report what the ``with`` block does as one stage, and nothing of the stages it calls.
+    """Report the ``with`` block as one stage; stages that it calls are not reported.
 
     Yields:
-        The figures to be told, empty at first.
+        The figures of the report, for the caller to fill.
     """
     metrics: dict[str, int | float] = {}
     journal, began = current(), time.perf_counter()
@@ -150,21 +150,21 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
     with writing(replace(journal, observer=None, figures=metrics)):
         yield metrics
     report = reported(name, time.perf_counter() - began, metrics)
-    events[before:] = [one for one in events[before:] if not isinstance(one, StageReport)]
+    events[before:] = [event for event in events[before:] if not isinstance(event, StageReport)]
     events.append(report)
     journal.observer.finished(report)
 
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """Add the seconds of the ``with`` block, in whichever thread, to the figures of its stage."""
+    """Add the seconds of the ``with`` block to the figures of its stage, from any thread."""
     began = time.perf_counter()
     yield
     add_counts({f"{name}_seconds": time.perf_counter() - began})
 
 
 def add_counts(counts: Mapping[str, int | float]) -> None:
-    """Add counts to the figures of the stage that runs, from any of its threads."""
+    """Add counts to the figures of the running stage, from any thread."""
     metrics = current().figures
     with _counting:
         for name, count in counts.items():
@@ -172,7 +172,7 @@ def add_counts(counts: Mapping[str, int | float]) -> None:
 
 
 def called(name: str, call: Callable[..., R], *inputs: object) -> R:
-    """Call a stage, and report it with the figures of its record."""
+    """Return the record of a stage, and report the call with the record's figures."""
     with stage(name) as metrics:
         record = call(*inputs)
         metrics |= figures(record)
@@ -180,7 +180,7 @@ def called(name: str, call: Callable[..., R], *inputs: object) -> R:
 
 
 def peak_memory_mb() -> float:
-    """Return highest resident memory of this process so far; 0 where the system does not tell."""
+    """Return the peak resident memory of this process so far, in MB; 0 on Windows."""
     if sys.platform == "win32":
         return 0.0
     import resource
@@ -191,7 +191,7 @@ def peak_memory_mb() -> float:
 
 @singledispatch
 def figures(record: object) -> dict[str, int | float]:
-    """Return the counts and fractions of a record that are worth telling."""
+    """Return counts and fractions that characterize a record, for its report."""
     return {}
 
 
@@ -217,14 +217,14 @@ def _(silhouettes: Silhouettes) -> dict[str, int | float]:
 
 
 @figures.register
-def _(found: SilhouetteCoverage) -> dict[str, int | float]:
-    if not len(found.uncovered):
+def _(coverage: SilhouetteCoverage) -> dict[str, int | float]:
+    if not len(coverage.uncovered):
         return {}
     return {
-        "covered": 1 - float(found.uncovered.mean()),
-        "sticking_out": float(found.outside.mean()),
-        "least_covered": 1 - float(found.uncovered.max()),
-        "most_sticking_out": float(found.outside.max()),
+        "covered": 1 - float(coverage.uncovered.mean()),
+        "sticking_out": float(coverage.outside.mean()),
+        "least_covered": 1 - float(coverage.uncovered.max()),
+        "most_sticking_out": float(coverage.outside.max()),
     }
 
 
@@ -256,8 +256,8 @@ def _(patches: PatchSet) -> dict[str, int | float]:
 
 
 @figures.register
-def _(seen: PatchViews) -> dict[str, int | float]:
-    pairs = list(zip(seen.patches.buckets, seen.buckets, strict=True))
+def _(observed: PatchViews) -> dict[str, int | float]:
+    pairs = list(zip(observed.patches.buckets, observed.buckets, strict=True))
     samples = sum(int(bucket.inside.sum()) * views.valid.shape[1] for bucket, views in pairs)
     valid = sum(int(views.valid.count_nonzero()) for _, views in pairs)
     return {"samples": samples, "missing_samples": samples - valid}
@@ -268,35 +268,35 @@ def _(photometric: PhotometricPatches) -> dict[str, int | float]:
     pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
     inside = sum(int(templates.inside.sum()) for templates, _ in pairs)
     count = photometric.patches.num_patches
-    ended = [bucket.convergence for _, bucket in pairs]
+    convergence = [bucket.convergence for _, bucket in pairs]
     statuses = Counter(code for _, bucket in pairs for code in bucket.status.tolist())
     return {
         "valid_fraction": sum(int(bucket.valid.sum()) for _, bucket in pairs) / inside,
         **{f"{status.name.lower()}_patches": statuses[status] for status in PatchStatus},
-        "converged_patches": sum(int(end.converged.sum()) for end in ended),
-        "mean_iterations": sum(float(end.iterations.sum()) for end in ended) / count,
-        "mean_residual": sum(float(end.residual.detach().sum()) for end in ended) / count,
+        "converged_patches": sum(int(state.converged.sum()) for state in convergence),
+        "mean_iterations": sum(float(state.iterations.sum()) for state in convergence) / count,
+        "mean_residual": sum(float(state.residual.detach().sum()) for state in convergence) / count,
     }
 
 
 @figures.register
 def _(swept: SweptPatches) -> dict[str, int | float]:
-    """Return how far priors are from what photographs tell, over what both claim; 1 is right."""
+    """Return the median deviation of priors over its stated error; 1 if variances are right."""
     angles, normals, depths = [], [], []
     for light, height in zip(swept.photometric.buckets, swept.buckets, strict=True):
-        if (guess := height.priors) is not None:
-            both = light.valid & (guess.normal_information > 0)
-            square = (guess.normals_patch - light.normals_patch)[both].square().sum(dim=-1)
-            claim = 1 / guess.normal_information[both] + 1 / light.information[both]
+        if (prior := height.priors) is not None:
+            known = light.valid & (prior.normal_information > 0)
+            square = (prior.normals_patch - light.normals_patch)[known].square().sum(dim=-1)
+            variance = 1 / prior.normal_information[known] + 1 / light.information[known]
             angles.append(square.detach())
-            normals.append((square / claim).detach())
-            both = (height.information > 0) & (guess.offset_information > 0)
-            square = (guess.offset - height.offset)[both].square()
-            claim = 1 / guess.offset_information[both] + 1 / height.information[both]
-            depths.append((square / claim).detach())
+            normals.append((square / variance).detach())
+            known = (height.information > 0) & (prior.offset_information > 0)
+            square = (prior.offset - height.offset)[known].square()
+            variance = 1 / prior.offset_information[known] + 1 / height.information[known]
+            depths.append((square / variance).detach())
     metrics: dict[str, int | float] = {}
     if sum(map(len, normals)):
-        # Medians of squares of Gaussian noise in two components, and in one.
+        # Medians of squared Gaussian noise over their mean: log(2) in 2D, 0.4549 in 1D.
         metrics["prior_normals_deg"] = math.degrees(float(torch.cat(angles).median()) ** 0.5)
         metrics["prior_normals_over_claim"] = (
             float(torch.cat(normals).median() / math.log(2)) ** 0.5

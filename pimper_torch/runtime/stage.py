@@ -26,25 +26,24 @@ class _Forward(Protocol[P, R]):
 
 
 class Stage(nn.Module):
-    """A module whose call has the types of its ``forward``, for a checker of types.
+    """Module whose call has the types of its ``forward``, for type checkers.
 
-    ``nn.Module`` alone may be called with anything and gives anything. A stage of one's own that
-    derives from this class is checked where it is put into a chain and wherever it is called; and
-    so are the records it is handed, when it runs.
+    A plain ``nn.Module`` accepts and returns any type. A custom stage derived from this class is
+    type-checked when it is inserted into a chain and when it is called. Its input records are
+    checked at run time.
 
     It computes on the device and in the dtype of these records: ``stage(views.to("cuda"))``.
-    ``to`` and its like move parameters, those of a network for instance, and warn where a stage has
+    ``to`` and similar methods move parameters, such as those of a network, and warn if a stage has
     none.
     """
 
     if TYPE_CHECKING:
 
         def __call__(self: _Forward[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-            """Run the stage.
+            """Return the record of the stage.
 
             Raises:
-                InputError: What is handed to it is of another type than it takes, or a record
-                    whose values no stage can use.
+                InputError: An input has the wrong type, or is a record with unusable values.
             """
 
     def __init__(self) -> None:
@@ -52,39 +51,39 @@ class Stage(nn.Module):
         self.register_forward_pre_hook(check_handed, with_kwargs=True)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Stage":
-        """Move parameters and buffers; warn where there are none, and records are to be moved."""
+        """Move parameters and buffers; warn if there are none, as records must be moved."""
         if any(True for _ in chain(self.parameters(), self.buffers())):
-            with held():  # stages inside that have none
+            with held():  # nested stages may have none
                 return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         probe = torch.empty(0)
-        with suppress(AssertionError, RuntimeError):  # of a device that is not there
+        with suppress(AssertionError, RuntimeError):  # the device is missing
             moved = fn(probe)
             if (moved.device, moved.dtype) == (probe.device, probe.dtype):
                 return self
         caution(
             f"{type(self).__name__} has no parameters to move: it computes on the device and in "
-            "the dtype of the records it is called with. Move these, such as `views.to('cuda')`.",
+            "the dtype of its input records. Move the records, such as `views.to('cuda')`.",
             stacklevel=3,
         )
         return self
 
 
 class Given(Stage, Generic[T]):
-    """A stage that gives what it was made with, whatever it is handed: a record that is at hand."""
+    """Stage that returns a given record and ignores its inputs."""
 
     def __init__(self, record: T) -> None:
         super().__init__()
         self.record = record
 
     def forward(self, *_: object) -> T:
-        """Return it."""
+        """Return the record."""
         return self.record
 
 
 class Then(Stage):
-    """A stage, and others behind it, each of which is handed the record of the one before.
+    """Sequence of stages, each of which receives the record of the one before.
 
-    ``load_chain("default", warp=Then(Warp(), Mine()))`` puts a stage into the gap behind the warp.
+    ``load_chain("default", warp=Then(Warp(), Mine()))`` inserts a stage after the warp.
     """
 
     def __init__(self, stage: nn.Module, *others: nn.Module) -> None:
@@ -92,7 +91,7 @@ class Then(Stage):
         self.stage, self.others = stage, nn.ModuleList(others)
 
     def forward(self, *given: object) -> object:
-        """Return the record of the last one."""
+        """Return the record of the last stage."""
         record = self.stage(*given)
         for other in self.others:
             record = other(record)
@@ -100,12 +99,12 @@ class Then(Stage):
 
 
 def check_handed(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str, object]) -> None:
-    """Refuse records of other types than a stage takes, and those that cannot be used."""
+    """Refuse inputs of the wrong type, and records with unusable values."""
     where = type(stage).__name__
     try:
         bound = inspect.signature(stage.forward).bind(*args, **kwargs)
     except TypeError:
-        return  # torch reports what does not fit
+        return  # torch reports wrong arguments
     hints = typing.get_type_hints(stage.forward)
     for name, value in bound.arguments.items():
         hint = hints.get(name)
@@ -122,9 +121,9 @@ def check_handed(stage: nn.Module, args: tuple[object, ...], kwargs: Mapping[str
 
 
 def _source(value: object, kinds: list[type]) -> str:
-    """Return where a record comes from that something else was given in place of."""
+    """Return advice how to obtain a record of the right kind, given a wrong value."""
     if Views in kinds and isinstance(value, str | Path):
         return "`load_views` reads the photographs of a folder."
     if Views in kinds and isinstance(value, Tensor | np.ndarray | Sequence):
-        return "`scene_of` puts images in tensors or arrays beside their cameras."
-    return "It comes from whoever called the stage, in a chain the stage before."
+        return "`scene_of` combines images in tensors or arrays with their cameras."
+    return "The caller of the stage passed it; in a chain, the stage before."

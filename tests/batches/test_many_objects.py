@@ -121,7 +121,7 @@ def test_too_few_photographs_fail_only_their_object(world):
         (photos / name).unlink()
     found = world.batch()
     assert (found["ball"].status, found["cup"].status) == ("ended", "failed")
-    assert "cup: the number of photographs is 2; needed: 4" in found["cup"].message
+    assert "cup: the number of photographs is 2; needed: at least 4" in found["cup"].message
 
 
 def test_changes_since_the_result_are_named(world):

@@ -41,7 +41,7 @@ def test_the_help_lists_the_available_commands(capsys, monkeypatch):
     found = helped(capsys)
     assert {*usual} - {*found} == {"evaluate", "bench", "convert"}
     assert {*found} - {*usual} == {"stroke"}
-    assert found["stroke"].endswith("brought by brushes")
+    assert found["stroke"].endswith("provided by brushes")
     assert found["render"] == usual["render"]
     assert [*found][-1] == "stroke"
 

@@ -123,15 +123,18 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
     [
         (["--preset", "papre"], "Did you mean `paper`?"),
         (["--preset", "paper", "--max-memory=1GB"], "option of the preset paper, but of default"),
-        (["--triangulate.reference", "9"], "is no option of the preset default, but of "),
+        (["--triangulate.reference", "9"], "is not an option of the preset default, but of "),
         (["--preset", "nowhere/mine.yaml"], "there is no such file"),
         (["--reconstruct.starts", "-1"], "starts is -1; needed: 0 or more"),
-        (["--max-size-px", "-3"], "max_size_px is -3; needed: 0, or 32 pixels at least"),
-        (["--factorize.min-views", "5"], "photos: the number of photographs is 4; needed: 5 at le"),
+        (["--max-size-px", "-3"], "max_size_px is -3; needed: 0, or at least 32 pixels"),
+        (
+            ["--factorize.min-views", "5"],
+            "photos: the number of photographs is 4; needed: at least",
+        ),
         (["--reference", "nosuch"], "0 photographs are named 'nosuch'; needed: one of 0.png, 1"),
         (["--photographs.saturation", "x"], "is 'x'; needed: {auto}|FLOAT|FLOAT,FLOAT,FLOAT."),
         (["--scales", "x"], "--scales is 'x'; needed: FLOAT,.... Of the photographs"),
-        (["--region", "1"], "--region is '1'; needed: FLOAT,.... Box that the object is inside"),
+        (["--region", "1"], "--region is '1'; needed: FLOAT,.... Box around the object"),
         (["--masks", "nowhere"], "nowhere: found nothing; needed: a folder"),
         (["--sede", "3"], "Unrecognized options: --sede, 3"),
         (["--reconstruct.starts", "many"], "--reconstruct.starts is 'many'; needed: INT."),
@@ -246,7 +249,7 @@ def test_unexpected_errors_are_reported_and_saved(
 @pytest.mark.parametrize(
     ("error", "expected"),
     [
-        (OSError(errno.ENOSPC, "No space left on device", "/tmp/a.db"), "Make room."),
+        (OSError(errno.ENOSPC, "No space left on device", "/tmp/a.db"), "Free space."),
         (PermissionError(errno.EACCES, "Permission denied", "/root/x"), "/root/x: the system"),
         (MemoryError(), "memory ran out; no result was written."),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 99 bytes"), "memory ran out"),
@@ -272,7 +275,7 @@ def test_an_unwritable_crash_report_is_reported(reconstruct, chain, tmp_path, ca
     assert reconstruct() == 1
     printed = capsys.readouterr().err
     assert "Traceback" in printed
-    assert "Above is what a report needs" in printed
+    assert "report it with the traceback above" in printed
 
 
 @pytest.mark.parametrize("place", ["out", "photos", "photograph"])

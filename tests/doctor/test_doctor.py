@@ -87,9 +87,7 @@ def test_saturated_and_dark_photographs_are_named():
     image[0, :4] = 1.0  # a tenth of the pixels, in one channel
     burnt = summarize("burnt.png", image)
     assert burnt.saturated == pytest.approx(0.1)
-    assert (
-        "1 of 2 are saturated in part: burnt.png (10%)" in saturation([burnt, photograph()]).found
-    )
+    assert "1 of 2 are partly saturated: burnt.png (10%)" in saturation([burnt, photograph()]).found
     mask = torch.zeros(40, 50, dtype=torch.bool)
     mask[4:] = True
     assert summarize("a", image, mask).saturated == 0

@@ -109,5 +109,6 @@ def test_clicks_are_read_as_foreground_seeds(views):
 
 @pytest.mark.parametrize("given", [["--silhouettes", "soft"], ["--object-at", "a.jpg,3,4"]])
 def test_given_masks_exclude_silhouette_priors(given):
-    with pytest.raises(ConfigError, match=r"is '(soft|a\.jpg,3,4)'; needed: none beside --masks"):
+    message = r"is '(soft|a\.jpg,3,4)'; needed: no value together with --masks"
+    with pytest.raises(ConfigError, match=message):
         parse("reconstruct", ["photos", "-o", "out", "--masks", "drawn", *given])

@@ -1,1 +1,1 @@
-"""Checks of photographs and of the machine, in seconds, before a run of minutes."""
+"""Fast checks of photographs and of the machine before a run."""

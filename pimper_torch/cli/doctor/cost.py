@@ -1,4 +1,4 @@
-"""Estimates of a run's time and memory."""
+"""Estimates of the time and memory of a run."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -8,22 +8,22 @@ from pimper_torch.cli.doctor.findings import Finding
 if TYPE_CHECKING:
     from pimper_torch.cli.doctor.photograph import Photograph
 
-# Fitted by hand to runs of `default` on 2 cores, 10 to 30 photographs of 0.3 to 1.9 megapixels,
-# each met within 1.5 times (benchmarks/README.md, "How cost grows"). Memory grows with the
-# surface, and so with the pixels of one photograph: photographs are on disk where they are large.
-# Depth maps take 7.3 MB a photograph (docs/decisions.md, "Photographs on disk").
+# Fitted by hand to runs of `default` on 2 cores with 10 to 30 photographs of 0.3 to 1.9 megapixels,
+# each within a factor of 1.5 (benchmarks/README.md, "How cost grows"). Memory grows with the
+# surface, and therefore with the pixels of one photograph: large photographs are on disk. Depth
+# maps take 7.3 MB per photograph (docs/decisions.md, "Photographs on disk").
 _GB, _GB_A_MEGAPIXEL_OF_ONE, _GB_A_VIEW = 1.1, 0.75, 0.0073
 
 
 def estimate(megapixels: float, num_views: int) -> tuple[float, float]:
-    """Estimate seconds on 2 cores and GB of memory that ``default`` takes.
+    """Estimate the seconds on 2 cores and the GB of memory of ``default``.
 
     >>> seconds, gigabytes = estimate(57.6, 30)
     >>> round(seconds), round(gigabytes, 2)
     (298, 2.54)
     """
-    # Programs are loaded, photographs read, records hashed and kept.
-    seconds = 3.0 + 0.35 * megapixels + sum(each for _, each in planned(megapixels, num_views))
+    # Outside of stages: imports, reading photographs, hashing and keeping records.
+    seconds = 3.0 + 0.35 * megapixels + sum(time for _, time in planned(megapixels, num_views))
     surface = _GB_A_MEGAPIXEL_OF_ONE * megapixels / max(1, num_views)
     return seconds, _GB + max(surface, _GB_A_VIEW * num_views)
 
@@ -36,14 +36,15 @@ def planned(
     cameras: bool = False,
     masks: bool = False,
 ) -> list[tuple[str, float]]:
-    """List the stages of the chain from coarse to fine with their estimated seconds on 2 cores.
+    """List the stages of the default chain with their estimated seconds on 2 cores.
 
-    Compilation, noticeable only in an installation's first run, is left out. Stages on photographs
-    grow with all pixels, or with the number of photographs where they shrink them; stages on the
-    surface grow with the pixels of one photograph and the square of the scale.
+    Compilation is excluded; it is noticeable only in the first run of an installation. The time of
+    stages on photographs grows with all pixels, or with the number of photographs if they scale
+    them down. The time of stages on the surface grows with the pixels of one photograph and the
+    square of the scale.
     """
     pairs, one = num_views * (num_views - 1) / 2, megapixels / max(1, num_views)
-    if num_views > 66:  # each is matched with 20 that look alike, many of them in both directions
+    if num_views > 66:  # each is matched with its 20 most similar views, many pairs twice
         pairs = 14.0 * num_views
     stages = [
         ("reconstruct", 0.5 if cameras else 0.6 * megapixels + 0.05 * pairs + 1.0 * num_views),
@@ -70,17 +71,17 @@ def planned(
 
 
 def cost(photographs: Sequence["Photograph"], available_gb: float | None) -> Finding:
-    """Report the estimate, and whether the memory is there."""
-    megapixels = sum(one.width * one.height for one in photographs) / 1e6
+    """Report the estimates, and whether the memory is available."""
+    megapixels = sum(photo.width * photo.height for photo in photographs) / 1e6
     seconds, needed = estimate(megapixels, len(photographs))
-    told = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
+    found = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, estimated"
     if available_gb is None or needed <= available_gb:
-        return Finding("cost", "ok", told)
-    found = f"{told}; {available_gb:.1f} GB are free"
-    advice = "Shrink the photographs (`--max-size-px`), take fewer, or free memory."
-    return Finding("cost", "warning", found, "as much memory as the run takes", advice)
+        return Finding("cost", "ok", found)
+    found += f"; {available_gb:.1f} GB are free"
+    advice = "Shrink the photographs (`--max-size-px`), use fewer, or free memory."
+    return Finding("cost", "warning", found, "memory for the run", advice)
 
 
 def minutes(seconds: float) -> str:
-    """Write a time that is estimated."""
+    """Return an estimated time as text."""
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} minutes"

@@ -1,4 +1,4 @@
-"""Overlap of photographs, by features of small copies."""
+"""Overlap of photographs, from matched features of small copies."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ from pimper_torch.runtime.errors import some
 
 
 def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[VerifiedPair]:
-    """Match small copies with one another; pairs that have nothing in common are left out."""
+    """Return the verified pairs of small copies; pairs without common features are excluded."""
     count, shapes = len(copies), [copy.shape for copy in copies]
     if count < 2 or min(map(min, shapes)) < SMALLEST_PX:  # which a run refuses
         return []
@@ -39,7 +39,7 @@ def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[Verifi
     )
     with workspace(views, settings.num_threads) as space:
         find_features(space, settings, [None] * count, range(count))
-        # Of 40 photographs all pairs; fewer verified matches come about by chance.
+        # All pairs of up to 40 photographs; fewer than 12 verified matches occur by chance.
         match_pairs(space, pairs[:800], settings, 12)
         return verified_pairs(space)
 
@@ -50,17 +50,17 @@ def overlap(names: Sequence[str], matches: Sequence[VerifiedPair]) -> Finding:
     links = np.array([pair.views for pair in matches], dtype=np.int64).reshape(-1, 2)
     usual = sorted(np.bincount(links.flatten(), minlength=count))[count // 2]
     graph = coo_array((np.ones(len(links)), tuple(links.T)), shape=(count, count))
-    group = connected_components(graph, directed=False)[1]
-    largest = np.bincount(group).argmax()
-    apart = [name for name, one in zip(names, group, strict=True) if one != largest]
+    groups = connected_components(graph, directed=False)[1]
+    largest = np.bincount(groups).argmax()
+    apart = [name for name, group in zip(names, groups, strict=True) if group != largest]
     found = f"each photograph matches {usual} others in the median"
     if not apart:
-        return Finding("overlap", "ok", f"{found}, all of them connected")
+        return Finding("overlap", "ok", f"{found}; all are connected")
     return Finding(
         "overlap",
         "warning",
-        f"{found}; {len(apart)} of {count} are not connected with the rest: {some(apart, 4)}",
-        "two neighbours each, and one connected group",
-        "Take photographs in between, 10 to 15 degrees apart. This is a quick look at small "
-        "copies: a run may still connect them.",
+        f"{found}; {len(apart)} of {count} are not connected to the rest: {some(apart, 4)}",
+        "two matching neighbours each, and one connected group",
+        "Take photographs in between, 10 to 15 degrees apart. This check uses small copies; a full "
+        "run may still connect them.",
     )

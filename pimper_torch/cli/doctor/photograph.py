@@ -1,4 +1,4 @@
-"""A photograph in a few numbers and a small copy."""
+"""Measurements of a photograph: blur, saturation, exposure, and a small copy."""
 
 import math
 from dataclasses import dataclass
@@ -15,22 +15,22 @@ from pimper_torch.ground.shapes import Map, Mask
 from pimper_torch.records import Record, Views
 from pimper_torch.runtime.parallel import side_by_side
 
-# Smoothing before the two gradients that are compared: enough for noise, little against the blur
-# that is to be found.
+# Smoothing before the two compared gradients, in pixels: enough against noise, and small compared
+# with the blur to detect.
 _FINE, _WIDE = 1.0, 2.0
 
 
 def edge_blur_px(grey: Map) -> float:
-    r"""Measure the standard deviation of the blur at the strongest edges.
+    r"""Return the standard deviation of the blur at the strongest edges, in pixels.
 
     An ideal edge under a Gaussian blur of variance :math:`s^2` has, after smoothing with variances
     :math:`a^2` and :math:`b^2`, gradients in the ratio
     :math:`R^2 = (s^2 + b^2) / (s^2 + a^2)`, so that :math:`s^2 = (b^2 - R^2 a^2) / (R^2 - 1)`.
-    Edges are taken by orientation and the most blurred orientation counts, as motion blurs edges
-    across it alone.
+    Edges are grouped by orientation and the most blurred orientation counts, because motion only
+    blurs edges across its direction.
 
     Returns:
-        NaN where there are no edges.
+        NaN if there are no edges.
 
     Source: Zhuo & Sim, Defocus map estimation from a single image, Pattern Recognition 44, 2011.
     """
@@ -42,16 +42,16 @@ def edge_blur_px(grey: Map) -> float:
     peaks &= strength > 6 * strength.median() + 1e-4  # else noise
     angle = torch.atan2(fine[1], fine[0]) % torch.pi
     bins = (angle * (4 / torch.pi) + 0.5).floor() % 4
-    found = [_blur(strength, torch.hypot(*wide), peaks & (bins == one)) for one in range(4)]
-    return max((one for one in found if one == one), default=float("nan"))
+    blurs = [_blur(strength, torch.hypot(*wide), peaks & (bins == index)) for index in range(4)]
+    return max((blur for blur in blurs if not math.isnan(blur)), default=float("nan"))
 
 
 def _blur(fine: Map, wide: Map, edges: Mask) -> float:
-    strength, other = fine[edges], wide[edges]
+    strength, smoothed = fine[edges], wide[edges]
     if len(strength) < 40:
         return float("nan")
     strongest = strength.topk(min(400, len(strength))).indices
-    ratio = (strength[strongest] / other[strongest]).square().clamp_min(1 + 1e-6)
+    ratio = (strength[strongest] / smoothed[strongest]).square().clamp_min(1 + 1e-6)
     # Central differences over two pixels are a box of variance 1 / 3.
     a, b = _FINE**2 + 1 / 3, _WIDE**2 + 1 / 3
     variance = ((b - ratio * a) / (ratio - 1)).clamp_min(0)
@@ -70,13 +70,13 @@ SMALL_PX = 640  # longer side of the small copy: features of 24 photographs take
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Photograph(Record):
-    """Measurements of one photograph without its neighbours.
+    """Measurements of one photograph.
 
     Attributes:
-        width: As a run would take it, in pixels.
-        bright: Radiance that a hundredth of the pixels exceed; 1 is saturation.
-        blur_px: Standard deviation of the blur at the strongest edges; NaN where there are none.
-        small: Mean of the colours in a small copy.
+        width: Width in pixels after ``--max-size-px``.
+        bright: Radiance that 1 % of the pixels exceed; 1 is saturation.
+        blur_px: Standard deviation of the blur at the strongest edges; NaN without edges.
+        small: Small copy, mean of the colour channels.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Photograph(Record):
 def summarize(
     name: str, radiance: Float[Tensor, "channel height width"], mask: Mask | None = None
 ) -> Photograph:
-    """Make the numbers and the small copy of linear radiance; saturation counts in the mask."""
+    """Return the measurements of linear radiance; saturation only counts inside the mask."""
     height, width = radiance.shape[-2:]
     shrink = min(1.0, SMALL_PX / max(height, width))
     sides = (max(1, round(side * shrink)) for side in (width, height))
@@ -111,13 +111,13 @@ def summarize(
 
 
 def of_views(views: Views) -> list[Photograph]:
-    """Summarize photographs that were read for a run."""
+    """Return the measurements of loaded photographs."""
 
-    def one(index: int) -> Photograph:
+    def measure(index: int) -> Photograph:
         width, height = views.sizes_px[index].tolist()
         image = views.images[index, :, :height, :width].detach().cpu().float()
         mask = None if views.masks is None else views.masks[index, :height, :width].cpu()
         return summarize(views.names[index], image, mask)
 
     with torch.no_grad():
-        return list(side_by_side(one, range(views.num_views), tracked=False))
+        return list(side_by_side(measure, range(views.num_views), tracked=False))

@@ -1,4 +1,4 @@
-"""A hash of what values hold, bit for bit: records, tensors, settings, stages and functions."""
+"""Hashes of the exact bits of values: records, tensors, settings, stages and functions."""
 
 import dataclasses
 import hashlib
@@ -19,8 +19,7 @@ from pimper_torch.runtime.mapped import LARGE, drop_pages
 
 _PACKAGE = Path(__file__).parents[2]
 
-
-# Packages that stages compute with.
+# Packages whose versions can change the results of stages.
 _COMPUTE = (
     *("torch", "numpy", "scipy", "numba", "pycolmap", "kornia", "opencv-python-headless"),
     *("scikit-image", "trimesh", "embreex", "fcpw", "cholespy"),
@@ -29,10 +28,10 @@ _COMPUTE = (
 
 @cache
 def code() -> str:
-    """Hash all source files of the package, and the versions of what it computes with."""
+    """Return a hash of all source files of the package and of the versions it computes with."""
     hashed = hashlib.blake2b(digest_size=16)
     for name in _COMPUTE:
-        with suppress(PackageNotFoundError):  # as where another program installed it
+        with suppress(PackageNotFoundError):  # optional, or installed without metadata
             hashed.update(f"{name} {version(name)} ".encode())
     for path in sorted(_PACKAGE.rglob("*.py")):
         hashed.update(path.relative_to(_PACKAGE).as_posix().encode() + path.read_bytes())
@@ -44,25 +43,25 @@ def is_known(module: str) -> bool:
     return module.startswith((f"{_PACKAGE.name}.", "torch.nn."))
 
 
-# Of tensors that were hashed, while they live: their version when they were, and the hash. Stages
-# hand on the same tensors, and writing into a tensor counts up its version.
+# Version and hash of live tensors that were hashed. Stages pass on the same tensors, and writing
+# into a tensor increments its version.
 _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def digest(*values: object) -> str | None:
-    """Hash values, so that equal hashes mean equal bits.
+    """Return a hash of values, so that equal hashes mean equal bits.
 
-    A module is what it is made with: its class, attributes and submodules. The code of modules and
-    functions counts, see :func:`~pimper_torch.runtime.store.digest.code`. A tensor's device counts,
-    its memory layout doesn't, nor do fields that are not compared, as where files lie.
+    A module is hashed by its class, attributes and submodules. The code of modules and functions
+    counts, see :func:`~pimper_torch.runtime.store.digest.code`. A tensor's device counts; its
+    memory layout does not, nor do fields excluded from comparison, such as paths of files.
 
     Args:
         values: Records and other dataclasses, tensors, modules, functions, tuples, lists, mappings,
             enums, paths, numbers, texts, bytes or ``None``.
 
     Returns:
-        Hexadecimal; ``None`` where something cannot be hashed, as code of other packages, or
-        gradients are asked for.
+        Hexadecimal; ``None`` if a value cannot be hashed, such as code of other packages, or
+        requires gradients.
     """
     try:
         text = json.dumps([_described(value) for value in values])
@@ -76,7 +75,7 @@ class _UnknownError(Exception):
 
 
 def _described(value: object) -> object:
-    """Turn a value into what JSON holds, one to one."""
+    """Return a value as JSON types, so that different values stay different."""
     if value is None or isinstance(value, bool | int | str):
         return value
     kind = _named(type(value))
@@ -89,12 +88,13 @@ def _described(value: object) -> object:
             raise _UnknownError
         if isinstance(value, types.FunctionType):
             return [kind, code(), _named(value)]
-        own = {
-            name: held
-            for name, held in vars(value).items()
+        public = {
+            name: attribute
+            for name, attribute in vars(value).items()
             if not name.startswith("_") and name != "training"
         }
-        return [kind, code(), _described(own | value._parameters | value._buffers | value._modules)]
+        members = public | value._parameters | value._buffers | value._modules
+        return [kind, code(), _described(members)]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [field.name for field in dataclasses.fields(value) if field.compare]
         return [kind, *((name, _described(getattr(value, name))) for name in fields)]
@@ -105,29 +105,29 @@ def _described(value: object) -> object:
     raise _UnknownError
 
 
-def _named(thing: type | types.FunctionType) -> str:
-    """Name a class or function; those made inside a function may differ under one name."""
-    if "<" in thing.__qualname__:
+def _named(kind: type | types.FunctionType) -> str:
+    """Return the full name of a class or function; refuse local ones, as names may repeat."""
+    if "<" in kind.__qualname__:
         raise _UnknownError
-    return f"{thing.__module__}.{thing.__qualname__}"
+    return f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _tensor(tensor: Tensor) -> str:
     if tensor.requires_grad or tensor.layout != torch.strided or tensor.is_meta:
         raise _UnknownError
-    # An inference tensor has no version; it cannot be written into outside inference mode.
+    # An inference tensor has no version; it cannot be written to outside inference mode.
     version = -1 if tensor.is_inference() else tensor._version
-    known: tuple[int, str] | None = _known.get(tensor)  # type: ignore[no-untyped-call]
-    if known is not None and known[0] == version:
-        return known[1]
+    cached: tuple[int, str] | None = _known.get(tensor)  # type: ignore[no-untyped-call]
+    if cached is not None and cached[0] == version:
+        return cached[1]
     about = f"{tensor.dtype} {tuple(tensor.shape)} {tensor.device.type}"
     hashed = hashlib.blake2b(about.encode(), digest_size=16)
     flat = tensor.detach().cpu().resolve_conj().resolve_neg().reshape(-1)
-    if flat.stride() != (1,):  # one entry may have any stride
+    if flat.stride() != (1,):  # a tensor of one element may have any stride
         flat = flat.clone(memory_format=torch.contiguous_format)
-    for part in torch.split(flat.view(torch.uint8), LARGE):
-        hashed.update(part.numpy().data)
+    for chunk in torch.split(flat.view(torch.uint8), LARGE):
+        hashed.update(chunk.numpy().data)
         drop_pages()
-    found = hashed.hexdigest()
-    _known[tensor] = (version, found)
-    return found
+    result = hashed.hexdigest()
+    _known[tensor] = (version, result)
+    return result

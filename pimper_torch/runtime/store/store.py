@@ -1,4 +1,4 @@
-"""A folder of records that runs find again."""
+"""A folder of records that later runs reuse."""
 
 import json
 import math
@@ -29,16 +29,15 @@ _Events = tuple[str | Failure | LeftOut | StageReport, ...]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Store:
-    """A folder with a file a record, named by a key, in which is a hash of the record's bits.
+    """A folder with one file per record, named by a key.
 
-    A record is believed when its hash is right: what was damaged is as if it were not there, so
-    that runs can share the folder. Where it grows too large, the records are deleted that were used
-    longest ago.
+    Each file contains a hash of the record's bits. Files with a wrong hash are ignored, so runs can
+    share the folder. If the folder grows too large, the least recently used records are deleted.
 
     Attributes:
-        folder: Made when the first record is kept.
-        max_bytes: Of all files together.
-        fresh: Find nothing of what is there; what is kept takes its place.
+        folder: Created with the first record.
+        max_bytes: Maximum size of all files together.
+        fresh: Ignore existing records; new ones replace them.
     """
 
     folder: Path | str
@@ -46,7 +45,7 @@ class Store:
     fresh: bool = False
 
     def find(self, key: str, cls: type[AnyRecord]) -> tuple[AnyRecord, dict[str, Any]] | None:
-        """Read a record; ``None`` where there is none, or a damaged one."""
+        """Return a record and its ``about``; ``None`` if it is missing or damaged."""
         path = self._path(key)
         if self.fresh or not path.exists():
             return None
@@ -57,19 +56,19 @@ class Store:
                 return None
         except InputError:
             return None
-        with suppress(OSError):  # a folder that may only be read
+        with suppress(OSError):  # a read-only folder
             os.utime(path)
         return realigned(record), json.loads(about)
 
     def keep(self, key: str, record: Record, about: Mapping[str, object] | None = None) -> bool:
-        """Write a record in place of one of the same key.
+        """Write a record; it replaces a record with the same key.
 
         Args:
-            record: Of any class that :func:`~pimper_torch.records.stored.save_record` takes.
-            about: What else is to be known of it: what JSON holds, and records without tensors.
+            record: Of any class that :func:`~pimper_torch.records.stored.save_record` supports.
+            about: Further information: JSON types, and records without tensors.
 
         Returns:
-            Whether it is kept: it is not where it alone is larger than the folder may be.
+            Whether it is kept; not if it cannot be hashed or stored, or exceeds ``max_bytes``.
         """
         text = as_json(about or {})
         hashed = digest(record, text)
@@ -77,75 +76,75 @@ class Store:
             return False
         try:
             save_record(record, self._path(key), {"digest": hashed, "about": text})
-        except InputError:  # a record that no file can hold
+        except InputError:  # a record that files cannot represent
             return False
         except OutputError as error:
             raise OutputError(
-                f"{self.folder}: what was found cannot be kept there ({error}). Free space, or "
-                "give a folder that may be written."
+                f"{self.folder}: records cannot be kept there ({error}). Free space, or choose a "
+                "writable folder."
             ) from error
-        with suppress(OSError):  # another run deletes, too
+        with suppress(OSError):  # another run may delete the same files
             self._bound()
         return self._path(key).exists()
 
     def _bound(self) -> None:
-        """Delete what was used longest ago until the rest is small enough."""
+        """Delete the least recently used records until the others are small enough."""
         for path in Path(self.folder).glob(".*.new-*"):
-            if time.time() - path.stat().st_mtime > 86_400:  # a day: its run is no more
+            if time.time() - path.stat().st_mtime > 86_400:  # a day old: its run has ended
                 path.unlink()
-        about = {path: path.stat() for path in Path(self.folder).glob("*.safetensors")}
-        total = sum(each.st_size for each in about.values())
-        for path in sorted(about, key=lambda path: about[path].st_mtime_ns):
+        stats = {path: path.stat() for path in Path(self.folder).glob("*.safetensors")}
+        total = sum(stat.st_size for stat in stats.values())
+        for path in sorted(stats, key=lambda path: stats[path].st_mtime_ns):
             if total > self.max_bytes:
                 path.unlink(missing_ok=True)
-                total -= about[path].st_size
+                total -= stats[path].st_size
 
     def _path(self, key: str) -> Path:
         return Path(self.folder) / f"{key}.safetensors"
 
 
 def opened(cache: Store | Path | str | None) -> Store | None:
-    """Take a folder for a store; ``None`` keeps nothing."""
+    """Return a folder as a store; ``None`` keeps nothing."""
     return cache if cache is None or isinstance(cache, Store) else Store(folder=cache)
 
 
 def realigned(record: AnyRecord) -> AnyRecord:
-    """Copy tensors that are not contiguous at an address of torch's; others stay as they are.
+    """Return the record with contiguous tensors at aligned addresses; other tensors are copied.
 
-    Stages compute the same bits from two records of equal values once both are settled: products
-    of matrices round otherwise at other strides or addresses. Fields that share a tensor share one
-    still. Differentiable.
+    Stages then compute the same bits from records of equal values: matrix products round
+    differently at other strides or addresses. Fields that share a tensor still share it.
+    Differentiable.
     """
     copies: dict[int, Tensor] = {}
 
-    def one(value: object) -> object:
+    def align(value: object) -> object:
         if not isinstance(value, Tensor) or value.layout != torch.strided:
             return value
         if value.is_contiguous() and value.data_ptr() % 64 == 0:
             return value
         return copies.setdefault(id(value), copied(value))
 
-    return pytree.tree_map(one, record)
+    return pytree.tree_map(align, record)
 
 
 def kept(
     store: Store | None, key: str | None, cls: type[AnyRecord], make: Callable[[], AnyRecord]
 ) -> tuple[AnyRecord, float]:
-    """Return a record that an earlier run kept, or make it and keep it.
+    """Return a record kept by an earlier run, or compute and keep it.
 
-    What the earlier run reported, skipped and warned of is told again. Where a record cannot be
-    kept, a warning says so.
+    Reports, failures and warnings of the earlier run are repeated. A record that cannot be written
+    gives a warning.
 
     Args:
-        key: A hash of all that the record depends on; ``None`` where that is not known.
+        key: A hash of everything that the record depends on; ``None`` if that is unknown.
 
     Returns:
-        The record, and the seconds of wall clock in which it was made.
+        The record, and the seconds of wall clock in which it was computed.
     """
     with aside(KEEP):
-        found = store.find(key, cls) if store and key else None
-    if found is not None:
-        record, about = found
+        stored = store.find(key, cls) if store and key else None
+    if stored is not None:
+        record, about = stored
         for event in of_json(about["events"], _Events, "events", {}):
             _replay(event)
         return record, about["seconds"]
