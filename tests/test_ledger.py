@@ -94,7 +94,7 @@ def test_the_closing_line_names_photographs_and_removals_above_five_percent():
         entry("extract.borders", 8, 100),
     ]
     assert closing_line(left_out) == (
-        "Left out: IMG_1, IMG_2 (sfm.missing); 6% of the facets (remesh.data); "
+        "Excluded: IMG_1, IMG_2 (sfm.missing); 6% of the facets (remesh.data); "
         "8% of the faces (extract.borders)."
     )
     assert closing_line([entry("warp", 90, 100), entry("sfm.missing", 0, 8)]) == ""

@@ -1,4 +1,4 @@
-"""``pimper clean``: the room that interrupted runs take."""
+"""``pimper clean``: free the disk space of interrupted runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from pimper_torch.doors.result_folder.folders import clean_output, require_clean
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Remove what a run into OUT kept to go on from, and what killed runs left there.
+    """Delete the records that runs kept in OUT to continue later, and files of killed runs.
 
     The result itself stays.
 
     Attributes:
-        out: Folder that was given to a run as `-o OUT`.
+        out: Folder of a run, given to it as `-o OUT`.
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
 
 
 def run(job: _Job, output: Output) -> None:
-    """Carry out ``clean``, and tell how much was freed."""
+    """Run ``clean``, and report the freed space."""
     freed = clean_output(job.out)
     outcome = f"{freed / 1e6:.1f} MB freed" if freed else "nothing to remove"
     output.remark(f"{job.out}: {outcome}.")
@@ -34,7 +34,7 @@ def run(job: _Job, output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a folder that is not ours."""
+    """Return the arguments, and refuse folders that no run wrote."""
     job = read_arguments(_Job, command, arguments)
     require_cleanable(job.out)
     return job

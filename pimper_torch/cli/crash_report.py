@@ -1,4 +1,4 @@
-"""Sentences and reports about a process that was killed or came upon what nobody expected."""
+"""Messages and report files for killed processes and unexpected errors."""
 
 import shlex
 import signal
@@ -12,26 +12,26 @@ from pimper_torch.doors.io.version import versions
 
 
 def what_killed(ended: int) -> str:
-    """Report how a process ended that said nothing.
+    """Return a sentence about a process that ended without a message.
 
     Args:
-        ended: Its exit code; less than 0, of which signal it died.
+        ended: Its exit code; or the negative number of the signal that killed it.
     """
     if ended == -signal.SIGKILL:
         return (
             "the run was killed by the system or by somebody (SIGKILL), most likely because memory "
             "ran out."
         )
-    known = -ended in {*signal.Signals}
-    name = signal.Signals(-ended).name if known else f"exit code {ended}"
+    is_signal = -ended in {*signal.Signals}
+    name = signal.Signals(-ended).name if is_signal else f"exit code {ended}"
     return f"the run crashed ({name}), most likely because memory ran out in a native library."
 
 
 def write_report(error: BaseException) -> Path | None:
-    """Write the traceback of an error to a file that can be sent, with versions and arguments.
+    """Write the traceback of an error to a file for bug reports, with versions and arguments.
 
     Returns:
-        The file; ``None`` where the disk refuses.
+        The file; ``None`` if it cannot be written.
     """
     lines = [f"{name} {version}" for name, version in versions().items()]
     lines += [f"at {datetime.now(UTC).isoformat(' ', 'seconds')}", shlex.join(sys.argv), ""]

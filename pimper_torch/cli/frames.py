@@ -1,4 +1,4 @@
-"""``pimper frames``: photographs out of a video."""
+"""``pimper frames``: extract photographs from a video."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from pimper_torch.runtime.progress import report
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Choose photographs out of a video: sharp frames, equally far apart on the way.
+    """Extract photographs from a video: sharp frames, evenly spaced along the camera's path.
 
     Attributes:
         video: MP4, MOV, MKV, WebM or AVI; needs pip install "pimper_torch[video]".
-        out: Folder for the photographs, PNG; new or empty.
-        count: Of photographs.
-        overwrite: Replace photographs that came from a video before.
+        out: Folder for the photographs (PNG); new or empty.
+        count: Number of photographs.
+        overwrite: Replace photographs of an earlier `pimper frames` in OUT.
     """
 
     video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
@@ -36,7 +36,7 @@ class _Job:
 
 
 def run(job: _Job, output: Output) -> None:
-    """Carry out ``frames``."""
+    """Run ``frames``."""
     from PIL import Image
 
     from pimper_torch.cli.video.choose import chosen, scanned
@@ -44,22 +44,22 @@ def run(job: _Job, output: Output) -> None:
     from pimper_torch.runtime.reporting import stage
 
     with output.observer():
-        with stage("scan") as told:
+        with stage("scan") as figures:
             scan = scanned(luma_frames(job.video))
-            told["frames"] = len(scan.way)
+            figures["frames"] = len(scan.way)
         frames = chosen(scan, job.count)
         written = written_whole(job.out, "frames", overwrite=job.overwrite)
-        with stage("write") as told, written as folder:
+        with stage("write") as figures, written as folder:
             pictures = frame_pictures(job.video, frames.tolist())
             for done, (number, picture) in enumerate(pictures, start=1):
                 Image.fromarray(picture).save(folder / f"{number:06d}.png")
                 report(done, len(frames))
-            told["photographs"] = len(frames)
+            figures["photographs"] = len(frames)
     if len(frames) < job.count:
         caution(
-            f"{job.video}: has {len(frames)} frames that differ, of {job.count} that were asked "
-            "for; the others show what these do. Move the camera farther, or more slowly where "
-            "the pictures jump.",
+            f"{job.video}: has {len(frames)} different frames instead of {job.count}; the others "
+            "are nearly copies of these. Move the camera farther, or more slowly if the picture "
+            "jumps.",
             stacklevel=2,
         )
     output.remark(
@@ -70,7 +70,7 @@ def run(job: _Job, output: Output) -> None:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a folder that is taken."""
+    """Return the arguments, and refuse an occupied folder."""
     job = read_arguments(_Job, command, arguments)
     require_apart(job.out, {"VIDEO": job.video})
     prepare_output(job.out, "frames", job.overwrite)

@@ -1,4 +1,4 @@
-"""``pimper markers``: a sheet to print, which tells the size of what is photographed with it."""
+"""``pimper markers``: write a sheet of markers, photographed with an object for its real size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ from pimper_torch.runtime.config import require
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Write a sheet of markers as PDF, to be printed and photographed with an object.
+    """Write a PDF with markers, to print and to photograph together with an object.
 
-    Results are then in millimetres. The larger the markers, the farther they are recognised.
+    Results are then in millimetres. Larger markers are recognised from farther away.
 
     Attributes:
-        out: The file, such as sheet.pdf.
-        paper: Size of the sheet.
-        side_mm: Of the markers' black squares, 10 to 36 millimetres.
-        overwrite: Replace a former sheet.
+        out: PDF file, such as sheet.pdf.
+        paper: Paper size.
+        side_mm: Side of the markers' black squares in millimetres, 10 to 36.
+        overwrite: Replace an earlier sheet.
     """
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="SHEET")]
@@ -34,20 +34,20 @@ class _Job:
 
 
 def run(job: _Job, output: Output) -> None:
-    """Carry out ``markers``."""
+    """Run ``markers``."""
     from pimper_torch.result.viz.marker_sheet import write_sheet
 
     with file_written_whole(job.out) as fresh:
         write_sheet(fresh, job.side_mm, job.paper)
     output.remark(
         f"{job.out}: print it at 100 %, check its ruler, and photograph it with the object. "
-        "`pimper reconstruct` finds the markers by itself."
+        "`pimper reconstruct` detects the markers automatically."
     )
     output.result({"sheet": job.out}, side_mm=job.side_mm)
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a file that is not ours."""
+    """Return the arguments, and refuse to replace other files than sheets."""
     job = read_arguments(_Job, command, arguments)
     require(job.out.suffix.lower() == ".pdf", "SHEET", job.out.name, "a name ending in .pdf")
     layout(job.side_mm, job.paper)

@@ -1,4 +1,4 @@
-"""One run, from photographs to a folder of results."""
+"""``reconstruct`` and ``demo``: a run from photographs to a folder of results."""
 
 import json
 import time
@@ -43,7 +43,7 @@ from pimper_torch.runtime.store import Store
 
 
 def carry_out(job: Job, output: Output) -> None:
-    """Reconstruct, and write and show what the arguments ask for."""
+    """Reconstruct, write the result, and show it if the arguments require that."""
     if job.common.device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             f"--device is cuda, but torch {torch.__version__} finds no CUDA device. Run on the CPU "
@@ -52,17 +52,17 @@ def carry_out(job: Job, output: Output) -> None:
     with Viewer() if job.common.view else nullcontext() as viewer:
         if viewer is not None:
             print_address(viewer, output)
-        _carry_out(job, output, viewer)
+        _reconstruct(job, output, viewer)
 
 
-def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
+def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
     common = job.common
     imports = reported("import", time.perf_counter() - output.began)
-    held, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
-    with held, output.observer(forecast) as observer:
-        with stage("read") as told:
+    lock, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
+    with lock, output.observer(forecast) as observer:
+        with stage("read") as figures:
             views = _read(job)
-            told["photographs"] = views.num_views
+            figures["photographs"] = views.num_views
             _examine(job, views)
             bars = bars_in_files(job, views)
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
@@ -77,10 +77,10 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
         if viewer is not None:
             viewer.add_pass(RESULT, result.mesh)
         result = result.replace(report=(imports, *accounted()))
-        with stage("scale") as told:
+        with stage("scale") as figures:
             result, scale = sized(job, bars, result)
             if scale is not None:
-                told["scale"] = scale.factor
+                figures["scale"] = scale.factor
         result = chain.finish(result, job.common.files)
         with stage("write"):
             _write(job, result, scale)
@@ -95,7 +95,7 @@ def _carry_out(job: Job, output: Output, viewer: Viewer | None) -> None:
 
 
 def _plan(job: Job, views: Views) -> list[tuple[str, float]]:
-    """List the stages to come with their seconds; of the published chain they are not known."""
+    """Return the planned stages with their seconds; empty for the published chain."""
     config, inputs = job.config, job.inputs
     if not isinstance(config, CoarseToFineConfig):
         return []
@@ -108,7 +108,7 @@ def _plan(job: Job, views: Views) -> list[tuple[str, float]]:
 def _preview(
     output: Output, path: Path, viewer: Viewer | None, scene: SparseScene, coarse: CoarseMesh
 ) -> None:
-    """Draw the coarse surface and say where; a disk that refuses ends no run."""
+    """Draw the coarse surface and print its path; errors of the disk are ignored."""
     if viewer is not None:
         viewer.add_pass(COARSE, coarse.mesh)
     with suppress(OSError):
@@ -140,18 +140,18 @@ def _read(job: Job) -> Views:
 
 
 def _examine(job: Job, views: Views) -> None:
-    """Warn of what `pimper doctor` finds without comparing what photographs show."""
+    """Give the warnings of `pimper doctor`, except those on overlap."""
     config = job.config
-    # The estimate is that of `default`.
-    dear = isinstance(config, CoarseToFineConfig) and config.scales[-1] >= 1
+    # Time and memory are estimated for `default`.
+    estimated = isinstance(config, CoarseToFineConfig) and config.scales[-1] >= 1
     for finding in examine_views(views):
-        if finding.severity == "warning" and (dear or finding.check != "cost"):
+        if finding.severity == "warning" and (estimated or finding.check != "cost"):
             caution(f"{job.photos}: {finding}", stacklevel=2)
 
 
 def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
-    given = ("masks", "sparse", "mesh", "silhouettes", "normals", "depth")
-    paths: dict[str, Path | None] = {name: getattr(job.inputs, name) for name in given}
+    names = ("masks", "sparse", "mesh", "silhouettes", "normals", "depth")
+    paths: dict[str, Path | None] = {name: getattr(job.inputs, name) for name in names}
     about: dict[str, object] = {
         "photographs": str(job.photos.absolute()),
         **{name: path and str(path) for name, path in paths.items()},
@@ -176,28 +176,28 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
 
 
 def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
-    fewer = " (simplified; --faces all writes every one)" if job.common.faces is None else ""
-    costs = [
-        f"{one.name:<16}{'kept' if one.kept else f'{one.seconds:.1f}':>9}{one.peak_memory_mb:10.0f}"
-        for one in result.report
-    ]
-    rows = ["stage             seconds   peak MB", *costs, headline(result)]
+    fewer = " (simplified; --faces all writes all faces)" if job.common.faces is None else ""
+    rows = ["stage             seconds   peak MB"]
+    for line in result.report:
+        seconds = "kept" if line.kept else f"{line.seconds:.1f}"
+        rows.append(f"{line.name:<16}{seconds:>9}{line.peak_memory_mb:10.0f}")
+    rows.append(headline(result))
     output.remark("\n".join(rows))
     if result.scene.diagnosis:
         output.warning(result.scene.diagnosis)
     if left_out := closing_line(result.left_out):
         output.remark(left_out)
-    shown = job.out / ("overview.png" if job.common.no_report else "report.html")
-    output.remark(f"{job.out}/mesh.ply is the surface{fewer}, {shown} shows it.")
+    page = job.out / ("overview.png" if job.common.no_report else "report.html")
+    output.remark(f"{job.out}/mesh.ply is the surface{fewer}; {page} shows it.")
     paths = {name: job.out / name for name in RESULT_NAMES if (job.out / name).exists()}
     figures = json.loads((job.out / "summary.json").read_text(encoding="utf-8"))
     output.result({"folder": job.out, **paths}, figures=figures)
 
 
 def in_files(job: Job, views: Views, mark: given.Mark) -> given.Mark:
-    """Return a place with the sizes of the files, whose pixels it is in.
+    """Return a mark with the upright image sizes of the files that its pixels refer to.
 
-    People click in files, which viewers turn as EXIF says; ``--max-size-px`` shrinks them later.
+    People click in files, which viewers rotate by EXIF; ``--max-size-px`` scales them afterwards.
     """
     paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
@@ -210,7 +210,7 @@ def in_files(job: Job, views: Views, mark: given.Mark) -> given.Mark:
 
 
 def bars_in_files(job: Job, views: Views) -> tuple[given.ScaleBar, ...]:
-    """Return scale bars as :func:`in_files`."""
+    """Return the scale bars with marks as from :func:`in_files`."""
     return tuple(
         replace(bar, first=in_files(job, views, bar.first), second=in_files(job, views, bar.second))
         for bar in job.inputs.bars
@@ -220,7 +220,7 @@ def bars_in_files(job: Job, views: Views) -> tuple[given.ScaleBar, ...]:
 def sized(
     job: Job, bars: tuple[given.ScaleBar, ...], result: Reconstruction
 ) -> tuple[Reconstruction, Scale | None]:
-    """Scale a result to its real size, if that is known."""
+    """Return the result in real size and the scale; both unchanged, ``None``, if unknown."""
     inputs = job.inputs
     scale = find_scale(
         result,
@@ -234,7 +234,7 @@ def sized(
 
 
 def scale_message(scale: Scale) -> str:
-    """State in a sentence what the size was taken from."""
+    """Return a sentence with the unit and the source of the size."""
     if scale.count == 1:
         return f"Lengths are in {scale.unit}, by one {scale.source.removesuffix('s')}."
     return (

@@ -1,4 +1,4 @@
-"""Signals that stop a command, as errors that unwind it."""
+"""Signals that stop a command, raised as exceptions."""
 
 import os
 import signal
@@ -16,10 +16,10 @@ SIGNALS = tuple(
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal to stop the process.
+    """Exception for a signal that stops the process.
 
     Attributes:
-        left: What is there now, for the message.
+        left: Sentence about the results that exist, for the message.
     """
 
     def __init__(self, number: int, left: str = "no result was written.") -> None:
@@ -28,7 +28,7 @@ class Stopped(KeyboardInterrupt):
 
 
 def exit_code(error: BaseException) -> int:
-    """Return the exit code of an interrupted command, as shells have it: 128 and the signal.
+    """Return the exit code of an interrupted command, as in shells: 128 plus the signal's number.
 
     >>> exit_code(Stopped(signal.SIGTERM)), exit_code(KeyboardInterrupt())
     (143, 130)
@@ -38,25 +38,25 @@ def exit_code(error: BaseException) -> int:
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Raise :class:`Stopped` in the block at a signal to stop; one that is ignored stays so.
+    """Raise :class:`Stopped` in the block on signals to stop; ignored signals stay ignored.
 
-    One that is raised where Python can only ignore it, as in a destructor, is raised again.
+    An exception raised where Python must ignore it, such as in a destructor, is raised again.
     """
     latest = 0.0
 
     def stop(number: int, frame: types.FrameType | None) -> None:
         nonlocal latest
         before, latest = latest, time.monotonic()
-        if latest - before > 1.0:  # one press of Ctrl-C comes from the terminal and the watcher
+        if latest - before > 1.0:  # the terminal and the watcher both send one press of Ctrl-C
             raise Stopped(number)
 
-    def lost(about: Any) -> None:  # noqa: ANN401 - `sys.UnraisableHookArgs` is none at run time
+    def resend(args: Any) -> None:  # noqa: ANN401 - `sys.UnraisableHookArgs` is for type stubs only
         nonlocal latest
-        if not isinstance(about.exc_value, Stopped):
-            usual(about)
+        if not isinstance(args.exc_value, Stopped):
+            usual(args)
             return
         latest = 0.0
-        again = threading.Timer(0.05, os.kill, (os.getpid(), about.exc_value.number))
+        again = threading.Timer(0.05, os.kill, (os.getpid(), args.exc_value.number))
         again.daemon = True
         again.start()
 
@@ -64,14 +64,14 @@ def stoppable() -> Iterator[None]:
         former = {
             number: signal.signal(number, stop)
             for number in SIGNALS
-            if signal.getsignal(number) is not signal.SIG_IGN  # as by nohup
+            if signal.getsignal(number) is not signal.SIG_IGN  # for example by nohup
         }
-    except ValueError:  # not in the main thread, where no signals arrive
+    except ValueError:  # other threads than the main one receive no signals
         yield
         return
-    usual, sys.unraisablehook = sys.unraisablehook, lost
+    usual, sys.unraisablehook = sys.unraisablehook, resend
     try:
-        if hasattr(signal, "pthread_sigmask"):  # those that came meanwhile are raised now
+        if hasattr(signal, "pthread_sigmask"):  # pending signals are raised now
             signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         yield
     finally:

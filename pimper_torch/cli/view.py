@@ -1,4 +1,4 @@
-"""``pimper view``: a result in a browser."""
+"""``pimper view``: show a result in a browser."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Turn and light a result in a browser, until Ctrl-C.
+    """Show a result in a browser, to turn and light it, until Ctrl-C.
 
     Attributes:
-        out: Folder that `pimper reconstruct` wrote, or a mesh file; needs pip install
+        out: Folder written by `pimper reconstruct`, or a mesh file; needs pip install
             "pimper_torch[view]".
         photos: Folder of its photographs, if they were moved.
-        port: Of the page; where it is taken, the next free one.
-        host: Address of this machine; with others than this one, other machines reach the page.
+        port: Port of the page; if it is in use, the next free one.
+        host: Address of this machine for the page; by default, other machines have no access.
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
@@ -36,11 +36,11 @@ class _Job:
 
 
 def run(job: _Job, output: Output) -> None:
-    """Carry out ``view``."""
+    """Run ``view``."""
     from pimper_torch.result.viewer.show import add_folder
     from pimper_torch.result.viewer.viewer import Viewer
 
-    # Ctrl-C ends the page and no work.
+    # Ctrl-C is the regular end.
     with Viewer(job.host, job.port) as viewer, suppress(KeyboardInterrupt):
         print_address(viewer, output, job.port)
         add_folder(viewer, job.out, job.photos)
@@ -50,12 +50,12 @@ def run(job: _Job, output: Output) -> None:
 def print_address(viewer: "Viewer", output: Output, port: int = PORT) -> None:
     """Print the address of the page."""
     output.event("view", address=viewer.address)
-    taken = f" (port {port} is taken)" if port not in (0, viewer.server.get_port()) else ""
-    output.emit(f"The viewer is at {viewer.address}{taken}; Ctrl-C ends it.")
+    in_use = f" (port {port} is in use)" if port not in (0, viewer.server.get_port()) else ""
+    output.emit(f"The viewer is at {viewer.address}{in_use}; Ctrl-C ends it.")
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Read the arguments, and refuse a result that is not there."""
+    """Return the arguments, and refuse a missing result."""
     job = read_arguments(_Job, command, arguments)
     require_viser()
     if not job.out.exists():

@@ -151,7 +151,7 @@ def closing_line(left_out: Sequence[LeftOut]) -> str:
 
     >>> cut = LeftOut(guard="extract.borders", what="faces", count=6, total=60, reason="narrow")
     >>> closing_line([cut])
-    'Left out: 10% of the faces (extract.borders).'
+    'Excluded: 10% of the faces (extract.borders).'
     """
     last = {entry.guard: entry for entry in left_out if entry.what not in _SILENT}
     parts = [
@@ -160,4 +160,4 @@ def closing_line(left_out: Sequence[LeftOut]) -> str:
         for entry in last.values()
         if entry.names or entry.count > _NEGLIGIBLE * entry.total
     ]
-    return f"Left out: {'; '.join(parts)}." if parts else ""
+    return f"Excluded: {'; '.join(parts)}." if parts else ""

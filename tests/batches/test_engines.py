@@ -123,8 +123,8 @@ def test_jobs_request_the_resources_of_a_task_and_are_cancelled_with_the_batch(w
     [
         (["--dask", "tcp://127.0.0.1:1"], "is tcp://127.0.0.1:1, where no scheduler answers"),
         (["--slurm", "gpu"], "there is no `sbatch` here"),
-        (["--dask", "tcp://127.0.0.1:1", "--slurm", "gpu"], "needed: none beside --dask"),
-        (["--jobs", "0"], "needed: 1 at least"),
+        (["--dask", "tcp://127.0.0.1:1", "--slurm", "gpu"], "needed: no value together with --d"),
+        (["--jobs", "0"], "needed: at least 1"),
     ],
 )
 def test_an_unreachable_engine_is_reported(world, given, said, capsys, monkeypatch):

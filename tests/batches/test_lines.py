@@ -25,7 +25,8 @@ def test_each_object_has_a_line_and_failures_set_the_exit_code(world, capsys, fa
     if failing:
         assert cup.endswith("it is so.")
         assert totals.startswith("1 ended, 1 failed; ")
-        assert "1 of 2 objects have no result, as cup: it is so." in " ".join(printed.err.split())
+        text = " ".join(told.err.split())
+        assert "1 of 2 objects have no result, for example cup: it is so." in text
 
 
 def test_events_have_the_outcome_of_each_object(world, capsys):

@@ -190,7 +190,7 @@ def test_objects_lost_by_an_engine_are_reported_and_the_command_resumes(world, e
     world.add("ball")
     lost = world.batch(executor=Inline(error))["ball"]
     assert lost.status == "lost"
-    assert f"its worker was lost, or cannot carry it out ({type(error).__name__}" in lost.message
+    assert f"its worker was lost, or cannot run it ({type(error).__name__}" in lost.message
     assert world.statuses() == {"ball": "ended"}
 
 

@@ -80,7 +80,7 @@ def test_rows_of_a_table_have_settings(scans, tmp_path):
         ("name,faces\nx,2\n", "columns are name, faces; needed: `photos`"),
         ("photos,photos\nscans/cup,scans/cup\n", "each once"),
         ("", "its columns are none"),
-        ("photos,view\nscans/cup,yes\n", "has the column view, which is the batch's own"),
+        ("photos,view\nscans/cup,yes\n", "has the column view, which only `pimper batch`"),
         ("photos,faces\nscans/cup,5,6\n", "row 2: has more cells than there are columns (2)"),
         ("photos,faces\n,5\n", "row 2: `photos` is empty"),
         ("photos,name\nscans/cup,../cup\n", "row 2: the name is '../cup'"),

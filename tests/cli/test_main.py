@@ -70,7 +70,7 @@ def test_a_run_ends_with_the_removals_of_guards(
     reduced = reconstruction.replace(left_out=(gone,))
     chain.__call__ = lambda *_: reduced
     assert reconstruct() == 0
-    assert "Left out: 3.png (sfm.missing)." in capsys.readouterr().out
+    assert "Excluded: 3.png (sfm.missing)." in capsys.readouterr().out
     (written,) = json.loads((tmp_path / "out" / "summary.json").read_text())["left_out"]
     assert LeftOut(**{**written, "names": tuple(written["names"])}) == gone
 

@@ -138,7 +138,7 @@ def test_a_run_that_ignores_a_signal_is_killed_within_five_seconds(tmp_path, mon
     returned, _, err = ran.end()
     assert 4 < time.monotonic() - began < 5.5  # half a second of tolerance for a busy machine
     assert returned == 143
-    assert err.startswith("error: killed, as it did not end by itself. No result was written")
+    assert err.startswith("error: killed, as it did not stop in time. No result was written")
     assert not any(temporary.iterdir())
 
 
@@ -178,8 +178,8 @@ def test_a_second_ctrl_c_ends_an_uninterruptible_run(tmp_path, late):
     os.killpg(ran.process.pid, signal.SIGINT)
     returned, _, err = ran.end()
     assert returned == 130
-    assert "killed, as it did not end by itself" in err
-    assert ("a second Ctrl-C ends it at once.\n" in err) is late
+    assert "killed, as it did not stop in time" in err
+    assert ("a second Ctrl-C stops it immediately.\n" in err) is late
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others look once a second")

@@ -110,7 +110,7 @@ def test_photographs_without_matches_are_named():
     assert overlap(names, [match(0, 1), match(1, 2), match(2, 3)]).severity == "ok"
     found = overlap(names, [match(0, 1), match(1, 2)])
     assert found.severity == "warning"
-    assert "1 of 4 are not connected with the rest: d" in found.found
+    assert "1 of 4 are not connected to the rest: d" in found.found
 
 
 # Megapixels, photographs, seconds, GB: benchmarks/README.md, "How cost grows"; and the demo.

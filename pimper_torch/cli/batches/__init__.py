@@ -1,4 +1,4 @@
-"""Many objects: whole reconstructions over any ``concurrent.futures.Executor``."""
+"""Batches: reconstructions of many objects by any ``concurrent.futures.Executor``."""
 
 from pimper_torch.cli.batches.many_objects import batch as batch
 from pimper_torch.cli.batches.objects import Object as Object

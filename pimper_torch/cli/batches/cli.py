@@ -1,4 +1,4 @@
-"""``pimper batch``: many objects, on this machine or on an engine."""
+"""``pimper batch``: reconstruct many objects, on this machine or on a cluster."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -24,22 +24,25 @@ from pimper_torch.runtime.errors import ReconstructionError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Reconstruct many objects, each as `pimper reconstruct` does.
+    """Reconstruct many objects, each with `pimper reconstruct`.
 
-    Arguments after `--` are passed to it for every object: `-- --preset fast`. An object whose
-    result is whole is passed over, others go on from what their stages kept.
+    Arguments after `--` are passed to it for every object: `-- --preset fast`. Objects with a
+    complete result are skipped; others continue after their last finished stage.
 
     Attributes:
-        list: Folder of folders of photographs, or a CSV file with columns `photos`, `name` and
-            options of `pimper reconstruct`.
-        out: Folder for a folder of each object, batch.csv and batch.html.
+        list: Folder with a folder of photographs per object, or a CSV file with columns `photos`,
+            `name` and options of `pimper reconstruct`.
+        out: Folder for batch.csv, batch.html and a folder per object.
         overwrite: Replace results of other settings or photographs.
-        jobs: Objects at once; as many as memory and cores allow unless given, 100 of Slurm.
-        dask: Scheduler of dask.distributed whose workers do it, such as tcp://127.0.0.1:8786.
-        slurm: Partition of Slurm whose nodes do it, a job an object.
-        time_limit: Minutes of one try; ten times the estimate unless given, an hour at least.
-        mem_gb: Memory of a run; an estimate unless given.
-        cpus_per_task: Threads of a run; here the cores shared out, on an engine 1 unless given.
+        jobs: Number of simultaneous objects; by default as many as memory and cores allow, or 100
+            on Slurm.
+        dask: Address of a dask.distributed scheduler whose workers run the objects, such as
+            tcp://127.0.0.1:8786.
+        slurm: Slurm partition whose nodes run the objects, one job per object.
+        time_limit: Time limit of a try in minutes; by default ten times the estimate, and at least
+            an hour.
+        mem_gb: Memory of a run; estimated by default.
+        cpus_per_task: Threads of a run; by default an equal share of the cores, or 1 on a cluster.
     """
 
     list: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LIST")]
@@ -56,13 +59,13 @@ class _Job:
 
 
 def run(given: tuple[_Job, list[str]], output: Output) -> None:
-    """Carry out ``batch``: a line an object, and at the end where the table is."""
+    """Run ``batch``: print a line per object, and the path of the table."""
     job, settings = given
 
-    def show(one: Outcome) -> None:
-        output.event("object-end", **asdict(one))
-        place = f" on {one.place}" if one.place else ""
-        output.remark(f"{one.name:<24} {one.status:<8}{one.seconds:8.1f} s{place} {one.message}")
+    def show(outcome: Outcome) -> None:
+        output.event("object-end", **asdict(outcome))
+        line = f"{outcome.name:<24} {outcome.status:<8}{outcome.seconds:8.1f} s"
+        output.remark(f"{line}{outcome.place and f' on {outcome.place}'} {outcome.message}")
 
     engine: AbstractContextManager[Executor | None] = nullcontext()
     if job.dask:
@@ -84,31 +87,31 @@ def run(given: tuple[_Job, list[str]], output: Output) -> None:
                 listener=show,
             )
     except KeyboardInterrupt as error:
-        left = f"objects that ended are whole, {job.out / CSV} lists all. {_GOES_ON}"
+        left = f"finished objects are complete; {job.out / CSV} lists all. {_CONTINUES}"
         raise Stopped(exit_code(error) - 128, left) from error
-    counts = Counter(one.status for one in outcomes)
+    counts = Counter(outcome.status for outcome in outcomes)
     totals = ", ".join(f"{count} {status}" for status, count in counts.items())
     output.remark(f"{totals}; {job.out / HTML} shows them.")
-    if lost := [one for one in outcomes if one.status not in ("ended", "kept")]:
-        first = lost[0]
+    if failed := [outcome for outcome in outcomes if outcome.status not in ("ended", "kept")]:
+        first = failed[0]
         raise ReconstructionError(
-            f"{len(lost)} of {len(outcomes)} objects have no result, as {first.name}: "
-            f"{first.message} {job.out / CSV} lists all with their reasons. {_GOES_ON}"
+            f"{len(failed)} of {len(outcomes)} objects have no result, for example {first.name}: "
+            f"{first.message} {job.out / CSV} lists all with their reasons. {_CONTINUES}"
         )
     paths = {"folder": job.out, CSV: job.out / CSV, HTML: job.out / HTML}
     output.result(paths, objects=len(outcomes))
 
 
-_GOES_ON = "The same command goes on: what stages finished is kept."
+_CONTINUES = "The same command continues after the finished stages."
 
 
 def checked(command: str, arguments: Sequence[str]) -> tuple[_Job, list[str]]:
-    """Read the arguments, and those behind ``--`` for every object."""
-    own, settings = [*arguments], []
-    if "--" in own:
-        place = own.index("--")
-        own, settings = own[:place], own[place + 1 :]
-    job = read_arguments(_Job, command, own)
-    require(not (job.dask and job.slurm), "--slurm", job.slurm, "none beside --dask")
-    require(job.jobs is None or job.jobs >= 1, "--jobs", job.jobs, "1 at least")
+    """Return the arguments, and those after ``--`` for every object."""
+    options, settings = [*arguments], []
+    if "--" in options:
+        index = options.index("--")
+        options, settings = options[:index], options[index + 1 :]
+    job = read_arguments(_Job, command, options)
+    require(not (job.dask and job.slurm), "--slurm", job.slurm, "no value together with --dask")
+    require(job.jobs is None or job.jobs >= 1, "--jobs", job.jobs, "at least 1")
     return job, settings

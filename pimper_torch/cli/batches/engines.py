@@ -1,4 +1,4 @@
-"""Engines of a batch: workers of ``dask.distributed``, and jobs of Slurm by ``submitit``."""
+"""Executors of a batch: workers of ``dask.distributed``, and Slurm jobs by ``submitit``."""
 
 import math
 import shutil
@@ -12,13 +12,13 @@ from pathlib import Path
 from pimper_torch.cli.batches.task import Outcome, Task, attempted
 from pimper_torch.runtime.errors import ConfigError, caution
 
-_TIMEOUT_SECONDS = 10  # a choice
-_MISSING = "{} needs {}, which is not installed: pip install 'pimper_torch[{}]'."
+_TIMEOUT_SECONDS = 10  # chosen by hand
+_MISSING = "{} needs {}, which is not installed. Run pip install 'pimper_torch[{}]'."
 
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Executor]:
-    """Connect to a scheduler for the block; a worker that dies has its task scheduled elsewhere.
+    """Connect to a scheduler, which reschedules the tasks of dead workers, inside the block.
 
     Raises:
         ConfigError: ``distributed`` is not installed, or no scheduler answers.
@@ -42,12 +42,12 @@ def dask_workers(address: str) -> Iterator[Executor]:
 
 
 class SlurmExecutor(ThreadPoolExecutor):
-    """A job of Slurm for every task, which asks for its time, memory and threads.
+    """Executor with a Slurm job per task, which requests the task's time, memory and threads.
 
     Args:
-        folder: Where submitit keeps tasks, outcomes and logs; every node must reach it.
-        jobs: At once, with a thread each that waits for it.
-        partition: Of Slurm; its own default where empty.
+        folder: Folder of submitit for tasks, outcomes and logs, visible to every node.
+        jobs: Number of simultaneous jobs; a thread waits for each.
+        partition: Partition of Slurm; empty for Slurm's default.
     """
 
     def __init__(self, folder: Path | str, jobs: int, partition: str = "") -> None:
@@ -57,26 +57,26 @@ class SlurmExecutor(ThreadPoolExecutor):
             raise ConfigError(_MISSING.format("--slurm", "submitit", "slurm")) from error
         if shutil.which("sbatch") is None:
             raise ConfigError(
-                "--slurm needs Slurm's commands, and there is no `sbatch` here. Run it where jobs "
-                "are submitted, as on a login node."
+                "--slurm needs Slurm's commands, but `sbatch` is not found. Run it where jobs are "
+                "submitted, such as on a login node."
             )
         super().__init__(jobs)
         self._executor = AutoExecutor(folder=folder, cluster="slurm")
         self._partition = partition
-        # Submitit has one set of parameters, and asks Slurm for the states of all jobs at once.
+        # Submitit has one set of parameters, and queries the states of all jobs together.
         self._lock = threading.Lock()
 
     def submit(  # type: ignore[override]
         self, work: Callable[[Task, Callable[[Task], Outcome]], Outcome], task: Task
     ) -> Future[Outcome]:
-        """Submit a job for each try; it is cancelled where the batch is interrupted."""
+        """Submit a job for each try; it is cancelled if the batch is interrupted."""
         return super().submit(work, task, self._in_job)
 
     def _in_job(self, task: Task) -> Outcome:
         with self._lock:
             self._executor.update_parameters(
                 name="pimper",
-                # The try ends by itself at its limit.
+                # The worker itself ends a try at its limit.
                 timeout_min=math.ceil(task.limit_s / 60) + 5,
                 mem_gb=math.ceil(task.mem_gb),
                 cpus_per_task=task.threads,

@@ -1,4 +1,4 @@
-"""Many objects, each a task of any ``concurrent.futures.Executor``."""
+"""Reconstruction of many objects, as tasks of any ``concurrent.futures.Executor``."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
@@ -29,36 +29,36 @@ def batch(
     cpus_per_task: int | None = None,
     listener: Callable[[Outcome], None] | None = None,
 ) -> tuple[Outcome, ...]:
-    """Reconstruct many objects, each in a process of its own, and write a table of them.
+    """Reconstruct many objects, each in a separate process, and write a table of outcomes.
 
-    An object whose result is whole, of the same settings and files, is passed over; any other goes
-    on from what its stages kept. A run that is killed, hangs or lacks memory is tried again, three
-    times in all; one that fails by itself is not, and stops no other. An object whose folder
-    another run holds is left waiting, with a message that names that run.
+    An object with a complete result of the same settings and files is skipped; others continue
+    after their last finished stage. A run that is killed, hangs or lacks memory is tried up to
+    three times; a run that fails with an error is not repeated and does not stop others. An object
+    whose folder is locked by another run is left waiting, with a message that names that run.
 
     Args:
-        objects: As of :func:`~pimper_torch.cli.batches.objects.read_objects`.
-        out: Folder for a folder of each object's name, ``batch.csv`` and ``batch.html``; workers
-            must reach it, and the photographs, under the same path.
-        executor: What carries out the tasks; by default processes of this machine.
-        jobs: Objects at once on this machine: as many as fit it unless given. An executor has a
-            number of its own.
+        objects: As for :func:`~pimper_torch.cli.batches.objects.read_objects`.
+        out: Folder for ``batch.csv``, ``batch.html`` and a folder per object; workers must see it,
+            and the photographs, under the same path.
+        executor: Executor of the tasks; by default processes on this machine.
+        jobs: Number of simultaneous objects on this machine; by default as many as fit. Not
+            allowed with an executor.
         settings: Options of ``pimper reconstruct`` for every object.
         overwrite: Replace results of other settings or files.
-        time_limit_min: Minutes that a try may take; ten times the estimate unless given, an hour at
-            least.
-        mem_gb: Memory that a run takes; an estimate unless given.
-        cpus_per_task: Threads of a run; the cores shared out unless given, 1 with an executor.
-        listener: Is called with how each object ended, at once.
+        time_limit_min: Time limit of a try in minutes; by default ten times the estimate, and at
+            least an hour.
+        mem_gb: Memory of a run; estimated by default.
+        cpus_per_task: Threads of a run; by default an equal share of the cores, 1 with an executor.
+        listener: Called with the outcome of each object as soon as it ends.
 
     Returns:
-        How each object ended, in their order.
+        The outcomes in the order of the objects.
 
     Raises:
-        InputError: No objects, or several of one name.
-        ConfigError: A wrong setting of one of them.
+        InputError: There are no objects, or several with one name.
+        ConfigError: An object has an invalid setting.
     """
-    require(jobs is None or executor is None, "jobs", jobs, "none where an executor has its own")
+    require(jobs is None or executor is None, "jobs", jobs, "no value together with an executor")
     for name, value in (
         ("jobs", jobs),
         ("time_limit_min", time_limit_min),
@@ -67,14 +67,14 @@ def batch(
     ):
         require(value is None or value > 0, name, value, "more than 0")
     out = Path(out).absolute()
-    # Results of an earlier batch into a folder of the list are none of its objects.
-    found = [
-        one
-        for one in read_objects(objects)
-        if not Path(one.photos).resolve().is_relative_to(out.resolve())
+    # If OUT is inside the listed folder, results of an earlier batch are not objects.
+    items = [
+        item
+        for item in read_objects(objects)
+        if not Path(item.photos).resolve().is_relative_to(out.resolve())
     ]
-    plan = planned_batch(found, out, settings, overwrite=overwrite)
-    tasks = [one for one in plan if isinstance(one, Task)]
+    plan = planned_batch(items, out, settings, overwrite=overwrite)
+    tasks = [entry for entry in plan if isinstance(entry, Task)]
     threads = cpus_per_task or 1
     if executor is None:
         jobs = jobs or runs_at_once([mem_gb or task.mem_gb for task in tasks])
@@ -99,25 +99,24 @@ def batch(
         for name, sign in SIGNS.items():
             prepare_file(out / name, overwrite=True, sign=sign)
         try:
-            for one in plan:
-                if isinstance(one, Outcome):
-                    settle(one)
+            for entry in plan:
+                if isinstance(entry, Outcome):
+                    settle(entry)
             with ThreadPoolExecutor(jobs) if executor is None else nullcontext(executor) as engine:
-                _carry_out_all(engine, tasks, settle)
+                _run_all(engine, tasks, settle)
         finally:
-            message = "interrupted; the same command goes on."
+            message = "interrupted; the same command continues."
             ended = tuple(
-                outcomes.get(one.name) or Outcome(name=one.name, status="waiting", message=message)
-                for one in found
+                outcomes.get(item.name)
+                or Outcome(name=item.name, status="waiting", message=message)
+                for item in items
             )
-            write_table(ended, out, {one.name: one.photos for one in found})
+            write_table(ended, out, {item.name: item.photos for item in items})
     return ended
 
 
-def _carry_out_all(
-    executor: Executor, tasks: Sequence[Task], settle: Callable[[Outcome], None]
-) -> None:
-    """Settle each task as it ends; an error, as of Ctrl-C, ends what runs in this process."""
+def _run_all(executor: Executor, tasks: Sequence[Task], settle: Callable[[Outcome], None]) -> None:
+    """Run all tasks, and settle each when it ends; an error, or Ctrl-C, stops running tasks."""
     futures: dict[Future[Outcome], Task] = {}
     STOPPED.difference_update(task.out.parent for task in tasks)
     try:
@@ -126,7 +125,7 @@ def _carry_out_all(
         for future in as_completed(futures):
             try:
                 outcome = future.result()
-            except Exception as error:  # of the engine
+            except Exception as error:  # raised by the engine
                 outcome = lost(futures[future], error)
             settle(outcome)
     except BaseException:

@@ -1,4 +1,4 @@
-"""The objects of a batch: a folder of folders, or a table."""
+"""Objects of a batch, from a folder of folders or a CSV table."""
 
 import csv
 import re
@@ -12,7 +12,7 @@ from pimper_torch.cli.options import every_option
 from pimper_torch.doors.result_folder.files import require_name
 from pimper_torch.runtime.errors import ConfigError, InputError, some
 
-# Files of the batch itself in OUT, beside the objects' folders.
+# Files of the batch itself in OUT, next to the objects' folders.
 CSV, HTML = "batch.csv", "batch.html"
 
 _PATHS = ("DIR", "FILE", "PATH")
@@ -21,12 +21,12 @@ _YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Object:
-    """Photographs of one object, and how to reconstruct it.
+    """Photographs of one object, and options for its reconstruction.
 
     Attributes:
-        name: Of its folder in the folder of the batch.
+        name: Name of its folder in the folder of the batch.
         settings: Options of ``pimper reconstruct`` with their values, as on its command line.
-        where: Place in a list, for messages.
+        where: Position in a list, for messages.
     """
 
     name: str
@@ -37,16 +37,16 @@ class Object:
     def __post_init__(self) -> None:
         where = f"{self.where or self.photos}: the name"
         require_name(self.name, InputError)
-        sound = self.name.isprintable() and not re.search(r"^[.\s]|[/\\]|\s$", self.name)
-        if not sound or self.name in ("", CSV, HTML):
+        valid = self.name.isprintable() and not re.search(r"^[.\s]|[/\\]|\s$", self.name)
+        if not valid or self.name in ("", CSV, HTML):
             raise InputError(
-                f"{where} is {self.name!r}; needed: one of a folder in OUT, without / or \\, that "
-                f"does not begin with a dot and is not {CSV} or {HTML}."
+                f"{where} is {self.name!r}; needed: a name for a folder in OUT, without / or \\, "
+                f"that does not begin with a dot and is not {CSV} or {HTML}."
             )
 
 
 def read_objects(given: Path | str | Sequence["Object | Path | str"]) -> list[Object]:
-    """List the objects of a folder, of a table, or of folders in turn.
+    """Return the objects of a folder, of a table, or of a list of folders.
 
     Args:
         given: A folder of folders, each with photographs or with a folder ``photos``; a CSV file
@@ -54,35 +54,35 @@ def read_objects(given: Path | str | Sequence["Object | Path | str"]) -> list[Ob
             dashes; or several objects or folders.
     """
     if not isinstance(given, Path | str):
-        found = [one if isinstance(one, Object) else _in_folder(Path(one)) for one in given]
+        objects = [item if isinstance(item, Object) else _in_folder(Path(item)) for item in given]
     elif Path(given).is_dir():
-        folders = (one for one in sorted(Path(given).iterdir()) if not one.name.startswith("."))
-        found = [_in_folder(one) for one in folders if one.is_dir()]
+        paths = (path for path in sorted(Path(given).iterdir()) if not path.name.startswith("."))
+        objects = [_in_folder(path) for path in paths if path.is_dir()]
     else:
-        found = _in_table(Path(given))
+        objects = _in_table(Path(given))
     where = str(given) if isinstance(given, Path | str) else "the list"
-    if not found:
+    if not objects:
         raise InputError(
             f"{where}: no objects; needed: a folder of folders of photographs, or a CSV file with "
             "a column `photos`."
         )
-    counts = Counter(one.name.casefold() for one in found)  # which some disks do not tell apart
-    same = [f"{one.photos} ({one.name})" for one in found if counts[one.name.casefold()] > 1]
+    counts = Counter(item.name.casefold() for item in objects)  # some disks ignore case
+    same = [f"{item.photos} ({item.name})" for item in objects if counts[item.name.casefold()] > 1]
     if same:
         raise InputError(
-            f"{where}: several objects have one name: {some(same)}; needed: a name each. Give a "
-            "CSV file with a column `name`."
+            f"{where}: several objects have one name: {some(same)}; needed: different names. Give "
+            "a CSV file with a column `name`."
         )
-    return found
+    return objects
 
 
 def _in_folder(
     folder: Path, name: str = "", settings: tuple[str, ...] = (), where: str = ""
 ) -> Object:
-    """Return an object by the name of its folder, for a link its own, unless another is given."""
-    own = folder if folder.name not in ("", "..") else folder.resolve()
+    """Return the object of a folder, by default with the name of the folder or link."""
+    named = folder if folder.name not in ("", "..") else folder.resolve()
     photos = folder / "photos" if (folder / "photos").is_dir() else folder
-    return Object(name=name or own.name, photos=photos, settings=settings, where=where)
+    return Object(name=name or named.name, photos=photos, settings=settings, where=where)
 
 
 def _in_table(path: Path) -> list[Object]:
@@ -103,10 +103,12 @@ def _in_table(path: Path) -> list[Object]:
             f"{path}: its columns are {some(columns) or 'none'}; needed: `photos`, and `name` or "
             "options of `pimper reconstruct` without dashes, each once."
         )
-    if taken := {"out", "o", "overwrite", "view"} & {*columns}:
-        raise ConfigError(f"{path}: has the column {min(taken)}, which is the batch's own.")
-    kinds = {name: one.value for one in every_option("reconstruct") for name in one.names}
-    found = []
+    if reserved := {"out", "o", "overwrite", "view"} & {*columns}:
+        raise ConfigError(
+            f"{path}: has the column {min(reserved)}, which only `pimper batch` itself may set."
+        )
+    kinds = {name: option.value for option in every_option("reconstruct") for name in option.names}
+    objects = []
     for row in table:
         where = f"{path}, row {table.line_num}"
         cells = {
@@ -123,12 +125,12 @@ def _in_table(path: Path) -> list[Object]:
             if cell
             for word in _words(where, f"--{column.replace('_', '-')}", cell, kinds, path.parent)
         ]
-        found.append(_in_folder(path.parent / photos, name, (*settings,), where))
-    return found
+        objects.append(_in_folder(path.parent / photos, name, (*settings,), where))
+    return objects
 
 
 def _words(where: str, option: str, cell: str, kinds: Mapping[str, str], base: Path) -> list[str]:
-    """Write a cell as on a command line; paths are relative to the table."""
+    """Return a cell as words of a command line; paths are relative to the table."""
     kind = kinds.get(option)
     if kind == "" and cell.lower() in (*_YES, *_NO):
         stage, dot, last = option[2:].rpartition(".")
@@ -140,6 +142,6 @@ def _words(where: str, option: str, cell: str, kinds: Mapping[str, str], base: P
         return [option, *(shlex.split(cell) if kind and " " in kind else [cell])]
     except ValueError as error:
         raise ConfigError(
-            f"{where}: {option} is {cell}, which a shell does not split ({error}); needed: quotes "
-            "in pairs around a name with spaces."
+            f"{where}: {option} is {cell}, which cannot be split into words ({error}); needed: "
+            "quotes in pairs around a name with spaces."
         ) from error

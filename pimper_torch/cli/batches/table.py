@@ -1,4 +1,4 @@
-"""The table of a batch, as CSV and as a page with pictures."""
+"""The table of a batch, as CSV and as a page with images."""
 
 import csv
 import io
@@ -20,14 +20,14 @@ _COLUMNS = (
     *("peak_memory_mb", "place", "message", "photographs"),
 )
 SIGNS = {CSV: "name,status,tries,seconds", HTML: "<!-- pimper batch -->"}
-"""Text by which our files are known: only files that hold it are replaced."""
+"""Text that identifies files of a batch; only files that contain it are replaced."""
 
 _WITH_RESULT = ("ended", "kept")
 
 
 def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Path | str]) -> None:
-    """Write ``batch.csv`` and ``batch.html``, with pictures that link to the objects' reports."""
-    rows = [_row(one, out) | {"photographs": str(photos[one.name])} for one in outcomes]
+    """Write ``batch.csv`` and ``batch.html``, with images that link to the objects' reports."""
+    rows = [_row(entry, out) | {"photographs": str(photos[entry.name])} for entry in outcomes]
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, _COLUMNS, restval="")
     table.writeheader()
@@ -37,15 +37,15 @@ def write_table(outcomes: Sequence[Outcome], out: Path, photos: Mapping[str, Pat
             fresh.write_text(content, encoding="utf-8", newline="")
 
 
-def _row(one: Outcome, out: Path) -> dict[str, object]:
-    """Return how an object ended and figures of its result, by column."""
+def _row(outcome: Outcome, out: Path) -> dict[str, object]:
+    """Return the outcome of an object and figures of its result, by column."""
     row: dict[str, object] = {}
-    if one.status in _WITH_RESULT:
-        summary = json.loads((out / one.name / "summary.json").read_text(encoding="utf-8"))
+    if outcome.status in _WITH_RESULT:
+        summary = json.loads((out / outcome.name / "summary.json").read_text(encoding="utf-8"))
         row = {name: summary.get(name, "") for name in _COLUMNS}
-    seconds = one.seconds or float(str(row.get("seconds") or 0))
-    row |= asdict(one) | {"seconds": seconds}
-    return {key: round(it, 1) if isinstance(it, float) else it for key, it in row.items()}
+    seconds = outcome.seconds or float(str(row.get("seconds") or 0))
+    row |= asdict(outcome) | {"seconds": seconds}
+    return {key: round(cell, 1) if isinstance(cell, float) else cell for key, cell in row.items()}
 
 
 def _page(rows: Sequence[Mapping[str, object]], out: Path) -> str:
@@ -55,8 +55,8 @@ def _page(rows: Sequence[Mapping[str, object]], out: Path) -> str:
     statuses = [str(row["status"]) for row in rows]
     reasons = _reasons(rows, out)
     return page.substitute(
-        title=f"{sum(one in _WITH_RESULT for one in statuses)} of {len(rows)} objects",
-        counts=", ".join(f"{statuses.count(one)} {one}" for one in dict.fromkeys(statuses)),
+        title=f"{sum(status in _WITH_RESULT for status in statuses)} of {len(rows)} objects",
+        counts=", ".join(f"{statuses.count(kind)} {kind}" for kind in dict.fromkeys(statuses)),
         style=style.read_text(encoding="utf-8"),
         sign=SIGNS[HTML],
         rows="\n".join(_line(row, out) for row in rows),
@@ -74,13 +74,13 @@ def _marked_up(text: str) -> str:
 
 
 def _line(row: Mapping[str, object], out: Path) -> str:
-    """Return an object's row of the page; without a result, its figures are empty."""
+    """Return an object's row of the page; figures are empty without a result."""
     folder, picture, name = out / str(row["name"]), "", escape(str(row["name"]))
     if (folder / "overview.png").exists():
         link = PurePosixPath("/", folder.name).as_uri().removeprefix("file:///")
         target = "report.html" if (folder / "report.html").exists() else "overview.png"
         image = f'<img loading="lazy" src="{link}/overview.png" alt="">'
-        picture, name = (f'<a href="{link}/{target}">{one}</a>' for one in (image, name))
+        picture, name = (f'<a href="{link}/{target}">{label}</a>' for label in (image, name))
     figures = {
         "photographs": _figure(row, "registered") and f"{row['registered']} of {row['views']}",
         "vertices": _figure(row, "vertices"),
@@ -88,7 +88,7 @@ def _line(row: Mapping[str, object], out: Path) -> str:
         "time": _figure(row, "seconds", " s"),
         "memory": _figure(row, "peak_memory_mb", " MB"),
     }
-    cells = "".join(f'<td class="number" title="{it}">{one}</td>' for it, one in figures.items())
+    cells = "".join(f'<td class="number" title="{key}">{it}</td>' for key, it in figures.items())
     status = f'<td class="{row["status"]}">{row["status"]}</td>'
     return f'<tr><td>{picture}</td><td class="name">{name}</td>{status}{cells}</tr>'
 
@@ -99,17 +99,17 @@ def _figure(row: Mapping[str, object], name: str, unit: str = "") -> str:
 
 
 def _reasons(rows: Sequence[Mapping[str, object]], out: Path) -> dict[str, list[str]]:
-    """List why objects have no result, each reason once, with the objects' names.
+    """Return the names of the objects without result, by reason.
 
-    Messages that differ only in the object's folders are one.
+    Messages that differ only in the object's folders are the same reason.
     """
-    found: dict[str, list[Mapping[str, object]]] = {}
+    by_reason: dict[str, list[Mapping[str, object]]] = {}
     for row in rows:
         if message := str(row["message"]):
             for path, word in ((row["photographs"], "PHOTOS"), (out / str(row["name"]), "OUT")):
                 message = message.replace(str(path), word)
-            found.setdefault(message, []).append(row)
+            by_reason.setdefault(message, []).append(row)
     return {
-        reason if len(some) > 1 else str(some[0]["message"]): [str(row["name"]) for row in some]
-        for reason, some in found.items()
+        reason if len(group) > 1 else str(group[0]["message"]): [str(row["name"]) for row in group]
+        for reason, group in by_reason.items()
     }

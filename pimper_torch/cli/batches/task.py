@@ -1,9 +1,9 @@
-"""One object of a batch, and how a worker on any machine carries it out.
+"""One object of a batch, and its reconstruction by a worker on any machine.
 
-A worker starts ``pimper reconstruct`` as a process of its own, so that a run that is killed, hangs
-or takes all memory leaves the worker unharmed. All that driver and workers share is the folder of
-the batch. There, in ``.stages``, an object has a log with the events of its runs, and the key of
-what its result is made from. The lock is that of the result's folder, and is never taken away.
+A worker starts ``pimper reconstruct`` as a child process, so a run that is killed, hangs or uses up
+the memory does not harm the worker. Driver and workers share only the folder of the batch. Its
+``.stages`` contains a log of each object's events, and a key of the inputs of its result. The lock
+is that of the result's folder, and is never broken.
 """
 
 import json
@@ -28,9 +28,9 @@ from pimper_torch.runtime.errors import OutputError
 Status = Literal["ended", "failed", "lost", "kept", "waiting"]
 
 STOPPED: set[Path] = set()
-"""Folders of batches that were interrupted: their runs in this process end."""
+"""Folders of interrupted batches, whose runs in this process must end."""
 
-# What a child runs: it ends when its parent does, and then is `pimper`.
+# Program of a child: `pimper`, which ends with its parent.
 _CHILD = """
 import faulthandler, sys
 from pimper_torch.cli.supervise import exit_with_parent
@@ -40,13 +40,13 @@ faulthandler.enable()
 from pimper_torch.cli.main import main
 sys.exit(main())
 """
-# Errors that a worker with more memory may not raise.
+# Errors that a worker with more memory may avoid.
 _OF_MEMORY = ("MemoryError", "OutOfMemoryError")
-_TRIES = 3  # a choice
+_TRIES = 3  # chosen by hand
 _LOOK_SECONDS = 0.5
-_PATIENCE_SECONDS = 10.0  # a choice
-# A choice: a stage's step is longer in large runs, which are killed then; their stages are kept.
-# The batch itself has four seconds to end.
+_PATIENCE_SECONDS = 10.0  # chosen by hand
+# Chosen by hand: a step of a large run takes longer, and the run is then killed; finished stages
+# are kept. The batch itself has four seconds to end.
 _END_SECONDS = 2.5
 
 
@@ -55,9 +55,9 @@ class Task:
     """Inputs of a worker for one object.
 
     Attributes:
-        arguments: Of ``pimper reconstruct``, with absolute paths.
-        key: Arguments and all files that are read, as JSON.
-        limit_s: Seconds after which a try is ended.
+        arguments: Arguments of ``pimper``, with absolute paths.
+        key: Options and all input files, as JSON.
+        limit_s: Time limit of a try in seconds.
     """
 
     name: str
@@ -69,11 +69,11 @@ class Task:
     threads: int = 1
 
     def beside(self, suffix: str) -> Path:
-        """Return a file of the object in ``.stages`` of the batch."""
+        """Return the path of a file of the object in ``.stages`` of the batch."""
         return self.out.parent / STAGES / f"{self.name}{suffix}"
 
     def made_from(self) -> str:
-        """Return the key that was written before the latest run began; empty without one."""
+        """Return the key written before the latest run; empty if there is none."""
         path = self.beside(".key")
         return path.read_text(encoding="utf-8") if path.exists() else ""
 
@@ -88,11 +88,11 @@ class Outcome:
     """End of a try.
 
     Attributes:
-        status: ``ended`` with a result; ``failed`` by itself, as it will anywhere; ``lost``, where
-            a new try may succeed; ``kept``, where the result was whole already; ``waiting``, where
-            no try began.
-        message: Why there is no result.
-        place: Host of the worker.
+        status: ``ended`` with a result; ``failed`` with an error that will recur; ``lost`` if a new
+            try may succeed; ``kept`` if the result was already complete; ``waiting`` if no try
+            began.
+        message: Reason if there is no result.
+        place: Host name of the worker.
     """
 
     name: str
@@ -104,10 +104,10 @@ class Outcome:
 
 
 def carry_out(task: Task, attempt: Callable[[Task], Outcome] | None = None) -> Outcome:
-    """Reconstruct an object, again where a run is lost.
+    """Return the outcome of an object; lost runs are tried again.
 
     Args:
-        attempt: Carries out one try; :func:`attempted` unless given.
+        attempt: Function for one try; by default :func:`attempted`.
     """
     for number in count(1):
         try:
@@ -122,12 +122,12 @@ def carry_out(task: Task, attempt: Callable[[Task], Outcome] | None = None) -> O
 def lost(task: Task, error: Exception) -> Outcome:
     """Return the outcome of a task whose engine or worker raised an error."""
     reason = f"{type(error).__name__}: {shorten(str(error), 300, placeholder=' ...')}"
-    message = f"its worker was lost, or cannot carry it out ({reason.rstrip('.: ')})."
+    message = f"its worker was lost, or cannot run it ({reason.rstrip('.: ')})."
     return Outcome(name=task.name, status="lost", message=message)
 
 
 def attempted(task: Task) -> Outcome:
-    """Try once, in a child process that writes its events to the task's log."""
+    """Return the outcome of one try, in a child process that writes events to the task's log."""
     began = time.monotonic()
     status, message = _tried(task, began + task.limit_s)
     seconds = time.monotonic() - began
@@ -135,18 +135,18 @@ def attempted(task: Task) -> Outcome:
 
 
 def is_whole(task: Task) -> bool:
-    """Return whether the object's result is there, of the same arguments and files.
+    """Return whether the object has a complete result of the same arguments and files.
 
-    It is newer than the key that was written before its run, however that ended.
+    A complete result is newer than the key, which is written before the run.
     """
     with suppress(OSError):
-        written, begun = (one.stat() for one in (task.out / MARKER, task.beside(".key")))
-        return written.st_mtime_ns >= begun.st_mtime_ns and task.made_from() == task.key
+        marker, key = (path.stat() for path in (task.out / MARKER, task.beside(".key")))
+        return marker.st_mtime_ns >= key.st_mtime_ns and task.made_from() == task.key
     return False
 
 
 def _tried(task: Task, latest: float) -> tuple[Status, str]:
-    patient = time.monotonic() + _PATIENCE_SECONDS  # with a run whose worker has just died
+    deadline = time.monotonic() + _PATIENCE_SECONDS  # the run of a dead worker may still end
     while True:
         try:
             with locked(task.out, task.out):
@@ -155,9 +155,9 @@ def _tried(task: Task, latest: float) -> tuple[Status, str]:
                 if task.made_from() != task.key:
                     task.beside(".key").write_text(task.key, encoding="utf-8")
             break
-        except OutputError as error:  # a different run holds it, and keeps its lock
-            if time.monotonic() > patient:
-                return "waiting", f"not begun: {error}"
+        except OutputError as error:  # another run has the lock
+            if time.monotonic() > deadline:
+                return "waiting", f"not started: {error}"
             time.sleep(_LOOK_SECONDS)
     with task.beside(".jsonl").open("ab+") as log:
         begun = log.seek(0, os.SEEK_END)
@@ -199,6 +199,6 @@ def _started(task: Task, log: IO[bytes]) -> "subprocess.Popen[bytes]":
             "PYTHONSAFEPATH": "1",
             "OMP_NUM_THREADS": str(task.threads),
         },
-        # Ctrl-C in the driver's terminal is the driver's to pass on.
+        # Only the driver receives Ctrl-C in its terminal; it passes it on.
         start_new_session=True,
     )

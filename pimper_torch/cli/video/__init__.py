@@ -1,1 +1,1 @@
-"""Photographs out of a video: frames that are sharp, and as far apart as the camera moved."""
+"""Photographs from a video: sharp frames, evenly spaced by the motion of the picture."""
