@@ -20,8 +20,8 @@ from pimper_torch.cli.stopping import SIGNALS
 from pimper_torch.runtime.scratch import remove_scratch
 
 _SHRINK = (
-    "Shrink the photographs (`--max-size-px`), close other programs, or set a limit that is checked "
-    "early (`--max-memory`)."
+    "Shrink the photographs (`--max-size-px`), close other programs, or set a limit that is "
+    "checked early (`--max-memory`)."
 )
 _CONTINUES = "No result was written; the same command continues after the last finished stage."
 # Chosen so that every command ends within five seconds of SIGTERM.

@@ -1,1 +1,1 @@
-"""How a run goes: settings, errors, journal, reports, memory, and kept records."""
+"""Infrastructure of runs: settings, errors, journal, reports, memory, and kept records."""

@@ -1,4 +1,4 @@
-"""Number of cores that a process may use; it may be lower than the machine's."""
+"""Number of cores that a process may use, which may be less than the machine has."""
 
 import math
 import os
@@ -6,15 +6,14 @@ from contextlib import suppress
 from pathlib import Path
 
 _CGROUP = Path("/sys/fs/cgroup")
-# A quota and its period in microseconds: of version 2, then of version 1.
+# Files with a quota and its period in microseconds: cgroup version 2, then version 1.
 _QUOTAS = (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"))
 
 
 def usable_cores() -> int:
     """Return the number of cores that a process may use, at least 1.
 
-    They are those that affinity, the CPU quota of a container and ``OMP_NUM_THREADS`` leave. A
-    quota of a core and a half is two cores.
+    Affinity, the CPU quota of a container (rounded up) and ``OMP_NUM_THREADS`` limit it.
     """
     cores = os.cpu_count() or 1
     if hasattr(os, "sched_getaffinity"):  # Linux
@@ -25,6 +24,6 @@ def usable_cores() -> int:
             quota, period = map(int, words)
             if quota > 0 and period > 0:
                 cores = min(cores, math.ceil(quota / period))
-    with suppress(ValueError):  # several levels, or nothing
+    with suppress(ValueError):  # nested levels (4,2), or not set
         cores = min(cores, max(1, int(os.environ.get("OMP_NUM_THREADS", ""))))
     return cores

@@ -1,8 +1,8 @@
-"""Work on batches side by side, in threads, with results in the order of the batches.
+"""Parallel work on batches, in threads, with results in the order of the batches.
 
-Operations on a batch that fits the cache gain nothing from a second thread inside them; two batches
-on two cores gain a factor of two. So every worker has one thread inside torch. A result depends on
-its batch alone: neither the number of workers nor who is first changes it.
+A second thread inside an operation gains nothing if the batch fits the cache; two batches on two
+cores gain a factor of two. Therefore every worker uses one thread inside torch. A result only
+depends on its batch, not on the number or timing of workers.
 """
 
 from collections import deque
@@ -27,24 +27,24 @@ Result = TypeVar("Result")
 
 
 def num_workers() -> int:
-    """Return how many batches are worked on side by side: as many as torch has threads."""
+    """Return the number of batches processed in parallel: the number of torch's threads."""
     return 1 if current().worker else torch.get_num_threads()
 
 
 def side_by_side(
     work: Callable[[Item], Result], items: Sequence[Item], tracked: bool = True
 ) -> Iterator[Result]:
-    """Apply ``work`` to every item, a few at a time, and yield the results in order.
+    """Yield ``work(item)`` for every item in order, computed in parallel.
 
-    Not more results than workers wait to be taken, so that memory stays bounded. Context variables
-    and whether gradients are recorded are those of the caller.
+    At most as many results as workers are buffered, so memory is bounded. Context variables and
+    the gradient mode are those of the caller.
 
     Args:
         work: Called in a worker thread.
         tracked: Whether progress is reported after every result.
 
     Raises:
-        BaseException: What ``work`` raised for the first item, in order, that failed.
+        BaseException: The error of the first item, in order, that failed.
     """
     workers = min(num_workers(), len(items))
     results = _in_threads(work, items, workers) if workers > 1 else _one_by_one(work, items)
@@ -59,15 +59,15 @@ def side_by_side(
 def over_rows(
     kernel: Callable[..., Result], rows: int, *arguments: object, size: int = 1
 ) -> list[Result]:
-    """Call ``kernel(*arguments, first, last)`` on ranges that make up all rows, side by side.
+    """Return ``kernel(*arguments, first, last)`` of ranges that partition all rows, in parallel.
 
     Args:
-        kernel: Compiled, so that it holds no lock; what it does for a row depends on no other.
-        size: How many rows of usual work one of them is.
+        kernel: Compiled, so that it releases the lock; must process rows independently.
+        size: Work per row, relative to usual rows.
     """
-    # Fewer rows take a second thread some 50 microseconds, which it is not worth.
+    # A second thread costs about 50 microseconds, too much for fewer rows.
     workers = num_workers() if rows * size >= 20_000 else 1
-    bounds = [rows * part // workers for part in range(workers + 1)]
+    bounds = [rows * index // workers for index in range(workers + 1)]
     others = [
         _idle(workers - 1).submit(kernel, *arguments, first, last)
         for first, last in pairwise(bounds[1:])
@@ -77,7 +77,7 @@ def over_rows(
 
 @cache
 def _idle(workers: int) -> ThreadPoolExecutor:
-    """Return threads that wait for work as long as the process lives."""
+    """Return a pool of threads that lives as long as the process."""
     return ThreadPoolExecutor(workers, thread_name_prefix="rows")
 
 
@@ -93,33 +93,33 @@ def _in_threads(
 ) -> Iterator[Result]:
     grad = torch.is_grad_enabled()
 
-    def one(item: Item) -> Result:
-        alone = replace(current(), worker=True, progress=None)
-        with torch.set_grad_enabled(grad), writing(alone):
+    def in_worker(item: Item) -> Result:
+        journal = replace(current(), worker=True, progress=None)
+        with torch.set_grad_enabled(grad), writing(journal):
             return work(item)
 
     waiting: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
-    # A worker's setting reaches other threads of the process too: theirs is put back.
-    with _threads(torch.get_num_threads()), ExitStack() as leaving:
-        # Nothing more starts once the block is left, and what runs is waited for.
-        leaving.callback(pool.shutdown, cancel_futures=True)
+    # A worker's setting affects all threads of the process: restore it at the end.
+    with _threads(torch.get_num_threads()), ExitStack() as stack:
+        # At the end of the block, cancel waiting items, and wait for running ones.
+        stack.callback(pool.shutdown, cancel_futures=True)
         for item in items:
             if len(waiting) > workers:
                 yield waiting.popleft().result()
-            waiting.append(pool.submit(copy_context().run, one, item))
+            waiting.append(pool.submit(copy_context().run, in_worker, item))
         while waiting:
             yield waiting.popleft().result()
 
 
 def on_one_thread() -> AbstractContextManager[None]:
-    """Let torch and LAPACK use one thread, so that bits do not depend on how many there are."""
+    """Let torch and LAPACK use one thread, so that bits do not depend on the number of threads."""
     return _threads(1)
 
 
 @contextmanager
 def _threads(count: int) -> Iterator[None]:
-    """Set torch's threads on entry; on exit they are what they were."""
+    """Set the number of torch's threads, and restore it at the end of the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

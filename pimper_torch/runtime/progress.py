@@ -1,7 +1,7 @@
-"""Progress of a stage, for whoever wants to show it.
+"""Progress of a stage, for display by the caller.
 
-Stages walk their batches through :func:`track`; nothing is printed. A caller that wants a
-bar listens with :func:`listening`.
+Stages iterate over their batches with :func:`track`; nothing is printed. To display a bar, a caller
+listens with :func:`listening`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,28 +23,28 @@ def report(done: int, total: int) -> None:
 
 
 def track(items: Sequence[Item]) -> Iterator[Item]:
-    """Walk through ``items``, reporting after each."""
+    """Yield the items, and report progress after each."""
     for done, item in enumerate(items, start=1):
         yield item
         report(done, len(items))
 
 
 def listening(listener: Listener | None) -> AbstractContextManager[Journal]:
-    """Send reports to ``listener(done, total)`` inside the ``with`` block, or to nobody."""
+    """Send reports of the ``with`` block to ``listener(done, total)``; ``None`` ignores them."""
     return writing(replace(current(), progress=listener))
 
 
 @contextmanager
 def part(place: int, count: int) -> Iterator[None]:
-    """Let what is reported inside the ``with`` block fill one of ``count`` equal parts.
+    """Report the progress of the ``with`` block as part ``place`` of ``count`` equal parts.
 
-    Parts nest, so that a stage of several steps, which report by themselves, has one bar.
+    Parts nest, so a stage of several steps with their own reports has one bar.
     """
-    whole = current().progress
+    outer = current().progress
 
     def inside(done: int, total: int) -> None:
-        if whole is not None:
-            whole(place * total + done, count * total)
+        if outer is not None:
+            outer(place * total + done, count * total)
 
     with listening(inside):
         yield

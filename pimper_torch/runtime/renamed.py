@@ -1,4 +1,4 @@
-"""Names of the last version, which work for one more and warn."""
+"""Deprecated names, which work for one more version with a warning."""
 
 import functools
 import warnings
@@ -16,7 +16,7 @@ def renamed(old: str, new: str) -> str:
 
 
 def renamed_names(module: str, names: Mapping[str, str]) -> Callable[[str], object]:
-    """Make the ``__getattr__`` of a module that finds renamed members by their former names."""
+    """Return a module's ``__getattr__`` that finds renamed members by their former names."""
 
     def find(name: str) -> object:
         if name not in names:
@@ -27,14 +27,14 @@ def renamed_names(module: str, names: Mapping[str, str]) -> Callable[[str], obje
 
 
 def renamed_fields(**names: str) -> Callable[[type[T]], type[T]]:
-    """Let a record be made and read by former names of its fields, given as ``former="new"``."""
+    """Return a decorator for records that accepts former names of fields: ``former="new"``."""
 
     def wrap(record: type[T]) -> type[T]:
-        made = record.__init__
+        init = record.__init__
 
-        @functools.wraps(made)
+        @functools.wraps(init)
         def make(self: T, **values: Any) -> None:  # noqa: ANN401 - the fields' own types
-            made(self, **{renamed(k, names[k]) if k in names else k: v for k, v in values.items()})
+            init(self, **{renamed(k, names[k]) if k in names else k: v for k, v in values.items()})
 
         def reader(old: str, new: str) -> property:
             return property(lambda self: getattr(self, renamed(old, new)))

@@ -1,4 +1,4 @@
-"""Temporary folders of a process and of those that it forks, under a prefix of their own."""
+"""Temporary folders of a process and of its forks, with a common random prefix."""
 
 import os
 import shutil
@@ -12,12 +12,12 @@ _PREFIX = f"pimper_{os.urandom(4).hex()}_"
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Make a temporary folder, which goes when the block ends."""
+    """Create a temporary folder, deleted at the end of the block."""
     with tempfile.TemporaryDirectory(prefix=_PREFIX) as folder:
         yield Path(folder)
 
 
 def remove_scratch() -> None:
-    """Remove the temporary folders that a killed fork of this process left."""
+    """Delete the temporary folders of a killed fork of this process."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         shutil.rmtree(folder, ignore_errors=True)

@@ -2,5 +2,5 @@
 
 import lazy_loader
 
-# When they are asked for, so that the command line reads settings of this room without torch.
+# Imported on first use, so the command line can import this subpackage without torch.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

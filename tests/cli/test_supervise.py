@@ -95,8 +95,8 @@ def test_the_cause_of_a_killed_run_is_one_paragraph(tmp_path, code, number, mess
     assert line.startswith("error: ")
     assert message in line
     assert "--max-size-px" in line
-    assert "the same command goes on" in line
-    assert ("stand_in.py" in "".join(crash)) is (number != 9)  # the place of the crash
+    assert "the same command continues" in line
+    assert ("stand_in.py" in "".join(crash)) is (number != 9)  # where it crashed
     last = json.loads(out.splitlines()[-1])
     assert (last["event"], last["kind"], last["exit_code"]) == ("error", "Killed", returned)
     assert f"error: {last['message']}" == line

@@ -1,4 +1,4 @@
-"""``pimper gamma``: the response of photographs from a fixed camera under several lights."""
+"""``pimper gamma``: estimate the response of photographs: a fixed camera, several lights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +16,13 @@ from pimper_torch.runtime.errors import InputError, caution, held
 if TYPE_CHECKING:
     from pimper_torch.single_view.factorization.estimate_gamma import GammaEstimate
 
-# A standard response whose residual is below this multiple of the best is recommended: a choice.
+# A standard response is recommended if its residual is below this multiple of the best one; chosen
+# by hand.
 _AS_GOOD = 1.05
 
 
 def run(job: "_Job", output: Output) -> None:
-    """Carry out ``gamma``: read, estimate, and print it with the option of `pimper reconstruct`."""
+    """Run ``gamma``: print the estimate, and the matching option of `pimper reconstruct`."""
     from pimper_torch.doors.io.photographs import load_views, read_mask
     from pimper_torch.doors.io.responses import CONTRADICTED
     from pimper_torch.runtime.reporting import stage
@@ -30,23 +31,23 @@ def run(job: "_Job", output: Output) -> None:
     with output.observer(), stage("read"), held() as messages:
         views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
     for message in messages:
-        if CONTRADICTED not in message:  # values are looked at as they are, whatever files say
+        if CONTRADICTED not in message:  # profiles of the files do not matter here
             caution(message)
-    drawn = None if job.mask is None else read_mask(job.mask, job.max_size_px)
-    found = gamma_of_photographs(views, mask=drawn, rank=job.rank)
-    output.emit(f"{found}{advice(found)}")
-    output.result(gamma=found.gamma, determined=found.determined)
+    mask = None if job.mask is None else read_mask(job.mask, job.max_size_px)
+    estimate = gamma_of_photographs(views, mask=mask, rank=job.rank)
+    output.emit(f"{estimate}{advice(estimate)}")
+    output.result(gamma=estimate.gamma, determined=estimate.determined)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Job:
-    """Find the gamma of photographs that a fixed camera took of one object under many lights.
+    """Estimate the gamma of photographs of a static object from a fixed camera under many lights.
 
     Attributes:
         photos: Folder of JPEG, PNG or TIFF files; the camera did not move.
-        mask: Image that is bright on the object and dark off it, of the photographs' size.
-        rank: 3 if point lights are far away and the room is dark, 4 with ambient light.
-        max_size_px: Shrink photographs whose longer side is longer; 0 leaves them.
+        mask: Mask of the object, bright on it and dark elsewhere, of the photographs' size.
+        rank: 3 for distant point lights in a dark room, 4 with ambient light.
+        max_size_px: Longer side to which larger photographs are scaled down; 0 keeps all sizes.
     """
 
     photos: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS")]
@@ -56,24 +57,24 @@ class _Job:
 
 
 def checked(command: str, arguments: Sequence[str]) -> _Job:
-    """Parse the arguments, and refuse photographs and a mask that do not exist."""
+    """Return the arguments, and refuse missing photographs or masks."""
     job = read_arguments(_Job, command, arguments)
     list_images(job.photos)
     if job.mask is not None and not job.mask.is_file():
         raise InputError(
-            f"{job.mask}: there is no such file; needed: a mask, bright on the object, for all "
-            "photographs."
+            f"{job.mask}: there is no such file; needed: a mask for all photographs, bright on the "
+            "object."
         )
     return job
 
 
-def advice(found: "GammaEstimate") -> str:
+def advice(estimate: "GammaEstimate") -> str:
     """Return the option of `pimper reconstruct` for the response; empty if it is not determined."""
-    if not found.determined:
+    if not estimate.determined:
         return ""
-    response = f"{found.gamma:.2f}"
-    if found.residual_linear <= _AS_GOOD * found.residual:
+    response = f"{estimate.gamma:.2f}"
+    if estimate.residual_linear <= _AS_GOOD * estimate.residual:
         response = "linear"
-    elif found.residual_srgb <= _AS_GOOD * found.residual:
+    elif estimate.residual_srgb <= _AS_GOOD * estimate.residual:
         response = "srgb"
     return f"\n  pimper reconstruct PHOTOS -o RESULT --photographs.response {response}"

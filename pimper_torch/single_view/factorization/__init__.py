@@ -1,4 +1,4 @@
-"""Factorization beyond the chain's: any low-rank matrix, other orders of light.
+"""Factorization of any low-rank matrix, and with other orders of light than in the chains.
 
 Problems and solvers are those of :mod:`pimper_torch.method.photometry`.
 """

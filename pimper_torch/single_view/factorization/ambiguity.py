@@ -20,7 +20,7 @@ from pimper_torch.records import Record
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Ambiguity(Record):
-    """A scaled Lorentz transformation, ready to act on a factorization.
+    """A scaled Lorentz transformation of a factorization.
 
     Attributes:
         matrix: ``A`` with ``A^T eta A = s^2 eta``.
@@ -37,11 +37,11 @@ class Ambiguity(Record):
         return self.matrix @ shading
 
     def on_lights(self, lights: Float[Tensor, "*batch view 4"]) -> Float[Tensor, "..."]:
-        """Return ``L A^-1``, so that the product with :meth:`on_shading` stays the data."""
+        """Return ``L A^-1``; its product with :meth:`on_shading` is the data."""
         return lights @ self.inverse().matrix
 
     def inverse(self) -> "Ambiguity":
-        """Return the transformation that undoes this one: ``eta A^T eta / s^2``."""
+        """Return the inverse transformation, ``eta A^T eta / s^2``."""
         eta = minkowski(self.matrix)
         return Ambiguity(matrix=eta @ self.matrix.mT @ eta / self.scale[..., None, None] ** 2)
 
@@ -57,7 +57,7 @@ def minkowski(like: Float[Tensor, "..."]) -> Float[Tensor, "4 4"]:
 
 
 def lorentz(generator: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
-    """Return the proper Lorentz transformation of a generator by the matrix exponential.
+    """Return the matrix exponential of a generator, a proper Lorentz transformation.
 
     Args:
         generator: Three rapidities of the boost along x, y, z, then a rotation vector.
@@ -72,19 +72,19 @@ def align_factorizations(
     reference: Float[Tensor, "*batch 4 sample"],
     weight: Float[Tensor, "*batch sample"],
 ) -> Ambiguity:
-    r"""Find the ambiguity that brings one factorization closest to another.
+    r"""Return the transformation that aligns one factorization best with another.
 
-    Minimises :math:`\sum_k w_k \lVert s e^{\omega} A_0 n_k - m_k \rVert^2` by Gauss-Newton
+    Minimizes :math:`\sum_k w_k \lVert s e^{\omega} A_0 n_k - m_k \rVert^2` by Gauss-Newton
     over scale and generators. It starts from the unconstrained linear solution and its
-    polar factor with respect to the form, reflections included.
+    polar factor with respect to the form, including reflections.
 
     Args:
         shading: ``N`` to be aligned, columns on the cone.
-        reference: What it is aligned to, columns on the cone.
-        weight: Not negative. Samples without weight are ignored.
+        reference: Target of the alignment, columns on the cone.
+        weight: Weights of samples, not negative. Samples of weight 0 are ignored.
 
-    Fails softly where the samples span less than four dimensions: the best transformation
-    found is still a scaled Lorentz transformation. Constant to autograd.
+    If the samples span less than four dimensions, the result is not unique, but still a scaled
+    Lorentz transformation. Constant to autograd.
     """
     with torch.no_grad():
         source, target, w = shading.double(), reference.double(), weight.double()[..., None, :]
@@ -116,21 +116,22 @@ def align_factorizations(
 
 
 def _nearest_lorentz(linear: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Take the polar factor with respect to the form by Newton's iteration.
+    """Return the polar factor with respect to the form, by Newton's iteration.
 
-    Source: Higham, Mackey, Mackey & Tisseur, SIAM J. Matrix Anal. 25(4), 2004. Where it does
-    not converge (the matrix is far from every Lorentz transformation) it gives the identity.
+    If it does not converge (far from every Lorentz transformation), the identity is returned.
+
+    Source: Higham, Mackey, Mackey & Tisseur, SIAM J. Matrix Anal. 25(4), 2004.
     """
     eta = minkowski(linear)
     scale = Ambiguity(matrix=linear).scale[..., None, None]
-    found = linear / scale.clamp_min(1e-30)
+    factor = linear / scale.clamp_min(1e-30)
     for _ in range(30):
-        inverse = torch.linalg.inv_ex(found).inverse
-        found = (found + eta @ inverse.mT @ eta) / 2
-    wrong = (found.mT @ eta @ found - eta).abs().amax(dim=(-2, -1)) > 1e-6
-    bad = wrong | ~found.isfinite().all(dim=-1).all(dim=-1) | (found[..., 0, 0] < 0)
+        inverse = torch.linalg.inv_ex(factor).inverse
+        factor = (factor + eta @ inverse.mT @ eta) / 2
+    inexact = (factor.mT @ eta @ factor - eta).abs().amax(dim=(-2, -1)) > 1e-6
+    failed = inexact | ~factor.isfinite().all(dim=-1).all(dim=-1) | (factor[..., 0, 0] < 0)
     eye = torch.eye(4, dtype=linear.dtype, device=linear.device)
-    return torch.where(bad[..., None, None], eye, found) * scale
+    return torch.where(failed[..., None, None], eye, factor) * scale
 
 
 def _algebra(generator: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:

@@ -1,12 +1,12 @@
-r"""Generalised bas-relief transformations, and a convention and lights that determine one.
+r"""Generalized bas-relief transformations, and their resolution by convention or equal lights.
 
 :math:`J = L B = (L A^{-1})(A B)` for every invertible 3 x 3 matrix, where the columns of ``B``
-are albedo times normal. Integrability, that normals belong to a surface ``z(x, y)``, restricts
-``A`` to the generalised bas-relief transformations :math:`\bar z = \lambda z + \mu x + \nu y`,
+are albedo times normal. Integrability (the normals are those of a surface ``z(x, y)``) restricts
+``A`` to the generalized bas-relief transformations :math:`\bar z = \lambda z + \mu x + \nu y`,
 times one factor between albedo and light.
 
-Point lights of one strength determine the quadratic form of lengths, of which bas-relief leaves
-four entries: the transformation follows up to convex or concave.
+Point lights of equal strength determine the quadratic form of lengths, of which bas-relief leaves
+four entries unknown. The transformation is then unique up to convex or concave.
 
 Source: Belhumeur, Kriegman & Yuille, IJCV 35(1), 1999; Hayakawa, Photometric stereo under a light
 source with arbitrary motion, JOSA A 11(11), 1994, for the form.
@@ -30,13 +30,13 @@ PerPixel = Float[Tensor, " pixel"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class BasRelief(Record):
-    r"""A generalised bas-relief transformation, ready to act on a factorization.
+    r"""A generalized bas-relief transformation of a factorization.
 
     Camera frame, ``n_z < 0``; depth becomes :math:`\lambda z + \mu x + \nu y`, and
     :math:`b = \rho n` becomes ``G b`` with ``G = [[lambda, 0, -mu], [0, lambda, -nu], [0, 0, 1]]``.
 
     Attributes:
-        lam: Flattening, not zero; below zero hills become valleys.
+        lam: Factor of depth, not zero; a negative factor turns hills into valleys.
 
     >>> tilt = BasRelief(mu=torch.tensor(0.5), nu=torch.tensor(0.0), lam=torch.tensor(2.0))
     >>> tilt.on_shading(torch.tensor([[0.0], [0.0], [-1.0]]))[:, 0]
@@ -59,15 +59,15 @@ class BasRelief(Record):
         return self.matrix @ shading
 
     def on_lights(self, lights: Float[Tensor, "*batch view 3"]) -> Float[Tensor, "..."]:
-        """Return ``L G^-1``, so that the product with :meth:`on_shading` stays the data."""
+        """Return ``L G^-1``; its product with :meth:`on_shading` is the data."""
         return lights @ self.inverse().matrix
 
     def inverse(self) -> "BasRelief":
-        """Return the transformation that undoes this one."""
+        """Return the inverse transformation."""
         return BasRelief(mu=-self.mu / self.lam, nu=-self.nu / self.lam, lam=1 / self.lam)
 
     def after(self, first: "BasRelief") -> "BasRelief":
-        """Return this transformation after another: they form a group."""
+        """Return the composition: ``first``, then this transformation. They form a group."""
         return BasRelief(
             mu=self.lam * first.mu + self.mu,
             nu=self.lam * first.nu + self.nu,
@@ -76,28 +76,29 @@ class BasRelief(Record):
 
 
 def standard_relief(shading: Shading, weight: PerPixel | None = None) -> BasRelief:
-    r"""Find the transformation to a canonical form, the same for all bas-reliefs of a surface.
+    r"""Return the transformation to a canonical form, common to all bas-reliefs of a surface.
 
-    After it a surface is upright on average and as deep as a ball:
-    :math:`\sum w x z = \sum w y z = 0` and :math:`\sum w (x^2 + y^2) = \sum w z^2`. Lambda is above
-    zero; NaN where all normals are parallel. Differentiable.
+    The transformed surface is upright on average and as deep as a ball:
+    :math:`\sum w x z = \sum w y z = 0` and :math:`\sum w (x^2 + y^2) = \sum w z^2`. Lambda is
+    positive, and NaN if all normals are parallel. Differentiable.
     """
     x, y, z = shading.double()
     w = torch.ones_like(z) if weight is None else weight.double()
     depth = (w * z * z).sum()
     tilt_x, tilt_y = (w * x * z).sum() / depth, (w * y * z).sum() / depth
     slant = (w * ((x - tilt_x * z).square() + (y - tilt_y * z).square())).sum()
-    # The relative rounding of squares of parallel vectors in float32.
+    # Relative rounding error of squares of parallel vectors in float32.
     curved = slant > 1e-12 * (depth + (w * (x * x + y * y)).sum())
     lam = (depth / torch.where(curved, slant, torch.nan)).sqrt()
     return BasRelief(mu=lam * tilt_x, nu=lam * tilt_y, lam=lam)
 
 
 def convex(relief: BasRelief, shading: Shading, weight: PerPixel, mask: Mask) -> BasRelief:
-    """Choose the convex one of a transformation and its mirror image, which fit equally well.
+    """Return the transformation or its mirror image, which fits equally well: the convex one.
 
     Args:
-        shading: It is applied to this, raster order; normals then point outwards on average.
+        shading: Shading before the transformation, in raster order. After the returned one,
+            normals point outwards on average.
     """
     upright = relief.to(shading.dtype)
     sideways, w = upright.on_shading(shading)[:2], weight.to(shading)
@@ -111,13 +112,14 @@ def convex(relief: BasRelief, shading: Shading, weight: PerPixel, mask: Mask) ->
 def relief_from_strength(
     lights: Float[Tensor, "view 3"], shading: Shading, weight: PerPixel, mask: Mask
 ) -> BasRelief:
-    """Find the bas-relief transformation that gives most point lights one strength; convex.
+    """Return the convex bas-relief transformation under which most point lights are equally strong.
 
-    Squared strengths are fitted to 1 under Cauchy's loss from several depths. Constant to autograd.
+    Squared strengths are fitted to 1 with Cauchy's loss from several initial depths. Constant to
+    autograd.
 
     Args:
-        lights: Of the same factorization as the shading; zero rows are ignored.
-        shading: Albedo times normal up to a bas-relief transformation, raster order; it
+        lights: Lights of the same factorization as the shading; zero rows are ignored.
+        shading: Albedo times normal up to a bas-relief transformation, in raster order; it
             distinguishes convex from concave.
     """
     rows = lights[(lights != 0).any(dim=1)].detach().double()
@@ -128,8 +130,8 @@ def relief_from_strength(
     size = rows.norm(dim=1).median()
     x, y, z = (rows / size).mT.numpy()
 
-    def excess(at: np.ndarray) -> np.ndarray:
-        across, tilt_x, tilt_y, along = at
+    def excess(parameters: np.ndarray) -> np.ndarray:
+        across, tilt_x, tilt_y, along = parameters
         return across**2 * (x * x + y * y) + (tilt_x * x + tilt_y * y + along * z) ** 2 - 1
 
     # Strengths that differ by more than 2.5 % lose weight.

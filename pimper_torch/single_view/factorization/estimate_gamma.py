@@ -1,15 +1,15 @@
-r"""Radiometric self-calibration: the gamma under which first-order light fits the photographs.
+r"""Radiometric self-calibration: the gamma for which first-order light fits the photographs best.
 
-Views of the same samples under several lights are, as radiance, a matrix of rank 3 (distant
-point lights) or 4 (ambient light besides); under a wrong response they are not. For each exponent
-the residual is that of the encoded values, where the noise is,
+The radiance of the same samples in several views under different lights is a matrix of rank 3
+(distant point lights) or 4 (with ambient light); with a wrong response it is not. For each
+exponent, the residual is computed in encoded values, where the noise is,
 
 .. math:: e = M - (L R)^{1/\gamma}, \qquad f(\gamma) = \min_{L, R} \sum \rho(e),
 
-so that it is comparable over exponents. A residual in radiance, even relative to radiance
-itself, is not: ``M ** gamma`` tends to a matrix of ones, which is of rank 1, as gamma falls.
-To first order noise adds to ``f`` its variance times the degrees of freedom, whatever the
-exponent, and does not shift the minimum.
+and is therefore comparable between exponents. A residual in radiance, even relative to radiance,
+is not: ``M ** gamma`` tends to a matrix of ones, of rank 1, as gamma decreases. To first order,
+noise adds its variance times the degrees of freedom to ``f``, independent of the exponent, and
+does not shift the minimum.
 """
 
 import math
@@ -34,12 +34,12 @@ Seen = Bool[Tensor, "view sample"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class EncodedFit(Record):
-    """Encoded values of the same samples in several views, and light fitted to them.
+    """Encoded values of the same samples in several views, and a fit of first-order light.
 
     Attributes:
-        scale: Of Cauchy's loss; 0 is least squares.
-        predicted: By the fit; at first the values themselves.
-        weight: Of each entry, less for outliers; 0 where not used.
+        scale: Scale of Cauchy's loss; 0 for least squares.
+        predicted: Values of the fit; initially the encoded values.
+        weight: Weight of each entry, less for outliers; 0 where not used.
         left: Left factor.
     """
 
@@ -52,7 +52,7 @@ class EncodedFit(Record):
 
     @property
     def loss(self) -> Samples:
-        """Of each entry; 0 where not used."""
+        """Loss of each entry; 0 where not used."""
         square = (self.used * (self.encoded - self.predicted)).square()
         return self.scale**2 * (square / self.scale**2).log1p() if self.scale else square
 
@@ -74,12 +74,12 @@ class EncodedFit(Record):
 def fit_encoded(start: EncodedFit, response: Response, iterations: int = 1) -> EncodedFit:
     """Fit first-order light to encoded values through a response; constant to autograd.
 
-    The encoded residual is linearized, first about the start, the fit of a similar response, then
-    about the fit: it is then least squares in radiance, weighted by the square of the response's
-    slope.
+    The encoded residual is linearized about the start, a fit of a similar response, and then about
+    the new fit. Linearized, it is least squares in radiance, weighted by the square of the
+    response's slope.
 
     Args:
-        iterations: Further linearizations about the fit, with outlier weights.
+        iterations: Number of further linearizations about the fit, with outlier weights.
     """
     about, weight, left = start.predicted, start.used * start.weight, start.left
     for iteration in range(iterations + 1):
@@ -97,34 +97,35 @@ def fit_encoded(start: EncodedFit, response: Response, iterations: int = 1) -> E
 
 
 def enough(used: Seen, rank: int) -> Seen:
-    """Leave out samples and views with too few entries to constrain the factors."""
+    """Return the entries without samples and views that have too few to constrain the factors."""
     for _ in range(2):
         used = used & (used.sum(dim=0) > rank) & (used.sum(dim=1, keepdim=True) > 2 * rank)
     return used
 
 
-# Range of the search, a choice: it holds all curves in use; 1 is linear.
+# The values below are chosen by hand.
+# Range of the search, which contains all curves in use; 1 is linear.
 MIN_GAMMA, MAX_GAMMA = 0.4, 4.0
-# Exponents of the grid search, a choice: even in their logarithm, 1.4 times one another.
+# Number of exponents of the grid search, evenly spaced in their logarithm by factors of 1.4.
 _TRIALS = 8
 _STEP = (MAX_GAMMA / MIN_GAMMA) ** (1 / (_TRIALS - 1))
 
-# Maximum relative standard error: a choice, twice as much would not distinguish 1.8 from 2.2.
+# Maximum relative standard error; twice as much would not distinguish 1.8 from 2.2.
 _MAX_UNCERTAIN = 0.1
 
-# Maximum residual: a choice, four levels of 255; more is shadows, highlights, or another curve.
+# Maximum residual, four levels of 255; above it there are shadows, highlights, or another curve.
 _MAX_RESIDUAL = 0.015
 
-# Encoded value up to which shading is not first-order.
+# Encoded value below which shading is not first-order.
 _DARK = 0.1
 
-# Minimum scale of Cauchy's loss: a choice, an eighth of a level of 8 bits.
+# Minimum scale of Cauchy's loss, an eighth of a level of 8 bits.
 _MIN_SCALE = 5e-4
 
-# The estimate is checked without these fractions of the entries, the darkest: a choice.
+# The estimate is checked without these fractions of the darkest entries.
 _DARKEST_FRACTIONS = (1 / 3, 1 / 2)
-# Difference from the estimate of the brighter entries, in its standard errors, above which they
-# replace the estimate: a choice.
+# If the estimate from brighter entries differs by more than this number of its standard errors, it
+# replaces the estimate from all.
 _MAX_ERRORS = 3.0
 
 
@@ -133,10 +134,11 @@ class GammaEstimate(Record):
     """The estimated exponent of a gamma curve, ``radiance = encoded ** gamma``.
 
     Attributes:
-        standard_error: Of gamma, from its variation over samples, or views if that is larger.
-        determined: False where the standard error is more than a tenth of gamma, the minimum is
-            at an end of the range, or residuals exceed a camera's noise.
-        residual: Robust standard deviation of the residuals in encoded values, 1 being full scale.
+        standard_error: Standard error of gamma, from its variation over samples, or over views if
+            that is larger.
+        determined: False if the standard error is more than a tenth of gamma, the minimum is at an
+            end of the range, or residuals exceed the noise of cameras.
+        residual: Robust standard deviation of the residuals in encoded values; 1 is full scale.
     """
 
     gamma: float
@@ -149,31 +151,31 @@ class GammaEstimate(Record):
 
     def __str__(self) -> str:
         """Return the estimate in a sentence."""
-        found = (
+        estimate = (
             f"gamma {self.gamma:.3f} +- {self.standard_error:.3f}; residual "
             f"{100 * self.residual:.2f} % of full scale, {100 * self.residual_linear:.2f} % if "
             f"linear, {100 * self.residual_srgb:.2f} % if sRGB"
         )
         if self.determined:
-            return f"{found}."
-        why = "light or surfaces vary too little"
+            return f"{estimate}."
+        reason = "light or surfaces vary too little"
         if self.residual > _MAX_RESIDUAL:
-            why = "shadows, highlights, another curve or a camera that moved leave more than noise"
-        return f"gamma is not determined by these photographs, {why} ({found})."
+            reason = "residuals are large: shadows, highlights, a moved camera, or another curve"
+        return f"gamma is not determined by these photographs; {reason} ({estimate})."
 
 
 def estimate_gamma(encoded: Samples, seen: Seen, *, rank: int = 4) -> GammaEstimate:
     """Estimate gamma from the same surface samples under several lights.
 
-    Dark and saturated values are left out: first by their observed values, then by those the fit
-    predicts, as selecting by noisy values biases gamma. Outliers lose weight. Where the estimate
-    from the brighter entries differs significantly, it is taken: ambient light in attached shadows
-    is not first-order.
+    Dark and saturated values are excluded: first by observed values, then by predictions of the
+    fit, because selection by noisy values biases gamma. Outliers lose weight. If the estimate from
+    the brighter entries differs significantly, it is used: ambient light in attached shadows is not
+    first-order.
 
     Args:
-        encoded: As the files hold them, 1 being full scale.
-        seen: False where missing. Dark and saturated values may be seen.
-        rank: 3 for distant point lights alone, 4 with ambient light.
+        encoded: Values as in the files; 1 is full scale.
+        seen: False for missing values. Dark and saturated values may be included.
+        rank: 3 for distant point lights only, 4 with ambient light.
 
     Raises:
         InputError: Values outside [0, 1] or not finite, an impossible rank, or fewer
@@ -188,19 +190,19 @@ def estimate_gamma(encoded: Samples, seen: Seen, *, rank: int = 4) -> GammaEstim
     outside = int((seen & ~((encoded >= 0) & (encoded <= 1))).sum())
     if outside:
         raise InputError(
-            f"{outside} encoded values are not from 0 to 1; needed: fractions of the files' full "
-            "scale, or `seen` false for these."
+            f"{outside} encoded values are outside 0 to 1; needed: fractions of the files' full "
+            "scale, or `seen` false for these values."
         )
     with torch.no_grad():
         fit = _sampled(encoded, seen, rank)
-        for _ in range(2):  # the first still starts from a selection by noisy values
-            fit = _chosen_by_fit(_grid_search(fit, iterations=0)[1])
+        for _ in range(2):  # the first one still depends on a selection by noisy values
+            fit = _selected_by_fit(_grid_search(fit, iterations=0)[1])
         gamma, error, fit = _consistent_minimum(fit)
-        sure = _inside_range(gamma) and error < _MAX_UNCERTAIN * gamma
+        certain = _inside_range(gamma) and error < _MAX_UNCERTAIN * gamma
         return GammaEstimate(
             gamma=gamma,
             standard_error=error,
-            determined=sure and fit.spread < _MAX_RESIDUAL,
+            determined=certain and fit.spread < _MAX_RESIDUAL,
             residual=fit.spread,
             residual_linear=fit_encoded(fit, Linear(), 2).spread,
             residual_srgb=fit_encoded(fit, Srgb(), 2).spread,
@@ -212,8 +214,8 @@ def gamma_of_photographs(views: Views, *, mask: Mask | None = None, rank: int = 
     """Estimate the gamma of photographs that a fixed camera took under several lights.
 
     Args:
-        views: Read with :data:`~pimper_torch.ground.radiometry.LINEAR`; pixels that any of their
-            masks leaves out are left out.
+        views: Views loaded with :data:`~pimper_torch.ground.radiometry.LINEAR`; only pixels in all
+            of their masks are used.
         mask: True on the object, for all photographs.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:
@@ -221,37 +223,37 @@ def gamma_of_photographs(views: Views, *, mask: Mask | None = None, rank: int = 
             "the photographs have unlike sizes; needed: photographs of one fixed camera."
         )
     inside = views.inside if views.masks is None else views.inside & views.masks
-    where = inside.all(dim=0)
+    pixels = inside.all(dim=0)
     if mask is not None:
-        if mask.shape != where.shape:
+        if mask.shape != pixels.shape:
             raise InputError(
                 f"the mask is {mask.shape[1]} x {mask.shape[0]}, the photographs are "
-                f"{where.shape[1]} x {where.shape[0]}; needed: a mask of the same size."
+                f"{pixels.shape[1]} x {pixels.shape[0]}; needed: a mask of the same size."
             )
-        where = where & mask
-    encoded = views.images[:, views.images.shape[1] // 2][:, where]
+        pixels = pixels & mask
+    encoded = views.images[:, views.images.shape[1] // 2][:, pixels]
     return estimate_gamma(encoded, torch.ones_like(encoded, dtype=torch.bool), rank=rank)
 
 
 def _sampled(encoded: Samples, seen: Seen, rank: int) -> EncodedFit:
-    """Subsample, and use entries that are neither dark nor saturated."""
+    """Return a start from a subset of the samples, without dark and saturated entries."""
     used = enough(seen & (encoded > _DARK) & (encoded < SATURATED), rank)
     views, samples = used.any(dim=1), used.any(dim=0).nonzero().flatten()
     if int(views.sum()) <= rank + 1 or len(samples) <= 4 * rank:
         raise InputError(
             f"only {len(samples)} samples are lit in more than {rank} of {len(seen)} views; "
             f"needed: more than {4 * rank}, in at least {rank + 2} views. Add photographs under "
-            "other lights, expose so that less is dark or saturated, or lower the rank."
+            "other lights, expose so that fewer pixels are dark or saturated, or lower the rank."
         )
     count = min(300, len(samples))
     spaced = torch.linspace(0, len(samples) - 1, count, dtype=torch.float64).round().long()
-    chosen = samples[spaced.to(samples.device)]
-    used = enough(used[views][:, chosen], rank)
-    return _start(torch.where(seen, encoded, 0)[views][:, chosen].double(), used, rank, 0.0)
+    subset = samples[spaced.to(samples.device)]
+    used = enough(used[views][:, subset], rank)
+    return _start(torch.where(seen, encoded, 0)[views][:, subset].double(), used, rank, 0.0)
 
 
 def _start(encoded: Samples, used: Seen, rank: int, scale: float) -> EncodedFit:
-    """Start from the values, with the left factor under the least gamma."""
+    """Return a start from the encoded values, with the left factor for the smallest gamma."""
     mask, about = used.double(), torch.where(used, encoded, 0.5)
     radiance = Gamma(exponent=MIN_GAMMA).linear_from_encoded(about)
     guess = low_rank.brightness_guess(radiance, mask)[None]
@@ -261,10 +263,10 @@ def _start(encoded: Samples, used: Seen, rank: int, scale: float) -> EncodedFit:
     )
 
 
-def _chosen_by_fit(fit: EncodedFit) -> EncodedFit:
-    """Start on entries that a fit predicts to be lit and not saturated, with outlier weights."""
+def _selected_by_fit(fit: EncodedFit) -> EncodedFit:
+    """Return a start from entries predicted to be lit and not saturated, with outlier weights."""
     encoded, predicted, rank = fit.encoded, fit.predicted, fit.left.shape[1]
-    lit = (predicted > _DARK) & (encoded > _DARK / 2)  # far below: a cast shadow; 0: missing
+    lit = (predicted > _DARK) & (encoded > _DARK / 2)  # far below: cast shadow; 0: missing
     lit = lit & (predicted < SATURATED - _DARK / 2) & (encoded < SATURATED)
     used = enough(lit & (fit.used.sum(dim=0) > rank), rank)
     if int(used.any(dim=0).sum()) <= 4 * rank:
@@ -275,12 +277,12 @@ def _chosen_by_fit(fit: EncodedFit) -> EncodedFit:
 
 
 def _grid_search(fit: EncodedFit, iterations: int) -> tuple[float, EncodedFit]:
-    found = []
+    fits = []
     for trial in range(_TRIALS):
         gamma = MIN_GAMMA * _STEP**trial
         fit = fit_encoded(fit, Gamma(exponent=gamma), iterations)
-        found.append((gamma, fit))
-    return min(found, key=lambda one: float(one[1].loss.sum()))
+        fits.append((gamma, fit))
+    return min(fits, key=lambda pair: float(pair[1].loss.sum()))
 
 
 def _inside_range(gamma: float) -> bool:
@@ -288,12 +290,12 @@ def _inside_range(gamma: float) -> bool:
 
 
 def _minimise(fit: EncodedFit, low: float, high: float) -> tuple[float, float, EncodedFit]:
-    r"""Find the gamma of least loss, its sandwich standard error, and the fit there.
+    r"""Return the gamma of least loss, its sandwich standard error, and its fit.
 
-    With :math:`s_k` the derivative of the loss of sample (or view) k along the profile and h the
-    second derivative of the whole, the variance is :math:`\sum_k s_k^2 / h^2`, over samples, or
-    over views if that is larger; it needs no model of the noise. Infinite where the loss has next
-    to no curvature.
+    With the derivative :math:`s_k` of the loss of sample (or view) k along the profile, and the
+    second derivative h of the total loss, the variance is :math:`\sum_k s_k^2 / h^2`, over samples
+    or over views, whichever is larger; it needs no model of the noise. The standard error is
+    infinite if the loss has almost no curvature.
     """
 
     def loss(logarithm: float) -> float:
@@ -302,38 +304,38 @@ def _minimise(fit: EncodedFit, low: float, high: float) -> tuple[float, float, E
         return float(fit.loss.sum())
 
     bounds = (math.log(max(low, MIN_GAMMA)), math.log(min(high, MAX_GAMMA)))
-    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-4})
-    gamma = math.exp(found.x)
+    minimum = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-4})
+    gamma = math.exp(minimum.x)
     fit, step = fit_encoded(fit, Gamma(exponent=gamma)), 0.02 * gamma
     below, above = (
-        fit_encoded(fit, Gamma(exponent=one)).loss for one in (gamma - step, gamma + step)
+        fit_encoded(fit, Gamma(exponent=value)).loss for value in (gamma - step, gamma + step)
     )
     curvature = float((below + above - 2 * fit.loss).sum()) / step**2
     slope = (above - below) / (2 * step)
     noise = max(float(slope.sum(dim=axis).square().sum()) for axis in (0, 1)) ** 0.5
-    # On data without noise everything but the curvature is rounding.
+    # On data without noise, everything except the curvature is rounding error.
     curved = curvature * gamma**2 > (_MIN_SCALE * 0.1) ** 2 * int(fit.used.sum())
     return gamma, noise / curvature if curved else math.inf, fit
 
 
 def _consistent_minimum(fit: EncodedFit) -> tuple[float, float, EncodedFit]:
-    """Estimate from all entries, or from the brighter ones where theirs differs significantly.
+    """Return the minimum of all entries, or of the brighter ones if it differs significantly.
 
-    Ambient light in attached shadows is not first-order: it biases the estimate from all entries.
+    Ambient light in attached shadows is not first-order, and biases the estimate from all entries.
     """
     best, fit = _grid_search(fit, 1)
-    found = [_minimise(fit, best / _STEP, best * _STEP)]
-    fit = found[0][2]
+    minima = [_minimise(fit, best / _STEP, best * _STEP)]
+    fit = minima[0][2]
     for fraction in _DARKEST_FRACTIONS:
-        level = fit.predicted[fit.used].quantile(fraction)
-        used = enough(fit.used & (fit.predicted > level), fit.left.shape[1])
+        threshold = fit.predicted[fit.used].quantile(fraction)
+        used = enough(fit.used & (fit.predicted > threshold), fit.left.shape[1])
         if (brighter := fit.replace(used=used)).freedom < 100:  # no reliable standard error
             break
-        found.append(_minimise(brighter, MIN_GAMMA, MAX_GAMMA))
+        minima.append(_minimise(brighter, MIN_GAMMA, MAX_GAMMA))
     while any(
-        abs(gamma - found[0][0]) > _MAX_ERRORS * error + 1e-3 * found[0][0]
-        for gamma, error, _ in found[1:]
+        abs(gamma - minima[0][0]) > _MAX_ERRORS * error + 1e-3 * minima[0][0]
+        for gamma, error, _ in minima[1:]
         if _inside_range(gamma)
     ):
-        found = found[1:]
-    return found[0]
+        minima = minima[1:]
+    return minima[0]

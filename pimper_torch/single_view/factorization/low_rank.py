@@ -1,7 +1,7 @@
 r"""Low-rank factorization of matrices with missing entries, as a problem for the solvers.
 
-Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that depends on
-albedo and normal alone. The set of these vectors determines the ambiguity of a factorization:
+Radiance is :math:`x = l^\top s` with a light ``l`` and a shading vector ``s`` that only depends on
+albedo and normal. The set of these vectors determines the ambiguity of a factorization:
 
 =====================  ====  =============================  =====================
 light                  rank  :math:`s`                      ambiguity
@@ -38,13 +38,13 @@ Columns = Float[Tensor, "*batch rank sample"]
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """Any vectors: low-rank factorization, and with rank three albedo times normal."""
+    """Manifold of all vectors, for low-rank factorization; of rank 3, they are albedo times normal."""
 
     rank: int = 3
     flat: ClassVar[bool] = True
 
     def project(self, shading: Vectors) -> Vectors:
-        """Return the vector itself: it is on the manifold, and so is the end of every step."""
+        """Return the vectors, which are on the manifold before and after every step."""
         return shading
 
     retract = project
@@ -52,7 +52,7 @@ class Free:
     def curvature(
         self, shading: Columns, slope: Columns
     ) -> Float[Tensor, "*batch sample rank rank"]:
-        """Return the manifold's part of second derivatives: flat, it has none."""
+        """Return the manifold's part of second derivatives: zero, because it is flat."""
         return slope.new_zeros(*slope.shape[:-2], slope.shape[-1], self.rank, self.rank)
 
     def tangents(self, shading: Columns) -> list[Tensor]:
@@ -61,7 +61,7 @@ class Free:
         return [axis[:, None].expand_as(shading) for axis in eye]
 
     def split(self, shading: Vectors) -> tuple[Scalars, Vectors]:
-        """Return lengths and directions: albedo and normals with rank three."""
+        """Return lengths and directions: albedo and normals for rank 3."""
         length = shading.norm(dim=-1)
         return length, shading / torch.where(length > 0, length, 1)[..., None]
 
@@ -70,12 +70,12 @@ def low_rank_problem(matrix: Matrices, weight: Matrices, start: LeftFactors) -> 
     r"""Return the problem :math:`\min \sum w (X - L N)^2` over factors of low rank, in float64.
 
     Args:
-        matrix: ``X``, rows as views, columns as samples; entries without weight are ignored.
+        matrix: ``X``, rows as views, columns as samples; entries of weight 0 are ignored.
         start: Left factors of full rank.
 
     Raises:
-        InputError: A rank that the matrices do not have, a weight that is negative, or an
-            entry with weight that is not a number.
+        InputError: A rank larger than the matrices allow, a negative weight, or a value that is
+            not finite with a positive weight.
     """
     rows, columns = matrix.shape[1:]
     rank = start.shape[2]
@@ -84,23 +84,23 @@ def low_rank_problem(matrix: Matrices, weight: Matrices, start: LeftFactors) -> 
             f"rank is {rank}; needed: between 1 and {min(rows, columns)} for matrices of "
             f"{rows} x {columns}."
         )
-    heavy = weight.double().contiguous()
-    seen = heavy > 0
-    wrong = ~((heavy >= 0) & heavy.isfinite() & (matrix.isfinite() | ~seen))
-    if bool(wrong.any()):
+    weights = weight.double().contiguous()
+    seen = weights > 0
+    invalid = ~((weights >= 0) & weights.isfinite() & (matrix.isfinite() | ~seen))
+    if bool(invalid.any()):
         raise InputError(
-            f"{int(wrong.sum())} entries have a weight that is negative or not finite, or one "
-            "above 0 but no finite value; needed: weight 0 where there is no number."
+            f"{int(invalid.sum())} entries have a weight that is negative or not finite, or a "
+            "positive weight without a finite value; needed: weight 0 for missing values."
         )
-    known = torch.where(seen, matrix.double(), 0).contiguous()
+    values = torch.where(seen, matrix.double(), 0).contiguous()
     left = start.double()
     return Bilinear(
-        radiance=known,
-        weight=heavy,
+        radiance=values,
+        weight=weights,
         lights=left,
         prior_mean=left,
-        shading=known.new_zeros(len(known), rank, columns),
-        regularization=known.new_zeros(len(known), rows),
+        shading=values.new_zeros(len(values), rank, columns),
+        regularization=values.new_zeros(len(values), rows),
         manifold=Free(rank=rank),
     )
 
@@ -112,19 +112,19 @@ def singular_left(
     guess: Matrices | None = None,
     imputations: int = 20,
 ) -> LeftFactors:
-    """Initialize by singular vectors of the matrix, missing entries imputed iteratively.
+    """Return left singular vectors of the matrix, with iteratively imputed missing entries.
 
-    Missing entries start from a guess, by default the mean of their row, and are replaced by the
-    low-rank approximation in turn. Orthonormal; in float64.
+    Missing entries start from a guess, by default the mean of their row, and are repeatedly
+    replaced by the low-rank approximation. Orthonormal; in float64.
     """
     seen = weight > 0
-    known = torch.where(seen, matrix.double(), 0)
+    values = torch.where(seen, matrix.double(), 0)
     if guess is None:
-        guess = known.sum(dim=2, keepdim=True) / seen.sum(dim=2, keepdim=True).clamp_min(1)
-    filled = torch.where(seen, known, guess.double())
+        guess = values.sum(dim=2, keepdim=True) / seen.sum(dim=2, keepdim=True).clamp_min(1)
+    filled = torch.where(seen, values, guess.double())
     for _ in range(imputations + 1):
         left = torch.linalg.eigh(filled @ filled.mT).eigenvectors[..., -rank:]
-        filled = torch.where(seen, known, left @ (left.mT @ filled))
+        filled = torch.where(seen, values, left @ (left.mT @ filled))
     return left
 
 
@@ -132,12 +132,12 @@ def brightness_guess(matrix: Matrix, weight: Matrix) -> Matrix:
     """Return the product of each row's and each column's brightness, for missing entries."""
     gain = (weight * matrix).sum(dim=1, keepdim=True)
     gain = gain / weight.sum(dim=1, keepdim=True).clamp_min(1e-12)
-    level = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
-    return gain * (weight * matrix).sum(dim=0, keepdim=True) / level
+    expected = (weight * gain).sum(dim=0, keepdim=True).clamp_min(1e-12)
+    return gain * (weight * matrix).sum(dim=0, keepdim=True) / expected
 
 
 def random_left(batch: int, rows: int, rank: int, generator: torch.Generator) -> LeftFactors:
-    """Draw orthonormal left factors, evenly over all subspaces."""
+    """Return random orthonormal left factors, uniform over all subspaces."""
     drawn = torch.randn(batch, rows, rank, generator=generator, dtype=torch.float64)
     return torch.linalg.qr(drawn).Q
 
@@ -147,9 +147,9 @@ class Restarted(Record):
     """The best of several factorizations of one matrix.
 
     Attributes:
-        best: A batch of one, rows as views and columns as samples.
-        repeated: Whether ``repeats`` starts reached the best minimum; if not, there may well be a
-            better one.
+        best: Factors as a batch of one, rows as views and columns as samples.
+        repeated: Whether ``repeats`` starts reached the best minimum; otherwise a better one is
+            likely to exist.
     """
 
     best: Factors
@@ -181,17 +181,17 @@ def factorize_from_many(
     best: Factors | None = None
     residuals: list[float] = []
     seen = weight > 0
-    level = float((weight[seen] * matrix[seen].square()).sum() / weight[seen].sum()) ** 0.5
+    size = float((weight[seen] * matrix[seen].square()).sum() / weight[seen].sum()) ** 0.5
     for _ in range(max_starts):
         start = random_left(1, matrix.shape[0], rank, generator).to(matrix.device)
         problem = low_rank_problem(matrix[None], weight[None], start)
-        found = solve_variable_projection(problem, 300, 1e-9)
-        residuals.append(float(found.convergence.residual))
+        factors = solve_variable_projection(problem, 300, 1e-9)
+        residuals.append(float(factors.convergence.residual))
         if best is None or residuals[-1] < float(best.convergence.residual):
-            best = found
-        # On exact data the residuals are rounding, and all differ.
-        same = max(min(residuals) * (1 + 1e-6), 1e-6 * level)
-        repeated = sum(one <= same for one in residuals) >= repeats
+            best = factors
+        # On exact data, residuals are rounding errors and all differ.
+        threshold = max(min(residuals) * (1 + 1e-6), 1e-6 * size)
+        repeated = sum(residual <= threshold for residual in residuals) >= repeats
         if repeated:
             break
     assert best is not None

@@ -1,22 +1,22 @@
-r"""Discontinuity-preserving integration: which steps between pixels are continuous.
+r"""Discontinuity-preserving integration: detection of continuous steps between pixels.
 
 .. math:: \min_x \sum_e D_e\, \phi_\sigma\!\left(\frac{x_b - x_a}{u_e} - s_e\right)
 
-over steps ``e`` that normals predict as ``s_e``, with Geman and McClure's :math:`\phi`, which
-redescends: a step across a depth discontinuity is rejected instead of deforming the surface on
-both sides. That problem has many minima. It is solved by graduated non-convexity: from plain
-least squares :math:`\sigma` falls to its final value, then the weights converge; every linear
-system is solved to convergence, so that the result does not depend on the solver.
+over steps ``e`` with slopes ``s_e`` from the normals. Geman and McClure's loss :math:`\phi` is
+redescending: a step across a depth discontinuity is rejected instead of deforming the surface on
+both sides. The problem has many minima and is solved by graduated non-convexity: starting from
+least squares, :math:`\sigma` decreases to its final value, then the weights converge. Every linear
+system is solved to convergence, so the result does not depend on the solver.
 
-At a crease, and at an occlusion boundary, the slope along a step changes by more than on the
-steps beside it, and the predicted step is wrong by up to that change. Where the slope across a
-step changes so, both sides meet in one point at most. Such steps are not tested: they, and all
-rejected ones, keep a small weight. Components that are connected by such weights alone,
-whose relative depth normals do not determine, are so aligned in the mean of their border.
+At a crease or an occlusion boundary, the slope along a step changes by more than on the adjacent
+steps, and the predicted step is wrong by up to that change (kink). Where the slope across a step
+changes in this way (twist), both sides meet in at most one point. Such steps are not tested. They
+and the rejected steps keep a small weight, which aligns components of undetermined relative depth
+in the mean of their border.
 
 Source: Black & Rangarajan, IJCV 19(1), 1996, for the loss and its graduation; the partition into
-continuous components and borders follows Milano, Chung, Ott & Siegwart, 2025, though here
-components follow from the weights and are never fixed. Kinks and twists are ours.
+continuous components and borders follows Milano, Chung, Ott & Siegwart, 2025, but components
+follow from the weights and are never fixed. Kinks and twists are ours.
 """
 
 from dataclasses import dataclass
@@ -32,30 +32,30 @@ from pimper_torch.runtime.progress import report
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, joined
 
-# The final scale: residual at which a step keeps a quarter of its weight, in widths of a pixel at
-# the surface's depth, and the least in deviations of the residuals, so that noisy normals make no
-# discontinuities.
+# The final scale, the residual at which a step keeps a quarter of its weight: in pixel widths at
+# the surface's depth, and at least in deviations of the residuals, so that noisy normals do not
+# cause discontinuities.
 _SCALE_PX, _NOISE_SCALES = 0.3, 6.0
 
-# Maximum kink of a step that is tested, about the tangent of a crease's angle; likewise of the
-# slope across the step, which no crease along the raster has.
+# Maximum kink of a tested step, about the tangent of a crease's angle; and maximum twist, which
+# creases along the raster do not have.
 _KINK, _TWIST = 2.0, 1.0
 
 # Weight of steps that are rejected or not tested.
 _TIE = 1e-4
 
-# Mean change of the weights at convergence, and linear systems at most.
+# Mean change of the weights at convergence, and maximum number of linear systems.
 _CHANGE, _MAX_ITERATIONS = 5e-4, 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Continuity(Record):
-    """The continuous steps.
+    """Weights of the steps between pixels.
 
     Attributes:
         right: Weight in [0, 1] of each step to the right: 1 continuous, 1e-4 rejected, 0
             outside.
-        convergence: Of the weights; the residual is that of continuous steps, in pixels.
+        convergence: Convergence of the weights; the residual of continuous steps is in pixels.
     """
 
     right: StepsRight
@@ -64,21 +64,21 @@ class Continuity(Record):
 
 
 def find_discontinuities(
-    steps: Steps, weight: Float[Tensor, " step"], anchor: Map | None, heights: Map | None
+    steps: Steps, weight: Float[Tensor, " step"], known_weight: Map | None, heights: Map | None
 ) -> Continuity:
-    """Find the continuous steps; constant to autograd.
+    """Return the weights of continuous steps; constant to autograd.
 
     Args:
-        weight: ``D``, zero outside, in units of the squared unknown's inverse.
-        anchor: Of pixels whose unknown is given.
+        weight: ``D``, zero outside, in units of the inverse squared unknown.
+        known_weight: Weights of the known unknowns in ``heights``.
     """
     with torch.no_grad():
         inside = weight > 0
         tested = inside & steps.reliable & (steps.kink < _KINK) & (steps.twist < _TWIST)
         fraction = torch.where(tested, 1.0, _TIE) * inside
         scale, cause = 3.0, StopCause.LIMIT  # pixels
-        for taken in range(1, _MAX_ITERATIONS + 1):
-            system = RasterSystem(*steps.split(weight * fraction), anchor, tolerance=1e-6)
+        for iteration in range(1, _MAX_ITERATIONS + 1):
+            system = RasterSystem(*steps.split(weight * fraction), known_weight, tolerance=1e-6)
             right, down = differences(system.fit_steps(*steps.target, heights))
             residual = joined(right, down) / steps.unit - steps.slope
             deviation = 1.4826 * float(residual[tested].abs().median()) if tested.any() else 0.0
@@ -88,7 +88,7 @@ def find_discontinuities(
             geman_mcclure = (1 + (residual / scale).square()) ** -2
             before = fraction
             fraction = torch.where(tested, geman_mcclure, 0).clamp_min(_TIE) * inside
-            report(taken, _MAX_ITERATIONS)
+            report(iteration, _MAX_ITERATIONS)
             change = float((fraction - before).abs().sum()) / max(1, int(inside.sum()))
             if narrowed and change < _CHANGE:
                 cause = StopCause.CONVERGED
@@ -100,7 +100,7 @@ def find_discontinuities(
             right=right,
             down=down,
             convergence=Convergence(
-                iterations=torch.tensor([taken]),
+                iterations=torch.tensor([iteration]),
                 residual=square.sqrt()[None],
                 cause=torch.tensor([int(cause)]),
             ),

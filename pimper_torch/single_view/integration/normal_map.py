@@ -1,4 +1,4 @@
-"""Integration of a normal map to depth, orthographic or pinhole, with mask, weights and anchors."""
+"""Integration of a normal map to depth: parallel or pinhole rays, mask, weights, known depths."""
 
 import math
 from dataclasses import dataclass
@@ -26,19 +26,19 @@ from pimper_torch.single_view.integration.steps import (
 Raster = Tensor | np.ndarray
 Integration = Literal["discontinuities", "weighted"]
 
-# Weight of steps over pixels without a normal, whose slopes are inpainted: a choice.
+# Weight of steps over pixels without a normal, whose slopes are inpainted; chosen by hand.
 _FILLED_WEIGHT = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class IntegratedMap(Record):
-    """A surface over a raster.
+    """Depth map of a surface.
 
     Attributes:
-        depth: Along z; 0 outside. A component of the mask without known depth has the geometric
-            mean 1 under a pinhole, and the mean 0 under parallel rays.
+        depth: Depth along z; 0 outside. A component of the mask without known depth has the
+            geometric mean 1 for a pinhole camera, and the mean 0 for parallel rays.
         valid: True where a normal was used; the mask's other pixels are interpolated.
-        continuity: The continuous steps between pixels; ``None`` where all are.
+        continuity: The continuous steps between pixels; ``None`` if all are.
     """
 
     depth: Map
@@ -56,23 +56,24 @@ def integrate_normal_map(
     known_depth: Raster | None = None,
     method: Integration = "discontinuities",
 ) -> IntegratedMap:
-    """Integrate a normal map to depth.
+    """Return the depth of a normal map.
 
     Args:
         normals: ``height width 3``: x right, y down, z forward into the surface; facing the
-            viewer. Of any length; where not finite, zero or facing away the surface is
-            interpolated. Like the other rasters, tensors or numpy arrays.
-        mask: Pixels of the surface; all if not given.
-        intrinsics: Of the pinhole, in pixels from the corner of the top-left one; without it
-            rays are parallel.
-        spacing: Distance of neighbouring pixels in a row and in a column, under parallel rays.
-        weight: Of each normal, that of a known depth being 1; 1 if not given, 0 like not finite.
-        known_depth: Depth at some pixels, NaN at the others.
+            viewer, of any length. The surface is interpolated where they are not finite, zero or
+            facing away. Rasters are tensors or NumPy arrays.
+        mask: Pixels of the surface; all by default.
+        intrinsics: Intrinsics of a pinhole camera, in pixels from the corner of the top-left
+            pixel; by default rays are parallel.
+        spacing: Distance of neighbouring pixels in a row and in a column, for parallel rays.
+        weight: Weight of each normal relative to a known depth, by default 1; normals of weight 0
+            are ignored.
+        known_depth: Depth at known pixels, NaN elsewhere.
         method: ``"discontinuities"`` preserves depth discontinuities; ``"weighted"`` is least
             squares.
 
     Raises:
-        InputError: Unusable rasters, or normals coded as colours or with z to the viewer.
+        InputError: Unusable rasters, or normals encoded as colours or with z to the viewer.
 
     Differentiable in normals, weights and known depths; which steps are continuous is constant.
 
@@ -95,7 +96,7 @@ def integrate_normal_map(
     frame = (box[1].start, mask.shape[1] - box[1].stop, box[0].start, mask.shape[0] - box[0].stop)
     if intrinsics is not None:
         intrinsics = crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
-    # The box of the mask, to save time and memory.
+    # Crop to the bounding box of the mask, to save time and memory.
     mask, weight, known_depth = mask[box], weight[box], known_depth[box]
     length = normals[box].norm(dim=-1)
     usable = mask & (length > 0) & length.isfinite() & (weight > 0)
@@ -106,19 +107,19 @@ def integrate_normal_map(
     else:
         steps = perspective_steps(unit, mask, intrinsics)
     continuity = None
-    anchor, unknown = _known(known_depth, mask, steps, intrinsics)
+    known_weight, unknown = _known_pixels(known_depth, mask, steps, intrinsics)
     reliability = torch.where(steps.valid, weight.double(), 0)
     least = torch.where(steps.reliable, at_both_ends(torch.minimum, reliability), _FILLED_WEIGHT)
     weights = at_both_ends(torch.logical_and, steps.inside) * least / steps.unit**2
     if method == "discontinuities":
-        continuity = find_discontinuities(steps, weights, anchor, unknown)
+        continuity = find_discontinuities(steps, weights, known_weight, unknown)
         weights = weights * joined(continuity.right, continuity.down)
         continuity = continuity.replace(
             right=pad(continuity.right, frame), down=pad(continuity.down, frame)
         )
-    system = RasterSystem(*steps.split(weights), anchor)
-    found = system.fit_steps(*steps.target, unknown)
-    depth = torch.where(mask, found if intrinsics is None else found.exp(), 0)
+    system = RasterSystem(*steps.split(weights), known_weight)
+    solution = system.fit_steps(*steps.target, unknown)
+    depth = torch.where(mask, solution if intrinsics is None else solution.exp(), 0)
     return IntegratedMap(
         depth=pad(depth.to(normals), frame),
         valid=pad(steps.valid & mask, frame),
@@ -126,12 +127,15 @@ def integrate_normal_map(
     )
 
 
-def _known(depth: Map, mask: Mask, steps: Steps, intrinsics: Matrix3 | None) -> tuple[Map, Map]:
+def _known_pixels(
+    depth: Map, mask: Mask, steps: Steps, intrinsics: Matrix3 | None
+) -> tuple[Map, Map]:
+    """Return the weight and the unknown, depth or its logarithm, of pixels with known depth."""
     given = depth.isfinite() & mask
     if intrinsics is not None and bool((depth[given] <= 0).any()):
         raise InputError(
             f"known_depth has {int((depth[given] <= 0).sum())} values that are not positive; "
-            "under a pinhole all must be. Mark pixels of unknown depth with NaN."
+            "needed: positive depths for a pinhole camera. Mark unknown depths with NaN."
         )
     safe = torch.where(given, depth.double(), 1)
     unknown = safe if intrinsics is None else safe.log()
@@ -141,7 +145,7 @@ def _known(depth: Map, mask: Mask, steps: Steps, intrinsics: Matrix3 | None) -> 
 def _refuse(
     normals: Tensor, mask: Tensor, weight: Tensor, known: Tensor, spacing: tuple[float, float]
 ) -> None:
-    """Refuse unusable rasters, and normals that are coded as colours or face away."""
+    """Refuse unusable rasters, and normals that are encoded as colours or face away."""
     if normals.ndim != 3 or normals.shape[-1] != 3 or not normals.is_floating_point():
         raise InputError(
             f"normals are {str(normals.dtype).removeprefix('torch.')} of shape "
@@ -156,19 +160,19 @@ def _refuse(
         count = int((~(weight >= 0)).sum())
         raise InputError(f"weight has {count} values that are negative or NaN; needed: 0 or more.")
     if not bool(mask.any()):
-        raise InputError("mask has no pixel; at least one must be inside.")
+        raise InputError("mask is empty; needed: at least one pixel.")
     if not all(0 < step < math.inf for step in spacing):
-        raise InputError(f"spacing is {spacing}; both distances must be above 0.")
-    some = normals.detach()[mask.bool()]
-    some = some[some.isfinite().all(dim=-1) & (some != 0).any(dim=-1)]
-    axes = "needed: x right, y down, z into the surface, n_z < 0 where it faces the viewer"
-    if len(some) > 1 and bool(((some >= 0) & (some <= 1)).all()):
+        raise InputError(f"spacing is {spacing}; needed: two distances above 0.")
+    usable = normals.detach()[mask.bool()]
+    usable = usable[usable.isfinite().all(dim=-1) & (usable != 0).any(dim=-1)]
+    axes = "needed: x right, y down, z into the surface; n_z < 0 where it faces the viewer"
+    if len(usable) > 1 and bool(((usable >= 0) & (usable <= 1)).all()):
         raise InputError(
-            f"normals lie in [0, 1], as colours do: decode them as 2 n - 1 first; {axes}."
+            f"normals are in [0, 1], which are encoded as colours: decode them as 2 n - 1; {axes}."
         )
-    away = float((some[:, 2] > 0).float().mean())
+    away = float((usable[:, 2] > 0).float().mean())
     if away > 0.5:
         raise InputError(
-            f"normals: {away:.0%} of them have z towards the viewer, as OpenGL's do, whose y "
-            f"points up, too: negate y and z; {axes}."
+            f"normals: {away:.0%} have z towards the viewer, as in OpenGL, where y is also up: "
+            f"negate y and z; {axes}."
         )

@@ -1,12 +1,12 @@
 r"""Differences of depth between neighbouring pixels, from normals.
 
-The unknown is the depth along z for parallel rays, and its logarithm for rays through a
-pinhole: then, with :math:`x` the unknown and the ray :math:`(u, v, 1)`,
+The unknown is the depth along z for parallel rays, and the logarithm of depth for a pinhole camera.
+In the latter case, with the unknown :math:`x` and the ray :math:`(u, v, 1)`,
 
 .. math:: \frac{\partial x}{\partial u} = -\frac{n_u}{n \cdot (u, v, 1)},
 
-as for parallel rays :math:`\partial z / \partial u = -n_u / n_z`. Both are slopes without a
-unit; times the distance of neighbouring pixels (``unit``: their spacing, or one over the focal
+and for parallel rays :math:`\partial z / \partial u = -n_u / n_z`. These slopes have no unit;
+multiplied by the distance of neighbouring pixels (``unit``: their spacing, or one over the focal
 length) they are steps of the unknown.
 """
 
@@ -29,12 +29,12 @@ PerStep = Shaped[Tensor, " step"]
 StepsRight = Shaped[Tensor, "height steps_right"]
 StepsDown = Shaped[Tensor, "steps_down width"]
 
-# Cosine between ray and normal below which a normal is not used: a choice, its slope is 1000.
+# Cosine between ray and normal below which a normal is not used (slope 1000); chosen by hand.
 _GRAZING = 1e-3
 
-# The cubic through four slopes is used where it differs from the chord by less than the first,
-# and where no crease (a change of slope that exceeds its neighbours' by the second) is near:
-# choices.
+# The cubic through four slopes is used where it differs from the chord by less than the first
+# value, and far from creases, where the change of slope exceeds its neighbours' by the second.
+# Chosen by hand.
 _MAX_DIFFERENCE, _MAX_KINK = 0.5, 0.3
 
 
@@ -43,14 +43,14 @@ class Steps(Record):
     """Slopes of the steps between neighbouring pixels: those to the right, then those down.
 
     Attributes:
-        slopes: At every pixel, right and down; inpainted where not valid.
-        slope: Of every step; 0 outside.
+        slopes: Slopes at every pixel, right and down; inpainted where not valid.
+        slope: Slope of every step; 0 outside.
         units: Change of the unknown on a step of slope 1, to the right and down.
-        reliable: True where both pixels are inside and their normals are usable.
-        kink: Change of the slope along the step, less that of the steps before and after:
+        reliable: True if both pixels are inside and have usable normals.
+        kink: Change of the slope along the step, minus that of the steps before and after:
             0 on a smooth surface.
-        twist: Likewise of the slope across the step, at depth discontinuities: sides of
-            different slope meet in one point at most.
+        twist: The same for the slope across the step. It is large at depth discontinuities: sides
+            of different slope meet in at most one point.
         valid: Pixels with a usable normal.
     """
 
@@ -75,10 +75,10 @@ class Steps(Record):
         return self.split(self.slope * self.unit)
 
     def split(self, values: PerStep) -> tuple[StepsRight, StepsDown]:
-        """Return the values of steps to the right and of those down, as rasters."""
+        """Return values of the steps to the right and down, as rasters."""
         height, width = self.inside.shape
-        many = height * (width - 1)
-        return values[:many].view(height, width - 1), values[many:].view(height - 1, width)
+        count = height * (width - 1)
+        return values[:count].view(height, width - 1), values[count:].view(height - 1, width)
 
 
 def joined(right: StepsRight, down: StepsDown) -> PerStep:
@@ -96,11 +96,11 @@ def at_both_ends(
 def orthographic_steps(
     normals: VectorMap, mask: Mask, spacing: tuple[float, float] = (1.0, 1.0)
 ) -> Steps:
-    """Return the steps of depth under parallel rays, differentiable in the normals.
+    """Return the steps of depth for parallel rays, differentiable in the normals.
 
     Args:
-        normals: Unit, ``n_z < 0``; where they are not finite or face away, slopes are inpainted
-            and the steps not reliable.
+        normals: Unit normals, ``n_z < 0``; where they are not finite or face away, slopes are
+            inpainted and steps not reliable.
         spacing: Distance of neighbouring pixels in a row and in a column.
     """
     towards = normals.new_tensor([0, 0, 1]).double()
@@ -108,9 +108,9 @@ def orthographic_steps(
 
 
 def perspective_steps(normals: VectorMap, mask: Mask, intrinsics: Matrix3) -> Steps:
-    r"""Return the steps of the logarithm of depth under rays through a pinhole.
+    r"""Return the steps of the logarithm of depth for a pinhole camera.
 
-    On a step the tangent planes of both pixels meet at the ray half-way, which is exact for
+    On a step, the tangent planes of both pixels meet on the ray half-way, which is exact for
     planes:
 
     .. math:: x_b - x_a = \log \frac{(n_a \cdot r_a)(n_b \cdot r_m)}
@@ -119,8 +119,8 @@ def perspective_steps(normals: VectorMap, mask: Mask, intrinsics: Matrix3) -> St
     Args:
         normals: As for :func:`orthographic_steps`, in the camera's frame.
 
-    Source: Milano, Lopez-Rodriguez, Ott, Siegwart & Chung, Discontinuity-aware normal
-    integration for generic central camera models, 2025, for the planes that meet.
+    Source of the meeting planes: Milano, Lopez-Rodriguez, Ott, Siegwart & Chung,
+    Discontinuity-aware normal integration for generic central camera models, 2025.
     """
     K = intrinsics.to(normals).double()
     centers = pixel_centers(mask.shape[1], mask.shape[0], like=K)
@@ -130,13 +130,13 @@ def perspective_steps(normals: VectorMap, mask: Mask, intrinsics: Matrix3) -> St
 
 
 def _between_planes(first: Scalars, second: Scalars, unit: float) -> tuple[Scalars, Scalars]:
-    """Return the step between tangent planes, and the rotation between them."""
-    if unit == 0:  # parallel rays; else one over the focal length
+    """Return the slope of the step between tangent planes, and the rotation between them."""
+    if unit == 0:  # parallel rays; otherwise one over the focal length
         return (first + second) / 2, second - first
     # With r_m half-way, n . r_m / n . r_a = 1 - (slope at a) unit / 2.
     ahead = (1 + unit / 2 * second).clamp_min(_GRAZING).log()
     behind = (1 - unit / 2 * first).clamp_min(_GRAZING).log()
-    # The logarithm of a plane's depth is curved: its slope's derivative is its square.
+    # The logarithm of a plane's depth is curved: the derivative of its slope is the squared slope.
     rotation = second - first - unit * first * second
     return (ahead - behind) / unit + unit / 24 * (first + second) * rotation, rotation
 
@@ -148,21 +148,21 @@ def _steps(
     mask: Mask,
     unit: tuple[float, float],
 ) -> Steps:
-    known = normals.isfinite().all(dim=-1)
-    facing = -(torch.where(known[..., None], normals, 0).double() * rays).sum(dim=-1)
-    valid = mask & known & (facing > _GRAZING)
+    finite = normals.isfinite().all(dim=-1)
+    facing = -(torch.where(finite[..., None], normals, 0).double() * rays).sum(dim=-1)
+    valid = mask & finite & (facing > _GRAZING)
     safe = torch.where(valid[..., None], normals.double(), -rays)
     across = (safe[..., :2] / -(safe * rays).sum(dim=-1)[..., None]).movedim(-1, 0)
     slopes = fill_smoothly(across[None], valid.to(across)[None])[0].movedim(0, -1)
     axes = []
     for axis in (0, 1):
-        own, other, known = slopes[..., axis], slopes[..., 1 - axis], valid
+        along, across, pixels = slopes[..., axis], slopes[..., 1 - axis], valid
         if axis == 1:
-            own, other, known = own.mT, other.mT, known.mT
-        both = known[:, 1:] & known[:, :-1]
-        step, kink = _curved(*_between_planes(own[:, :-1], own[:, 1:], bend[axis]), both)
-        found = step, both, kink, _excess(other.diff(dim=1), both)
-        axes.append([part.mT for part in found] if axis == 1 else found)
+            along, across, pixels = along.mT, across.mT, pixels.mT
+        known = pixels[:, 1:] & pixels[:, :-1]
+        step, kink = _curved(*_between_planes(along[:, :-1], along[:, 1:], bend[axis]), known)
+        result = step, known, kink, _excess(across.diff(dim=1), known)
+        axes.append([raster.mT for raster in result] if axis == 1 else result)
     step, reliable, kink, twist = (joined(right, down) for right, down in zip(*axes, strict=True))
     return Steps(
         slopes=slopes,
@@ -177,13 +177,13 @@ def _steps(
 
 
 def _curved(step: Changes, rotation: Changes, known: Known) -> tuple[Changes, Changes]:
-    """Correct steps to those of the cubic through four slopes, and give kinks.
+    """Return the steps of the cubic through four slopes, and kinks.
 
     The step between tangent planes is wrong by a twelfth of the surface's third derivative,
-    which on a sphere accumulates from pixel to pixel; the neighbouring rotations estimate it.
+    which accumulates from pixel to pixel on a sphere; the adjacent rotations estimate it.
     """
-    before, after = _beside(rotation, known)
-    has_before, has_after = _beside(known.to(rotation), known)
+    before, after = _adjacent(rotation, known)
+    has_before, has_after = _adjacent(known.to(rotation), known)
     kink = _excess(rotation, known)
     difference = after - before
     smooth = known & (has_before * has_after > 0)
@@ -192,13 +192,13 @@ def _curved(step: Changes, rotation: Changes, known: Known) -> tuple[Changes, Ch
 
 
 def _excess(change: Changes, known: Known) -> Changes:
-    """Return the excess of a slope's change over its neighbours'; no gradient."""
-    before, after = _beside(change.detach(), known)
-    beside = torch.maximum(before.abs(), after.abs())
-    return torch.where(known, (change.detach().abs() - beside).clamp_min(0), 0)
+    """Return the excess of a slope's change over that of adjacent steps; no gradient."""
+    before, after = _adjacent(change.detach(), known)
+    largest = torch.maximum(before.abs(), after.abs())
+    return torch.where(known, (change.detach().abs() - largest).clamp_min(0), 0)
 
 
-def _beside(change: Changes, known: Known) -> tuple[Changes, Changes]:
+def _adjacent(change: Changes, known: Known) -> tuple[Changes, Changes]:
     """Return the changes on the steps before and after each; 0 where those are not reliable."""
-    wide = pad(torch.where(known, change, 0), (1, 1))
-    return wide[:, :-2], wide[:, 2:]
+    padded = pad(torch.where(known, change, 0), (1, 1))
+    return padded[:, :-2], padded[:, 2:]

@@ -1,4 +1,4 @@
-"""Photometric stereo from one viewpoint: lights known or not, and one call for all methods."""
+"""Photometric stereo from one viewpoint, calibrated or uncalibrated, with one function."""
 
 from pimper_torch.single_view.photometric_stereo.stereo import PhotometricStereo, photometric_stereo
 

@@ -1,16 +1,16 @@
 r"""Uncalibrated photometric stereo under perspective projection, unique up to scale.
 
-With rays :math:`r = (x, y, 1)` the surface is :math:`z r`, and a vector b along its normal gives
-:math:`(\log z)_x = -b_1 / (b \cdot r)`, :math:`(\log z)_y = -b_2 / (b \cdot r)`. That these are
-the slopes of one function reads
+With rays :math:`r = (x, y, 1)` the surface is :math:`z r`, and a vector b along its normal
+determines the slopes :math:`(\log z)_x = -b_1 / (b \cdot r)` and
+:math:`(\log z)_y = -b_2 / (b \cdot r)`. They are integrable if
 
 .. math:: (b \times b_x)_1 + (b \times b_y)_2 - x (b \times b_x)_3 - y (b \times b_y)_3 = 0.
 
 For factors known up to an invertible matrix, :math:`b = A \hat b`, cross products transform by the
 cofactors of A: :math:`b \times b_x = P (\hat b \times \hat b_x)`, P proportional to the inverse
 of A's transpose. This is one equation per pixel, linear in the nine entries of P. Without the last
-two terms, which grow with the field of view, the last row of P is free: that is the bas-relief
-ambiguity. On some surfaces, balls and all quadrics among them, a second P is a solution, too.
+two terms, which grow with the field of view, the last row of P is free: the bas-relief ambiguity.
+On some surfaces, including balls and all quadrics, there is a second solution P.
 
 Source: Papadhimitri & Favaro, A new perspective on uncalibrated photometric stereo, CVPR 2013.
 """
@@ -27,7 +27,7 @@ from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import Shading
 from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs
 
-# Minimum ratio of the second smallest residual to the smallest: a choice; on a ball it is about 1.
+# Minimum ratio of the second smallest residual to the smallest, about 1 on a ball; chosen by hand.
 _DISTINCT = 1.5
 
 
@@ -39,26 +39,26 @@ def factorize_in_perspective(
     *,
     radius: int = 3,
 ) -> tuple[Shading, ViewVectors]:
-    """Estimate albedo times normal and the lights from photographs of one viewpoint.
+    """Estimate albedo times normal, and lights, from photographs of one viewpoint.
 
-    The images, channels added, are factorized to rank three; the integrability of the normalized
-    vectors gives the matrix between the factors. Derivatives are those of cubics fitted to
-    squares. Their noise biases least squares; the solution is the generalised eigenvector of the
-    equations' moments against those of noise alone.
+    The sum of the channels is factorized to rank 3; the integrability of the normalized vectors
+    determines the matrix between the factors. Derivatives are those of cubics fitted to squares of
+    pixels. Their noise biases least squares, so the solution is the generalized eigenvector of the
+    equations' moments and those of noise alone.
 
     Args:
         mask: True on the surface, without depth discontinuities.
         intrinsics: Pinhole K in pixels, centre of the top-left pixel at (0.5, 0.5).
         seen: False for missing values, shadows and highlights, pixels in raster order.
-        radius: Of the squares, which lie inside the mask.
+        radius: Radius of the squares, which must be inside the mask.
 
     Returns:
-        Shading and lights in the camera frame, unique up to one factor between them: the lights'
-        root mean square is 1. Pixels seen in fewer than three views have the vector zero. Constant
-        to autograd.
+        Shading and lights in the camera frame, unique up to one factor between them; the lights'
+        root mean square is 1. Pixels observed in fewer than three views have the vector zero.
+        Constant to autograd.
 
-    The error is proportional to the inverse of the field of view. On a ball, as on some other
-    surfaces, the images do not determine the result; this is detected with noise alone.
+    The error is proportional to the inverse of the field of view. On a ball, and on some other
+    surfaces, the images do not determine the result; this is only detected on noisy images.
 
     Source: Papadhimitri & Favaro, CVPR 2013, for the idea; the cofactors' form, normalization and
     the noise model are ours.
@@ -72,17 +72,17 @@ def factorize_in_perspective(
     with torch.no_grad():
         radiance = images.double().sum(dim=1)[:, mask]
         weight = torch.ones_like(radiance) if seen is None else seen.double()
-        found = factorize_photographs(radiance, weight, 3, robust=False)
-        left, right = found.lights, found.shading
-        known = ((weight > 0).sum(dim=0) >= 3) & (right != 0).any(dim=0)
-        right = torch.where(known, right, 0)
+        factors = factorize_photographs(radiance, weight, 3, robust=False)
+        left, right = factors.lights, factors.shading
+        usable = ((weight > 0).sum(dim=0) >= 3) & (right != 0).any(dim=0)
+        right = torch.where(usable, right, 0)
         inside = torch.zeros_like(mask)
-        inside[mask] = known
+        inside[mask] = usable
         pixels = homogeneous(pixel_centers(mask.shape[1], mask.shape[0], weight))
         rays = pixels @ torch.linalg.inv(intrinsics.double()).mT
-        matrix = _between(right, mask, inside, intrinsics.double(), rays, radius)
-        towards = ((matrix @ right) * rays[mask].mT).sum()
-        matrix = torch.where(towards > 0, -matrix, matrix)
+        matrix = _mixing_matrix(right, mask, inside, intrinsics.double(), rays, radius)
+        away = ((matrix @ right) * rays[mask].mT).sum()
+        matrix = torch.where(away > 0, -matrix, matrix)
         lights = left @ torch.linalg.inv(matrix)
         scale = lights.square().sum(dim=1).mean().sqrt()
         return (scale * (matrix @ right)).to(images), (lights / scale).to(images)
@@ -91,11 +91,11 @@ def factorize_in_perspective(
 def integrability_equations(
     vectors: Shading, along_x: Shading, along_y: Shading, rays: Shading
 ) -> Float[Tensor, "pixel 9"]:
-    """Return the coefficients of the integrability constraint by the entries of P, row by row.
+    """Return the coefficients of the entries of P in the integrability constraint, row by row.
 
     Args:
-        vectors: Along normals, up to an invertible matrix.
-        along_x: Their derivatives by the normalised image coordinates.
+        vectors: Vectors along normals, up to an invertible matrix.
+        along_x: Their derivatives by the normalized image coordinate x.
         rays: ``(x, y, 1)``.
     """
     cross_x = torch.linalg.cross(vectors, along_x, dim=0)
@@ -104,15 +104,15 @@ def integrability_equations(
     return torch.cat([cross_x, cross_y, -x * cross_x - y * cross_y]).mT
 
 
-def _between(
+def _mixing_matrix(
     right: Shading, mask: Mask, inside: Mask, intrinsics: Matrix3, rays: VectorMap, radius: int
 ) -> Matrix3:
-    """Find the matrix under which the vectors are normals times albedo, up to a factor."""
+    """Return the matrix that makes the vectors normals times albedo, up to a factor."""
     moment = right @ right.mT / inside.sum().clamp_min(1)
     values, axes = torch.linalg.eigh(moment)
     if float(values[0]) <= 1e-12 * float(values[-1]):
         raise InputError(
-            "the images have rank two or less; needed: three lights that are not in one plane, "
+            "the images have rank 2 or less; needed: three lights that are not in one plane, "
             "and a curved surface."
         )
     white = axes.mT / values.sqrt()[:, None]
@@ -121,23 +121,24 @@ def _between(
     raster = right.new_zeros(3, *mask.shape)
     raster[:, mask] = vectors / size
     side = 2 * radius + 1
-    whole = -max_pool2d(-pad(inside.double(), (radius,) * 4)[None], side, stride=1)[0] > 0
+    centres = -max_pool2d(-pad(inside.double(), (radius,) * 4)[None], side, stride=1)[0] > 0
     # Nine unknowns up to scale.
-    if int(whole.sum()) < 50:
+    if int(centres.sum()) < 50:
         raise InputError(
-            f"{int(whole.sum())} squares of {side} x {side} pixels lie inside the mask and are "
-            f"seen in three views; needed: {50}. Lower `radius`, or enlarge the mask."
+            f"{int(centres.sum())} squares of {side} x {side} pixels are inside the mask and "
+            "observed in three views; needed: 50. Lower `radius`, or enlarge the mask."
         )
-    b, *slopes = _derivatives(raster, radius)[:, :, whole]
-    rays, by_ray = rays[whole].mT, intrinsics[:2, :2]  # derivatives of u and v by x and y
+    b, *slopes = _derivatives(raster, radius)[:, :, centres]
+    rays, by_ray = rays[centres].mT, intrinsics[:2, :2]  # derivatives of u and v by x and y
     along_x, along_y = torch.einsum("st,scp->tcp", by_ray, torch.stack(slopes))
     rows = integrability_equations(b, along_x, along_y, rays)
-    # Noise of the factors is white; after whitening it has a covariance, and normalization
-    # divides it by the vectors' length. Of the cross product of each vector with it:
+    # Noise of the factors is white; after whitening it has a covariance, which normalization
+    # divides by the vectors' squared length. This is the covariance of each vector's cross product
+    # with the noise.
     cross = torch.linalg.cross(torch.eye(3).to(b)[None], b.mT[:, None], dim=-1)
     noise_covariance = cross @ (white @ white.mT) @ cross.mT
-    noise_covariance = noise_covariance / size[whole[mask]].square()[:, None, None]
-    # The coefficients of noise of b_u and of b_v, for each row of P.
+    noise_covariance = noise_covariance / size[centres[mask]].square()[:, None, None]
+    # Coefficients of the noise of b_u and b_v, for each row of P.
     by_noise = torch.cat(
         [by_ray[:, None].expand(2, len(rows), 2), -(by_ray @ rays[:2])[..., None]], dim=-1
     )
@@ -145,8 +146,8 @@ def _between(
     inverse, singular = torch.linalg.inv_ex(cofactors)
     if ratio < _DISTINCT or bool(singular):
         raise InputError(
-            f"a second surface explains the images as well (its misfit is {ratio:.2f} times the "
-            "least); needed: a surface unlike a ball or any quadric, or less noise. Raise "
+            f"a second surface explains the images equally well (its misfit is {ratio:.2f} times "
+            "the least); needed: a surface unlike a ball or any quadric, or less noise. Raise "
             "`radius`, or factorize without perspective and resolve the bas-relief ambiguity."
         )
     return inverse.mT @ white
@@ -157,11 +158,11 @@ def _cofactors(
     noise_covariance: Float[Tensor, "pixel 3 3"],
     by_noise: Float[Tensor, "2 pixel 3"],
 ) -> tuple[Matrix3, float]:
-    """Find the cofactors of least residual over that of noise; by how much the second is larger."""
+    """Return the cofactors of least residual over noise, and the ratio of the second to it."""
     weight = torch.ones_like(rows[:, 0])
     for _ in range(4):
-        both = torch.einsum("p,spi,spk->pik", weight, by_noise, by_noise)
-        noise = torch.einsum("pij,pkl->ikjl", both, noise_covariance).reshape(9, 9)
+        coefficients = torch.einsum("p,spi,spk->pik", weight, by_noise, by_noise)
+        noise = torch.einsum("pij,pkl->ikjl", coefficients, noise_covariance).reshape(9, 9)
         noise = noise + 1e-12 * noise.trace() * torch.eye(9).to(noise)
         moment = (weight[:, None] * rows).mT @ rows
         ratios, vectors = eigh(moment.cpu().numpy(), noise.cpu().numpy())
@@ -176,10 +177,10 @@ def _cofactors(
 def _derivatives(
     raster: Float[Tensor, "channel height width"], radius: int
 ) -> Float[Tensor, "derivative channel height width"]:
-    """Fit a cubic to the square around each pixel; give its value and derivatives by u and v."""
+    """Return value and derivatives by u and v of a cubic fitted to the square around each pixel."""
     side = torch.arange(-radius, radius + 1).to(raster)
     v, u = torch.meshgrid(side, side, indexing="ij")
-    # The value and its derivatives first.
+    # In this order the first three coefficients are the value and the derivatives.
     powers = [(power - j, j) for power in range(4) for j in range(power + 1)]
     basis = torch.stack([u.flatten() ** i * v.flatten() ** j for i, j in powers], dim=1)
     kernels = torch.linalg.pinv(basis)[:3].reshape(3, 1, *u.shape)

@@ -1,4 +1,4 @@
-r"""Regression of each pixel's radiance on lights that are known or factorized, robust to shadows.
+r"""Regression of each pixel's radiance on known or factorized lights, robust to shadows.
 
 A pixel's radiance under lights ``l`` is :math:`x_v = l_v^\top b`; the rows of the lights may
 be directions, harmonics, or the left factor of a factorization :math:`X = L S`, which is defined up
@@ -29,17 +29,17 @@ Lights = Float[Tensor, "view unknown"]
 Colours = Float[Tensor, "view channel pixel"]
 ChannelPixels = Float[Tensor, "channel pixel"]
 
-# The scale of the weights starts at this multiple and is multiplied by the second per iteration,
-# down to 1: choices, so that the initial fit does not decide which samples are outliers.
+# The scale of the weights starts at the first multiple and is multiplied by the second value per
+# iteration, down to 1, so that the initial fit does not determine the outliers. Chosen by hand.
 _WIDEST, _NARROWING = 4.0, 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Factored(Record):
-    """Lights, and the shading vectors that explain photographs under them.
+    """Lights and shading vectors, whose product approximates photographs.
 
     Attributes:
-        lights: ``L``; orthonormal columns where they are factors of the photographs.
+        lights: ``L``; with orthonormal columns if they are factors of the photographs.
         shading: ``b`` of every pixel; zero without samples.
         weight: Final weight of each sample; 0 where missing or in shadow.
     """
@@ -50,46 +50,47 @@ class Factored(Record):
 
 
 def regress(radiance: Samples, weight: Samples, lights: Lights, *, robust: bool = True) -> Factored:
-    r"""Fit each pixel's shading vector to its radiance; float64, constant to autograd.
+    r"""Return the fit of each pixel's shading vector to its radiance.
 
-    Plain: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
-    weights, whose scale is 2.385 robust deviations of the residuals of all pixels; a view whose
-    light comes from behind (:math:`l_v^\top b \le 0`) has weight 0. The
-    initial fit weights samples by their brightness, up to the pixel's median: shadows are dark.
+    Not robust: :math:`\min_b \sum_v w_v (x_v - l_v^\top b)^2`. Robust: the same with Cauchy's
+    weights, whose scale is 2.385 robust deviations of the residuals of all pixels; views with
+    light from behind (:math:`l_v^\top b \le 0`) have weight 0. The initial fit weights samples by
+    their brightness, up to the pixel's median, because shadows are dark.
 
-    An underdetermined pixel has one of its minima; see :func:`determined`.
+    For an underdetermined pixel, one of the minima is returned; see :func:`determined`. In float64;
+    constant to autograd.
 
-    Source: Holland & Welsch 1977 for the weights; robust weights in place of thresholds on
-    shadows and highlights are common practice since Ikehata et al., CVPR 2012.
+    Source: Holland & Welsch 1977 for the weights; robust weights instead of thresholds for shadows
+    and highlights are common practice since Ikehata et al., CVPR 2012.
     """
     with torch.no_grad():
         seen = weight > 0
         x = torch.where(seen, radiance, 0).double()
-        given = weight.double()
+        prior = weight.double()
         rows = lights.double()
         if not robust:
-            return _fit(x, given, rows)
-        found = _fit(x, given * brightness(x, seen), rows)
+            return _fit(x, prior, rows)
+        fit = _fit(x, prior * brightness(x, seen), rows)
         for iteration in range(15):
             widen = max(1.0, _WIDEST * _NARROWING**iteration)
-            found = _fit(x, reweigh(x, given, rows @ found.shading, widen), rows)
-        return found
+            fit = _fit(x, reweigh(x, prior, rows @ fit.shading, widen), rows)
+        return fit
 
 
 def reweigh(radiance: Samples, weight: Samples, predicted: Samples, widen: float) -> Samples:
-    """Return the samples' weights by their residuals; 0 where a light comes from behind.
+    """Return the samples' weights from their residuals; 0 for light from behind.
 
     Args:
-        predicted: By a fit; below zero for lights from behind.
+        predicted: Radiance of a fit; negative for light from behind.
         widen: Multiple of the scale.
     """
     lit = predicted > 0
     residual = torch.where(lit, radiance - predicted, radiance)
     seen = (weight > 0) & lit
-    level = radiance[seen].abs().mean().nan_to_num(nan=1.0)
+    mean = radiance[seen].abs().mean().nan_to_num(nan=1.0)
     scale = CAUCHY_TUNING * robust_deviation(residual.flatten(), seen.flatten())
-    # Far below the 4e-3 of 8-bit steps.
-    return weight * cauchy_weights(residual, widen * scale.maximum(1e-4 * level)) * lit
+    # The minimum scale is far below the 4e-3 of 8-bit steps.
+    return weight * cauchy_weights(residual, widen * scale.maximum(1e-4 * mean)) * lit
 
 
 def brightness(radiance: Samples, seen: Bool[Tensor, "view pixel"]) -> Samples:
@@ -102,12 +103,12 @@ def brightness(radiance: Samples, seen: Bool[Tensor, "view pixel"]) -> Samples:
 
 
 def determined(weight: Samples, lights: Lights) -> Bool[Tensor, " pixel"]:
-    """Find which pixels have as many samples as unknowns, under lights that span them."""
+    """Return whether pixels have at least as many samples as unknowns, and lights that span them."""
     count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
     basis = normalize(lights.double(), dim=0, eps=1e-300)
     unknowns = lights.shape[1]
     values = torch.linalg.eigvalsh(unpacked(outer(basis.mT) @ weight.double(), unknowns))
-    # With less, noise of 1 % in the images is as large as the solution.
+    # Below this ratio, noise of 1 % in the images leads to errors as large as the solution.
     spanned = values[:, 0] > 1e-4 * values[:, -1]
     return (count >= unknowns) & spanned & (values[:, -1] > 0)
 
@@ -120,10 +121,10 @@ def _fit(x: Samples, weight: Samples, rows: Lights) -> Factored:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class StereoSolution(Record):
-    """Normals, albedo and lights, for the pixels inside a mask in raster order, in float64.
+    """Normals, albedo and lights of the pixels inside a mask in raster order, in float64.
 
     Attributes:
-        normals: Unit, in the frame of the lights; zero where a pixel is black.
+        normals: Unit normals in the frame of the lights; zero for black pixels.
         weight: Final weight of each sample; 0 where missing or in shadow.
     """
 
@@ -136,12 +137,12 @@ class StereoSolution(Record):
 def calibrated_stereo(
     radiance: Colours, weight: Samples, lights: ViewVectors, *, robust: bool = True
 ) -> StereoSolution:
-    r"""Recover normals and albedos of pixels under known distant lights; constant to autograd.
+    r"""Return normals and albedos of pixels under known distant lights; constant to autograd.
 
-    Weights are those of the mean of the colours; see :func:`regress`. Normal and albedos are then
-    the least-squares solution over all colours: with :math:`A = \sum w\, l l^\top` and the
-    solutions of single colours the columns of ``B``, that is :math:`n \rho^\top = B v v^\top`,
-    ``v`` the leading eigenvector of :math:`B^\top A B`.
+    Weights are those of the mean of the channels; see :func:`regress`. Normal and albedos are the
+    least-squares solution over all channels, :math:`n \rho^\top = B v v^\top`: the columns of ``B``
+    are the solutions of single channels, and ``v`` is the leading eigenvector of
+    :math:`B^\top A B` with :math:`A = \sum w\, l l^\top`.
 
     Args:
         lights: Direction to the point light times its irradiance.
@@ -149,9 +150,9 @@ def calibrated_stereo(
     with torch.no_grad():
         x = torch.where((weight > 0)[:, None], radiance, 0).double()
         gray = regress(x.mean(dim=1), weight, lights, robust=robust)
-        rows, heavy = gray.lights, gray.weight
-        factored = PackedCholesky(outer(rows.mT) @ heavy, 3)
-        sides = rows.mT @ (heavy[:, None] * x).movedim(1, 0)
+        rows = gray.lights
+        factored = PackedCholesky(outer(rows.mT) @ gray.weight, 3)
+        sides = rows.mT @ (gray.weight[:, None] * x).movedim(1, 0)
         single = torch.stack([factored.solve(side) for side in sides])
         common = torch.einsum("cip,dip->pcd", single, sides)
         albedo = torch.linalg.eigh(common).eigenvectors[..., -1].mT
@@ -161,38 +162,39 @@ def calibrated_stereo(
             normals=normalize(shading, dim=0, eps=1e-300),
             albedo=(shading.norm(dim=0) * albedo).clamp_min(0),
             lights=rows,
-            weight=heavy,
+            weight=gray.weight,
         )
 
 
 def chromatic_albedo(radiance: Colours, weight: Samples, shade: Samples) -> ChannelPixels:
-    """Fit the albedo of each colour, not negative, to the shading of albedo 1."""
+    """Return the albedo of each channel, not negative, that fits the shading of albedo 1."""
     x = torch.where((weight > 0)[:, None], radiance, 0).to(shade)
     square = (weight * shade * shade).sum(dim=0)
     product = ((weight * shade)[:, None] * x).sum(dim=0)
     return (product / torch.where(square > 0, square, 1)).clamp_min(0)
 
 
-# Steps of variable projection: for the first solution, and after every change of weights, whose
-# scale narrows more slowly than in a regression: choices.
+# Steps of variable projection for the first solution, and after every change of weights, whose
+# scale decreases more slowly than in a regression. Chosen by hand.
 _FIRST_STEPS, _NEXT_STEPS, _NARROWING_FACTORED = 100, 5, 0.8
 
 
 def factorize_photographs(
     radiance: Samples, weight: Samples, rank: int, *, robust: bool = True
 ) -> Factored:
-    """Factorize photographs with missing samples, shadows and highlights; constant to autograd.
+    """Return factors of photographs with missing samples, shadows and highlights.
 
-    Complete and without robust weights, it is the singular value decomposition. Otherwise lights
-    are estimated from an even subset of pixels by variable projection, with Cauchy's weights if
-    ``robust``; the shading of all pixels is regressed on them.
+    For complete photographs and without robust weights, they are from the singular value
+    decomposition. Otherwise lights are estimated from an even subset of pixels by variable
+    projection, with Cauchy's weights if ``robust``, and the shading of all pixels is regressed on
+    them. Constant to autograd.
 
     Source: Hayakawa, JOSA A 11(11), 1994, for the decomposition.
     """
     with torch.no_grad():
         seen = weight > 0
         x = torch.where(seen, radiance, 0).double()
-        given = weight.double()
+        prior = weight.double()
         usable = torch.nonzero(seen.sum(dim=0) > rank)[:, 0]
         views = int(seen.any(dim=1).sum())
         if views < rank or len(usable) <= rank:
@@ -201,24 +203,24 @@ def factorize_photographs(
                 f"{rank}; needed: {rank} views and more than {rank} such pixels. Add photographs "
                 "or widen the mask."
             )
-        if not robust and bool((given == given[seen].max()).all()):
+        if not robust and bool((prior == prior[seen].max()).all()):
             left = torch.linalg.eigh(x @ x.mT).eigenvectors[:, -rank:].flip(1)
-            return Factored(lights=left, shading=left.mT @ x, weight=given)
-        # Lights are estimated from these, shading for all.
+            return Factored(lights=left, shading=left.mT @ x, weight=prior)
+        # Lights are estimated from a subset of pixels, shading for all.
         spaced = torch.linspace(0, len(usable) - 1, min(len(usable), 4000)).round().long()
-        some = usable[spaced.to(usable.device)]
-        few, heavy = x[:, some], given[:, some]
+        subset = usable[spaced.to(usable.device)]
+        samples, weights = x[:, subset], prior[:, subset]
         if robust:
-            heavy = heavy * brightness(few, seen[:, some])
-        # Missing samples start as the view's times the pixel's brightness.
-        fraction = heavy / heavy.amax().clamp_min(1e-300)
-        filled = fraction * few + (1 - fraction) * brightness_guess(few, heavy)
+            weights = weights * brightness(samples, seen[:, subset])
+        # Missing samples start as the product of the view's and the pixel's brightness.
+        fraction = weights / weights.amax().clamp_min(1e-300)
+        filled = fraction * samples + (1 - fraction) * brightness_guess(samples, weights)
         left = torch.linalg.eigh(filled @ filled.mT).eigenvectors[:, -rank:].flip(1)
         for iteration in range(20 if robust else 1):
-            problem = low_rank_problem(few[None], heavy[None], left[None])
+            problem = low_rank_problem(samples[None], weights[None], left[None])
             steps = _NEXT_STEPS if iteration else _FIRST_STEPS
             solved = solve_variable_projection(problem, steps)
             left = solved.lights[0]
             widen = max(1.0, _WIDEST * _NARROWING_FACTORED**iteration)
-            heavy = reweigh(few, given[:, some], left @ solved.shading[0], widen)
-        return regress(x, given, left, robust=robust)
+            weights = reweigh(samples, prior[:, subset], left @ solved.shading[0], widen)
+        return regress(x, prior, left, robust=robust)

@@ -1,4 +1,4 @@
-"""Photometric stereo from one viewpoint, by any of the methods."""
+"""Photometric stereo from one viewpoint, with a choice of methods."""
 
 from dataclasses import dataclass
 
@@ -28,8 +28,8 @@ from pimper_torch.single_view.photometric_stereo.regress_lights import (
     factorize_photographs,
 )
 
-# Each method with the resolvers of its bas-relief ambiguity; "rounded" is a convention. Entropy is
-# the default: nearest to known lights on the rendered objects (benchmarks/photometric_stereo.py).
+# Methods with the resolvers of their bas-relief ambiguity; "rounded" is a convention. Entropy is the
+# default: on rendered objects it is closest to the true lights (benchmarks/photometric_stereo.py).
 METHODS: dict[str, tuple[str, ...]] = {
     "calibrated": (),
     "integrability": ("albedo_entropy", "rounded", "equal_strength"),
@@ -42,13 +42,13 @@ class PhotometricStereo(Record):
     """Normals, albedo and lights of one viewpoint.
 
     Attributes:
-        normals: Unit, camera frame; where not valid, an estimate or zero.
-        albedo: Not negative. With unknown lights up to one factor, such that lights have the median
-            length 1.
+        normals: Unit normals, camera frame; where not valid, an estimate or zero.
+        albedo: Albedo, not negative. For unknown lights it is up to one factor, chosen so that
+            lights have the median length 1.
         lights: Direction to the point light times its irradiance; zero for a view without samples.
-        lit: True where a sample is an inlier: seen, in no shadow, no highlight.
-        valid: Where samples are as many as unknowns, lights span space, and the normal faces the
-            viewer.
+        lit: True where a sample is an inlier: observed, not in shadow, not a highlight.
+        valid: True where a pixel has at least as many samples as unknowns, their lights span
+            space, and the normal faces the viewer.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
     """
@@ -73,7 +73,7 @@ def photometric_stereo(
     weight: Float[Tensor, "..."] | None = None,
     robust: bool = True,
 ) -> PhotometricStereo:
-    """Recover normals and albedo from photographs of one viewpoint under changing light.
+    """Return normals and albedo from photographs of one viewpoint under changing light.
 
     ==================  ==========================================  =================
     method              light                                       ambiguity
@@ -84,66 +84,66 @@ def photometric_stereo(
     ``perspective``     point lights, pinhole (``intrinsics``)      none
     ==================  ==========================================  =================
 
-    ``resolve`` is ``albedo_entropy`` (few albedos), ``equal_strength`` (of the lights), or
-    ``rounded`` (a convention: upright on average, as deep as a ball).
+    ``resolve`` is ``albedo_entropy`` (few different albedos), ``equal_strength`` (of the lights),
+    or ``rounded`` (a convention: upright on average, as deep as a ball).
 
     Args:
         images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
         mask: True on the object.
         lights: For ``calibrated``: direction to the point light times its irradiance, camera frame.
         intrinsics: ``K``, for ``perspective``; the other methods are orthographic.
-        weight: Of samples ``(view, height, width)``, not negative; 0 where missing, saturated, or
-            known to be in shadow.
+        weight: Weights of samples ``(view, height, width)``, not negative; 0 for missing,
+            saturated, or known shadowed samples.
         robust: Whether shadows and highlights lose weight.
 
     >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
     >>> images = torch.tensor([1.0, 0.8, 0.8]).reshape(3, 1, 1, 1)
-    >>> found = photometric_stereo(
+    >>> result = photometric_stereo(
     ...     images, torch.ones(1, 1) > 0, method="calibrated", lights=lights
     ... )
-    >>> found.normals[0, 0].round(decimals=3) + 0
+    >>> result.normals[0, 0].round(decimals=3) + 0
     tensor([ 0.,  0., -1.])
     """
     if method not in METHODS:
         raise InputError(f"method is {method!r}; needed: one of {', '.join(METHODS)}.")
-    given = images.new_ones(len(images), *mask.shape) if weight is None else weight
-    _refuse(images, mask, method, resolve, lights, intrinsics, given)
+    weight = images.new_ones(len(images), *mask.shape) if weight is None else weight
+    _refuse(images, mask, method, resolve, lights, intrinsics, weight)
     with torch.no_grad():
         samples = images[:, :, mask]
-        seen = samples.isfinite().all(dim=1)
-        heavy = torch.where(seen, given[:, mask], 0).double()
-        used = (heavy > 0).any(dim=1)
+        finite = samples.isfinite().all(dim=1)
+        weights = torch.where(finite, weight[:, mask], 0).double()
+        used = (weights > 0).any(dim=1)
         if int(used.sum()) < 3:
             raise InputError(
                 f"{method}: {int(used.sum())} photographs have samples inside the mask; needed: 3 "
                 "or more, one for each unknown of a pixel. Add photographs."
             )
-        heavy = heavy[used]
-        radiance = torch.where((heavy > 0)[:, None], samples[used], 0).double()
+        weights = weights[used]
+        radiance = torch.where((weights > 0)[:, None], samples[used], 0).double()
         applied, free = None, "nothing"
         if lights is not None:
-            shining = lights[used].double()
-            finite = bool(shining.isfinite().all())
-            if not finite or int(torch.linalg.matrix_rank(shining, rtol=1e-6)) < 3:
+            known = lights[used].double()
+            all_finite = bool(known.isfinite().all())
+            if not all_finite or int(torch.linalg.matrix_rank(known, rtol=1e-6)) < 3:
                 raise InputError(
-                    "calibrated: the lights are not finite, or lie in one plane through the "
-                    "object; needed: lights that span space, or normals are free across the plane. "
-                    "Add one from outside it."
+                    "calibrated: the lights are not finite, or in one plane with the object, which "
+                    "leaves normals undetermined across the plane; needed: lights that span space. "
+                    "Add a light outside of the plane."
                 )
-            found = calibrated_stereo(radiance, heavy, shining, robust=robust)
+            solution = calibrated_stereo(radiance, weights, known, robust=robust)
         elif intrinsics is not None:
-            whole = torch.zeros_like(images[used], dtype=torch.float64)
-            whole[:, :, mask] = radiance
-            shading, own = factorize_in_perspective(whole, mask, intrinsics.double(), heavy > 0)
-            factors = Factored(lights=own.double(), shading=shading.double(), weight=heavy)
-            found, free = _lambertian(radiance, factors), _FACTOR
+            raster = torch.zeros_like(images[used], dtype=torch.float64)
+            raster[:, :, mask] = radiance
+            shading, left = factorize_in_perspective(raster, mask, intrinsics.double(), weights > 0)
+            factors = Factored(lights=left.double(), shading=shading.double(), weight=weights)
+            solution, free = _lambertian(radiance, factors), _FACTOR
         else:
-            by = resolve or METHODS[method][0]
-            factors, applied = _integrable(radiance, heavy, mask, by, robust)
-            found = _lambertian(radiance, factors)
-            free = f"bas-relief, {_FACTOR}" if by == "rounded" else _FACTOR
-        spread = _spread_out(found, heavy, mask, used, like=images)
-        return spread.replace(applied=applied, free=free)
+            resolver = resolve or METHODS[method][0]
+            factors, applied = _integrable(radiance, weights, mask, resolver, robust)
+            solution = _lambertian(radiance, factors)
+            free = f"bas-relief, {_FACTOR}" if resolver == "rounded" else _FACTOR
+        result = _as_rasters(solution, weights, mask, used, like=images)
+        return result.replace(applied=applied, free=free)
 
 
 _FACTOR = "a factor between albedo and light"
@@ -152,7 +152,7 @@ _FACTOR = "a factor between albedo and light"
 def _integrable(
     radiance: Colours, weight: Samples, mask: Mask, resolve: str, robust: bool
 ) -> tuple[Factored, bas_relief.BasRelief]:
-    """Factorize the mean of the colours, make it integrable, and resolve its bas-relief."""
+    """Return integrable factors of the mean of the colours, and the bas-relief applied to them."""
     factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)
     total, reliable = factors.weight.sum(dim=0), determined(factors.weight, factors.lights)
     reliability = torch.where(reliable, total / total.amax().clamp_min(1e-300), 0)
@@ -167,12 +167,12 @@ def _integrable(
         groups = chromaticity_groups(radiance[:, :, used]) if radiance.shape[1] > 1 else None
         relief = resolve_by_albedo_entropy(shading[:, used], groups)
     relief = bas_relief.convex(relief, shading, reliability, mask)
-    moved = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
-    return moved, relief
+    factors = factors.replace(shading=relief.on_shading(shading), lights=relief.on_lights(lights))
+    return factors, relief
 
 
 def _lambertian(radiance: Colours, factors: Factored) -> StereoSolution:
-    """Return normals and the albedo of each colour, under lights of the median length 1."""
+    """Return normals and the albedo of each channel, for lights of the median length 1."""
     normals = normalize(factors.shading, dim=0, eps=1e-300)
     shade = (factors.lights @ normals).clamp_min(0)
     albedo = chromatic_albedo(radiance, factors.weight, shade)
@@ -186,24 +186,24 @@ def _lambertian(radiance: Colours, factors: Factored) -> StereoSolution:
     )
 
 
-def _spread_out(
-    found: StereoSolution, given: Samples, mask: Mask, used: Bool[Tensor, " all"], like: Tensor
+def _as_rasters(
+    solution: StereoSolution, weight: Samples, mask: Mask, used: Bool[Tensor, " all"], like: Tensor
 ) -> PhotometricStereo:
     def raster(values: Tensor) -> Tensor:
-        whole = values.new_zeros(len(values), *mask.shape)
-        whole[:, mask] = values
-        return whole
+        pixels = values.new_zeros(len(values), *mask.shape)
+        pixels[:, mask] = values
+        return pixels
 
-    valid = (found.normals[2] < 0) & (found.albedo > 0).any(dim=0)
+    valid = (solution.normals[2] < 0) & (solution.albedo > 0).any(dim=0)
     lit, lights = mask.new_zeros(len(used), *mask.shape), like.new_zeros(len(used), 3)
-    lit[used] = raster((given > 0) & (found.weight >= 0.5 * given))
-    lights[used] = found.lights.to(like)
+    lit[used] = raster((weight > 0) & (solution.weight >= 0.5 * weight))
+    lights[used] = solution.lights.to(like)
     return PhotometricStereo(
-        normals=raster(found.normals.to(like)).movedim(0, -1).contiguous(),
-        albedo=raster(found.albedo.to(like)).movedim(0, -1).contiguous(),
+        normals=raster(solution.normals.to(like)).movedim(0, -1).contiguous(),
+        albedo=raster(solution.albedo.to(like)).movedim(0, -1).contiguous(),
         lights=lights,
         lit=lit,
-        valid=raster((valid & determined(found.weight, found.lights))[None])[0],
+        valid=raster((valid & determined(solution.weight, solution.lights))[None])[0],
     )
 
 
@@ -214,23 +214,27 @@ def _refuse(
     resolve: str | None,
     lights: Tensor | None,
     intrinsics: Tensor | None,
-    given: Tensor,
+    weight: Tensor,
 ) -> None:
-    size, seen, count = tuple(mask.shape), tuple(images.shape[2:]), len(images)
+    size, image_size, count = tuple(mask.shape), tuple(images.shape[2:]), len(images)
     num_lights = 0 if lights is None else len(lights)
     resolvers = METHODS[method]
-    for wrong, found, needed in (
-        (seen != size, f"images are {seen}, the mask {size}", "one size; resize the mask"),
+    for invalid, found, needed in (
+        (
+            image_size != size,
+            f"images are {image_size}, the mask {size}",
+            "one size; resize the mask",
+        ),
         (not mask.any(), "the mask is empty", "pixels of the object; is it inverted?"),
         (
             num_lights != (count if method == "calibrated" else 0),
             f"{num_lights} lights for {count} photographs",
-            "one for each if they are known (calibrated), else none",
+            "one light per photograph for calibrated, no lights otherwise",
         ),
         (
             (intrinsics is not None) != (method == "perspective"),
             f"intrinsics are {'not ' if intrinsics is None else ''}given",
-            "those of the camera for perspective, none for orthographic methods",
+            "the camera's for perspective, none for orthographic methods",
         ),
         (
             resolve is not None and resolve not in resolvers,
@@ -238,15 +242,15 @@ def _refuse(
             ", ".join(resolvers) or "none",
         ),
         (
-            tuple(given.shape) != (count, *size),
-            f"weights are {tuple(given.shape)}",
-            f"{(count, *size)}, one a sample",
+            tuple(weight.shape) != (count, *size),
+            f"weights are {tuple(weight.shape)}",
+            f"{(count, *size)}, one per sample",
         ),
         (
-            not ((given >= 0) & given.isfinite()).all(),
+            not ((weight >= 0) & weight.isfinite()).all(),
             "some weights are negative or not finite",
             "0 or more",
         ),
     ):
-        if wrong:
+        if invalid:
             raise InputError(f"photometric stereo, {method}: {found}; needed: {needed}.")
