@@ -5,8 +5,7 @@
 >>> result = chain(pt.load_views("photos/"))  # doctest: +SKIP
 >>> pt.write_result(result, chain.config, "out/")  # doctest: +SKIP
 
-``scene_of`` takes images and cameras as tensors. Everything else is in subpackages, listed by
-completion and ``dir``:
+``scene_of`` takes images and cameras as tensors. The rest is in subpackages, which ``dir`` lists:
 
 - ``records``: inputs and outputs of stages and chains, such as ``pt.records.Mesh``
 - ``stages``: the stages of chains with their settings, to replace or to call alone

@@ -146,9 +146,9 @@ def test_installed_presets_take_precedence_over_a_checkout(tmp_path, monkeypatch
     [
         (b"a: 1\nb: 2\na: 3\n", "`a` occurs twice"),
         (b"a: {b: 1, b: 2}\n", "`b` occurs twice"),
-        (b"a: [1\n", "no valid YAML"),
+        (b"a: [1\n", "not valid YAML"),
         (b"- a\n- b\n", "contains a list"),
-        (b"!!python/object/apply:os.getcwd []\n", "no valid YAML"),
+        (b"!!python/object/apply:os.getcwd []\n", "not valid YAML"),
         (b"\xff\xfe\x00a", "cannot be read"),
         (b"a: &a [x, x]\nb: *a\n", "aliases .* are not supported"),
         (b"a: " + b"[" * 100_000, "nested too deeply"),

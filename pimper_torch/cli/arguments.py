@@ -34,7 +34,7 @@ OF_EVERY_COMMAND = """\
 
 all commands:
   -q, --quiet             Print only results, warnings and errors.
-  --json                  Print events as JSON, one per line, to standard output.
+  --json                  Print events as lines of JSON to standard output.
   --log-level LEVEL       error, warning, info or debug. (default: info)
   -h, --help              Print this page.
 """

@@ -14,8 +14,7 @@ from pimper_torch.records import StageReport
 class Bars:
     """Observer that displays a bar for every stage, and the time left for the run.
 
-    If the output is not a terminal, it writes lines instead: one at the end of a stage, and one per
-    tenth of a long stage.
+    Without a terminal, it writes a line at the end of each stage, and per tenth of a long one.
 
     Args:
         figures: Number of displayed figures of a finished stage; ``None`` for all.

@@ -33,8 +33,7 @@ class ExportJob:
             EXR, PNG and NPZ), `rti` (the reference view under 60 lights, with lights.lp).
         axes: Axes of normals in `maps`: `opengl` (right, up, to the viewer), `opencv` (right, down,
             into the scene) or `lub` (left, up, to the viewer).
-        photos: Folder of the photographs if they were moved after the run; not needed for `maps`
-            and `rti`.
+        photos: Folder of the photographs, if they were moved; not needed for `maps` and `rti`.
         overwrite: Replace an earlier export in OUT.
     """
 

@@ -88,7 +88,7 @@ OF_BENCH = {
 _LIGHT = ("batch", "clean", "config")  # run without torch
 _UNEXPECTED, _BAD_INPUT = 1, 2
 _FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
-# Errors of the system that are no bugs of the package.
+# Errors of the system, not bugs of the package.
 _REFUSALS = (
     *_FULL,
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG, errno.ELOOP),
@@ -206,9 +206,8 @@ def _prepare_threads() -> None:
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     if usable_cores() < (os.cpu_count() or 1):  # OpenMP respects affinity, but not quotas
         os.environ.setdefault("OMP_NUM_THREADS", str(usable_cores()))
-    # One malloc arena per core. The C library of Linux makes eight, and memory that runs leave in
-    # each adds up: from the second to the fourth run in one process memory grew by 2.0 %, with two
-    # arenas by 0.2 %.
+    # One malloc arena per core. The C library of Linux makes eight, and runs leave memory in each:
+    # from the second to the fourth run in one process it grew by 2.0 %, with two arenas by 0.2 %.
     with suppress(OSError, AttributeError):  # other systems have no such function
         ctypes.CDLL("libc.so.6").mallopt(-8, usable_cores())  # M_ARENA_MAX
 
@@ -245,7 +244,7 @@ def _failed(output: Output, error: BaseException) -> int:
         traceback.print_exception(error)
     text = (
         f"unexpected {kind}: {str(error).rstrip('.')}. This is a bug of pimper_torch; no result "
-        f"was written.{notes} Please report it with {report or 'the traceback above'}."
+        f"was written.{notes} Please send {report or 'the traceback above'} with a bug report."
     )
     output.error(kind, text, _UNEXPECTED)
     return _UNEXPECTED

@@ -57,8 +57,7 @@ class CommonOptions:
 
     Attributes:
         preset: Settings to start from: default, fast, paper, or your own YAML file.
-        reference: Reference photograph, for sample spacing and rendered views; chosen automatically
-            by default.
+        reference: Photograph for sample spacing and rendered views; by default chosen by the run.
         device: Device of the stages after structure from motion; cuda has not been tested on a GPU.
         max_size_px: Longer side to which larger photographs are scaled down; 0 keeps all sizes.
         overwrite: Replace the result in OUT.
@@ -135,13 +134,11 @@ class InputOptions:
         silhouettes: Folder of soft masks of a segmentation network, for all or some photographs, of
             any size: PNG, JPEG, EXR, NPZ or NPY. Other views overrule them if they contradict.
         object_at: Pixel of a photograph on the object; may be repeated.
-        normals: Folder of normal maps of a network, named like the photographs: PNG, EXR, NPZ or
-            NPY.
+        normals: Folder of a network's normal maps, named like photographs: PNG, EXR, NPZ or NPY.
         axes: Axes of these normals; auto detects them from point cloud and outlines.
         normals_error_deg: Root mean square error of these normals, if no file has their variance.
         depth: Folder of depth maps of a network; their kind is detected from the point cloud.
-        depth_error: Root mean square error of these depths as a fraction of their range, if no file
-            has their variance.
+        depth_error: The same for depths, as a fraction of their range.
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -215,8 +212,7 @@ SKULL = CommonOptions(reference="37")
 def parse(command: str, arguments: Sequence[str]) -> Job:
     """Return the run that the arguments of a command describe.
 
-    The preset is read first: its settings are the defaults of the other options, also in
-    ``--help-all``.
+    The preset is read first: its settings are the defaults, also in ``--help-all``.
     """
     name = _preset(arguments)
     _refuse_others(command, arguments, name)

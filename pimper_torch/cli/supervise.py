@@ -32,8 +32,7 @@ def main() -> int:
     """Run the command line in a separate process, and return its exit code.
 
     Returns:
-        As for :func:`pimper_torch.cli.main.main`; 128 plus the signal's number if the worker was
-        killed.
+        As for :func:`pimper_torch.cli.main.main`; 128 plus the signal that killed the worker.
     """
     if not hasattr(os, "fork"):
         return _run()

@@ -50,9 +50,8 @@ class Range:
         least: The smallest valid value; or
         above: an exclusive lower bound.
         below: An exclusive upper bound.
-        most: The largest valid value. Above it, memory or time does not suffice, iterations have
-            converged, there are fewer photographs or processors, or a product with zero is
-            undefined.
+        most: The largest valid value; above it memory or time does not suffice, iterations have
+            converged, photographs or processors are fewer, or a product with zero is undefined.
     """
 
     least: int | float | None = None
@@ -101,10 +100,9 @@ def bytes_of(size: str, field: str = "max_memory") -> float:
 def build(cls: type[Config], mapping: Mapping[str, object], where: str) -> Config:
     """Return a config dataclass, with nested ones, from a mapping such as parsed YAML.
 
-    Missing fields keep their defaults. An int is accepted for a float; there are no other
-    conversions, and a bool is not a number. Supported annotations are bool, int, float, str,
-    ``Path``, ``Literal``, tuples (from lists), unions of these, and dataclasses of all.
-    Inverse of :func:`to_mapping`.
+    Missing fields keep their defaults. The only conversion is from int to float; a bool is not a
+    number. Supported annotations are bool, int, float, str, ``Path``, ``Literal``, tuples (from
+    lists), unions of these, and dataclasses of all. Inverse of :func:`to_mapping`.
 
     Args:
         where: Source of the mapping for messages, such as a file name.
@@ -163,7 +161,7 @@ def find_config(name_or_path: str | Path) -> Path:
     A text with a YAML suffix or a folder is a path; any other text is a preset's name.
 
     Raises:
-        ConfigError: There is no such preset (the message names the nearest) or file.
+        ConfigError: Unknown preset (the message names the nearest), or missing file.
     """
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml") or len(path.parts) > 1 or isinstance(name_or_path, Path):
@@ -190,8 +188,7 @@ def read_mapping(path: Path | str) -> dict[str, object]:
     """Return the settings in a YAML file.
 
     Raises:
-        ConfigError: The file cannot be read, is not YAML, has a key twice, or does not contain
-            ``key: value`` settings.
+        ConfigError: The file is unreadable, not YAML, without ``key: value``, or has a key twice.
     """
     path = Path(path)
     try:

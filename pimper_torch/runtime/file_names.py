@@ -22,9 +22,8 @@ def match_files(
 
     File names without folders are compared in three rounds: exactly; without regard to case,
     Unicode form, separator and replacements of spaces; and also without image extensions. Each
-    round excludes the files matched before. Among files of the same name, the one with most
-    folders in common, counted from the end of both paths, is chosen. If any folders agree, files
-    from other folders are excluded.
+    round excludes the files matched before. Among files of the same name, the one with most common
+    folders, from the end of both paths, is chosen. If any folders agree, others are excluded.
 
     Args:
         folder: Parent folder of the wanted names.
@@ -81,9 +80,8 @@ def match_poses(
     """Return the index of the file of each photograph, or of its pose (its folder).
 
     If any files are in folders named like poses, photographs are matched by :func:`match_files`
-    pose by pose, else with all files. A photograph without a match has the file of another
-    photograph of its pose, else the file named like the pose, else the only file in the folder of
-    the pose.
+    pose by pose, else with all files. A photograph without a match has the file of a photograph of
+    its pose, else the file named like the pose, else the only file in the pose's folder.
 
     >>> match_poses(["p1/a.jpg", "p1/b.jpg", "p2/a.jpg"], ["p2.png", "p1/b.jpg"], where="", what="")
     [1, 1, 0]

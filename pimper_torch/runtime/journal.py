@@ -13,8 +13,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-# Lines of a run's table outside of stages: hashing the inputs of stages, and writing and reading
-# records.
+# Lines of a run's table outside of stages: hashing their inputs, writing and reading records.
 HASH, KEEP = "hash", "keep"
 
 
@@ -25,12 +24,10 @@ class Journal:
     Attributes:
         events: Cautions (texts), failures, entries of guards, and reports of stages, in order of
             arrival; ``None`` if they are not collected.
-        collects: Whether failures and entries of guards are events; otherwise failures are warned
-            of immediately.
+        collects: Whether failures and entries of guards are events; else failures warn at once.
         fail: Whether a failure ends the run.
         quiet: Whether cautions are only events, without warnings.
-        observer: Listener of stages; ``None`` within a stage, because nested stages are not
-            reported.
+        observer: Listener of stages; ``None`` within a stage, whose nested stages are not reported.
         figures: Figures of the running stage so far.
         began: Start of the stages, in seconds of :func:`time.perf_counter`.
         aside: Seconds outside of stages, by line.

@@ -118,8 +118,7 @@ def leave_out(
 def listening(listener: Listener) -> AbstractContextManager[Journal]:
     """Pass every entry of the ``with`` block and its threads to a listener, with masks.
 
-    Entries of records kept by an earlier run (:mod:`pimper_torch.runtime.store`) have no masks and
-    are not passed on.
+    Not of records kept by an earlier run (:mod:`pimper_torch.runtime.store`), which have no masks.
     """
     return writing(replace(current(), masks=listener))
 

@@ -90,7 +90,7 @@ def release_memory() -> None:
     """Return freed memory to the system, if glibc is available.
 
     With 30 photographs of 1600x1200 the threads that write them leave 400 MB, those of COLMAP
-    another 400 MB, and patches before the fusion 200 MB, in addition to the memory of later stages.
+    400 MB, and stages up to the fusion 200 MB, in addition to the memory of later stages.
     """
     drop_pages()
     forget_casters()

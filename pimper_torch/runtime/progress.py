@@ -1,7 +1,6 @@
 """Progress of a stage, for display by the caller.
 
-Stages iterate over their batches with :func:`track`; nothing is printed. To display a bar, a caller
-listens with :func:`listening`.
+Stages iterate over batches with :func:`track`; a caller that displays a bar uses :func:`listening`.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -95,8 +95,7 @@ def recorded(observer: Observer) -> Iterator[list[StageReport]]:
     A nested block outside of a stage is part of the outer block.
 
     Yields:
-        A list, filled at the end of the block with the reports and with one report for each line
-        outside of stages.
+        A list, filled at the end of the block with the reports, and those of lines outside stages.
     """
     events, reports = current().so_far(), list[StageReport]()
     before = len(events)

@@ -28,13 +28,11 @@ class _Forward(Protocol[P, R]):
 class Stage(nn.Module):
     """Module whose call has the types of its ``forward``, for type checkers.
 
-    A plain ``nn.Module`` accepts and returns any type. A custom stage derived from this class is
-    type-checked when it is inserted into a chain and when it is called. Its input records are
-    checked at run time.
+    A plain ``nn.Module`` accepts and returns any type. A custom stage of this class is type-checked
+    where it is inserted into a chain or called. Its input records are checked at run time.
 
     It computes on the device and in the dtype of these records: ``stage(views.to("cuda"))``.
-    ``to`` and similar methods move parameters, such as those of a network, and warn if a stage has
-    none.
+    ``to`` and similar methods move parameters, as of a network, and warn if a stage has none.
     """
 
     if TYPE_CHECKING:
@@ -51,7 +49,7 @@ class Stage(nn.Module):
         self.register_forward_pre_hook(check_handed, with_kwargs=True)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "Stage":
-        """Move parameters and buffers; warn if there are none, as records must be moved."""
+        """Move parameters and buffers; warn if a stage has none, as records must be moved."""
         if any(True for _ in chain(self.parameters(), self.buffers())):
             with held():  # nested stages may have none
                 return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]

@@ -122,7 +122,7 @@ def test_jobs_request_the_resources_of_a_task_and_are_cancelled_with_the_batch(w
     ("given", "said"),
     [
         (["--dask", "tcp://127.0.0.1:1"], "is tcp://127.0.0.1:1, where no scheduler answers"),
-        (["--slurm", "gpu"], "there is no `sbatch` here"),
+        (["--slurm", "gpu"], "`sbatch` is not found"),
         (["--dask", "tcp://127.0.0.1:1", "--slurm", "gpu"], "needed: no value together with --d"),
         (["--jobs", "0"], "needed: at least 1"),
     ],

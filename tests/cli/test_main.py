@@ -275,7 +275,7 @@ def test_an_unwritable_crash_report_is_reported(reconstruct, chain, tmp_path, ca
     assert reconstruct() == 1
     printed = capsys.readouterr().err
     assert "Traceback" in printed
-    assert "report it with the traceback above" in printed
+    assert "Please send the traceback above" in printed
 
 
 @pytest.mark.parametrize("place", ["out", "photos", "photograph"])

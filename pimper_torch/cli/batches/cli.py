@@ -34,13 +34,10 @@ class _Job:
             `name` and options of `pimper reconstruct`.
         out: Folder for batch.csv, batch.html and a folder per object.
         overwrite: Replace results of other settings or photographs.
-        jobs: Number of simultaneous objects; by default as many as memory and cores allow, or 100
-            on Slurm.
-        dask: Address of a dask.distributed scheduler whose workers run the objects, such as
-            tcp://127.0.0.1:8786.
+        jobs: Number of simultaneous objects; by default as many as fit, or 100 on Slurm.
+        dask: Address of a dask.distributed scheduler to run on, such as tcp://127.0.0.1:8786.
         slurm: Slurm partition whose nodes run the objects, one job per object.
-        time_limit: Time limit of a try in minutes; by default ten times the estimate, and at least
-            an hour.
+        time_limit: Minutes per try; by default ten times the estimate, at least an hour.
         mem_gb: Memory of a run; estimated by default.
         cpus_per_task: Threads of a run; by default an equal share of the cores, or 1 on a cluster.
     """

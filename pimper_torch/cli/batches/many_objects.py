@@ -41,12 +41,10 @@ def batch(
         out: Folder for ``batch.csv``, ``batch.html`` and a folder per object; workers must see it,
             and the photographs, under the same path.
         executor: Executor of the tasks; by default processes on this machine.
-        jobs: Number of simultaneous objects on this machine; by default as many as fit. Not
-            allowed with an executor.
+        jobs: Number of simultaneous objects; by default as many as fit. Only without executor.
         settings: Options of ``pimper reconstruct`` for every object.
         overwrite: Replace results of other settings or files.
-        time_limit_min: Time limit of a try in minutes; by default ten times the estimate, and at
-            least an hour.
+        time_limit_min: Minutes per try; by default ten times the estimate, at least an hour.
         mem_gb: Memory of a run; estimated by default.
         cpus_per_task: Threads of a run; by default an equal share of the cores, 1 with an executor.
         listener: Called with the outcome of each object as soon as it ends.
@@ -55,7 +53,7 @@ def batch(
         The outcomes in the order of the objects.
 
     Raises:
-        InputError: There are no objects, or several with one name.
+        InputError: No objects, or several with one name.
         ConfigError: An object has an invalid setting.
     """
     require(jobs is None or executor is None, "jobs", jobs, "no value together with an executor")

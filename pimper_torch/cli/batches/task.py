@@ -73,7 +73,7 @@ class Task:
         return self.out.parent / STAGES / f"{self.name}{suffix}"
 
     def made_from(self) -> str:
-        """Return the key written before the latest run; empty if there is none."""
+        """Return the key of the latest run, written at its start; empty without a run."""
         path = self.beside(".key")
         return path.read_text(encoding="utf-8") if path.exists() else ""
 
@@ -89,9 +89,8 @@ class Outcome:
 
     Attributes:
         status: ``ended`` with a result; ``failed`` with an error that will recur; ``lost`` if a new
-            try may succeed; ``kept`` if the result was already complete; ``waiting`` if no try
-            began.
-        message: Reason if there is no result.
+            try may succeed; ``kept`` with an earlier complete result; ``waiting`` without a try.
+        message: Reason for a missing result.
         place: Host name of the worker.
     """
 
@@ -155,7 +154,7 @@ def _tried(task: Task, latest: float) -> tuple[Status, str]:
                 if task.made_from() != task.key:
                     task.beside(".key").write_text(task.key, encoding="utf-8")
             break
-        except OutputError as error:  # another run has the lock
+        except OutputError as error:  # a different run has the lock
             if time.monotonic() > deadline:
                 return "waiting", f"not started: {error}"
             time.sleep(_LOOK_SECONDS)

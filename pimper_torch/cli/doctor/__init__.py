@@ -1,1 +1,1 @@
-"""Fast checks of photographs and of the machine before a run."""
+"""Fast checks of photographs and of the machine."""

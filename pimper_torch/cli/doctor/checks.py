@@ -1,4 +1,4 @@
-"""Checks of photographs before a run: each one alone, and their overlap."""
+"""Checks of photographs: each one alone, and their overlap."""
 
 import math
 from collections import Counter

@@ -38,10 +38,9 @@ def planned(
 ) -> list[tuple[str, float]]:
     """List the stages of the default chain with their estimated seconds on 2 cores.
 
-    Compilation is excluded; it is noticeable only in the first run of an installation. The time of
-    stages on photographs grows with all pixels, or with the number of photographs if they scale
-    them down. The time of stages on the surface grows with the pixels of one photograph and the
-    square of the scale.
+    Compilation, noticeable only in an installation's first run, is excluded. Stages on photographs
+    take time proportional to all pixels, or to the number of photographs if they scale them down;
+    stages on the surface, to the pixels of one photograph and the square of the scale.
     """
     pairs, one = num_views * (num_views - 1) / 2, megapixels / max(1, num_views)
     if num_views > 66:  # each is matched with its 20 most similar views, many pairs twice
@@ -74,7 +73,7 @@ def cost(photographs: Sequence["Photograph"], available_gb: float | None) -> Fin
     """Report the estimates, and whether the memory is available."""
     megapixels = sum(photo.width * photo.height for photo in photographs) / 1e6
     seconds, needed = estimate(megapixels, len(photographs))
-    found = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, estimated"
+    found = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
     if available_gb is None or needed <= available_gb:
         return Finding("cost", "ok", found)
     found += f"; {available_gb:.1f} GB are free"

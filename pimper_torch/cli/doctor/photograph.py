@@ -15,8 +15,7 @@ from pimper_torch.ground.shapes import Map, Mask
 from pimper_torch.records import Record, Views
 from pimper_torch.runtime.parallel import side_by_side
 
-# Smoothing before the two compared gradients, in pixels: enough against noise, and small compared
-# with the blur to detect.
+# Smoothing of the two compared gradients, in pixels: above noise, below the blur to detect.
 _FINE, _WIDE = 1.0, 2.0
 
 
@@ -26,11 +25,8 @@ def edge_blur_px(grey: Map) -> float:
     An ideal edge under a Gaussian blur of variance :math:`s^2` has, after smoothing with variances
     :math:`a^2` and :math:`b^2`, gradients in the ratio
     :math:`R^2 = (s^2 + b^2) / (s^2 + a^2)`, so that :math:`s^2 = (b^2 - R^2 a^2) / (R^2 - 1)`.
-    Edges are grouped by orientation and the most blurred orientation counts, because motion only
-    blurs edges across its direction.
-
-    Returns:
-        NaN if there are no edges.
+    The most blurred orientation of edges counts, because motion only blurs edges across it. NaN
+    without edges.
 
     Source: Zhuo & Sim, Defocus map estimation from a single image, Pattern Recognition 44, 2011.
     """

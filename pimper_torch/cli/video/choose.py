@@ -63,8 +63,7 @@ def thumbnail(luma: UInt8[Tensor, "height width"]) -> Thumbnail:
 def motion(before: Thumbnail, after: Thumbnail) -> float:
     """Return the motion between thumbnails, as a fraction of their width: a high quantile.
 
-    Source of the optical flow: Kroeger, Timofte, Dai, Van Gool, Fast optical flow using dense
-    inverse search, ECCV 2016.
+    Source: Kroeger et al., Fast optical flow using dense inverse search, ECCV 2016.
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)
     # An object that turns in front of a static wall may cover only a fifth of the frame.

@@ -60,8 +60,7 @@ def digest(*values: object) -> str | None:
             enums, paths, numbers, texts, bytes or ``None``.
 
     Returns:
-        Hexadecimal; ``None`` if a value cannot be hashed, such as code of other packages, or
-        requires gradients.
+        Hexadecimal; ``None`` for values such as code of other packages, or with gradients.
     """
     try:
         text = json.dumps([_described(value) for value in values])

@@ -83,7 +83,7 @@ class Store:
                 f"{self.folder}: records cannot be kept there ({error}). Free space, or choose a "
                 "writable folder."
             ) from error
-        with suppress(OSError):  # another run may delete the same files
+        with suppress(OSError):  # other runs may delete the same files
             self._bound()
         return self._path(key).exists()
 
@@ -112,8 +112,7 @@ def realigned(record: AnyRecord) -> AnyRecord:
     """Return the record with contiguous tensors at aligned addresses; other tensors are copied.
 
     Stages then compute the same bits from records of equal values: matrix products round
-    differently at other strides or addresses. Fields that share a tensor still share it.
-    Differentiable.
+    differently at other strides or addresses. Shared tensors stay shared. Differentiable.
     """
     copies: dict[int, Tensor] = {}
 
@@ -132,8 +131,7 @@ def kept(
 ) -> tuple[AnyRecord, float]:
     """Return a record kept by an earlier run, or compute and keep it.
 
-    Reports, failures and warnings of the earlier run are repeated. A record that cannot be written
-    gives a warning.
+    Reports, failures and warnings of the earlier run are repeated. Failed writes give a warning.
 
     Args:
         key: A hash of everything that the record depends on; ``None`` if that is unknown.

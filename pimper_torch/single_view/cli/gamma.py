@@ -16,8 +16,7 @@ from pimper_torch.runtime.errors import InputError, caution, held
 if TYPE_CHECKING:
     from pimper_torch.single_view.factorization.estimate_gamma import GammaEstimate
 
-# A standard response is recommended if its residual is below this multiple of the best one; chosen
-# by hand.
+# Multiple of the best residual below which a standard response is recommended; chosen by hand.
 _AS_GOOD = 1.05
 
 

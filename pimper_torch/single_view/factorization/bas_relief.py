@@ -114,8 +114,7 @@ def relief_from_strength(
 ) -> BasRelief:
     """Return the convex bas-relief transformation under which most point lights are equally strong.
 
-    Squared strengths are fitted to 1 with Cauchy's loss from several initial depths. Constant to
-    autograd.
+    Squared strengths are fitted to 1, with Cauchy's loss, from several depths. No gradient.
 
     Args:
         lights: Lights of the same factorization as the shading; zero rows are ignored.

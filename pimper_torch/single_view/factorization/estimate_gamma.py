@@ -8,8 +8,7 @@ exponent, the residual is computed in encoded values, where the noise is,
 
 and is therefore comparable between exponents. A residual in radiance, even relative to radiance,
 is not: ``M ** gamma`` tends to a matrix of ones, of rank 1, as gamma decreases. To first order,
-noise adds its variance times the degrees of freedom to ``f``, independent of the exponent, and
-does not shift the minimum.
+noise adds its variance times the degrees of freedom to ``f`` and does not shift the minimum.
 """
 
 import math
@@ -75,8 +74,7 @@ def fit_encoded(start: EncodedFit, response: Response, iterations: int = 1) -> E
     """Fit first-order light to encoded values through a response; constant to autograd.
 
     The encoded residual is linearized about the start, a fit of a similar response, and then about
-    the new fit. Linearized, it is least squares in radiance, weighted by the square of the
-    response's slope.
+    the new fit: least squares in radiance, weighted by the square of the response's slope.
 
     Args:
         iterations: Number of further linearizations about the fit, with outlier weights.
@@ -124,8 +122,7 @@ _MIN_SCALE = 5e-4
 
 # The estimate is checked without these fractions of the darkest entries.
 _DARKEST_FRACTIONS = (1 / 3, 1 / 2)
-# If the estimate from brighter entries differs by more than this number of its standard errors, it
-# replaces the estimate from all.
+# Number of standard errors above which a deviating estimate from brighter entries is used.
 _MAX_ERRORS = 3.0
 
 
@@ -134,8 +131,7 @@ class GammaEstimate(Record):
     """The estimated exponent of a gamma curve, ``radiance = encoded ** gamma``.
 
     Attributes:
-        standard_error: Standard error of gamma, from its variation over samples, or over views if
-            that is larger.
+        standard_error: Of gamma, from its variation over samples, or over views if larger.
         determined: False if the standard error is more than a tenth of gamma, the minimum is at an
             end of the range, or residuals exceed the noise of cameras.
         residual: Robust standard deviation of the residuals in encoded values; 1 is full scale.
@@ -168,9 +164,9 @@ def estimate_gamma(encoded: Samples, seen: Seen, *, rank: int = 4) -> GammaEstim
     """Estimate gamma from the same surface samples under several lights.
 
     Dark and saturated values are excluded: first by observed values, then by predictions of the
-    fit, because selection by noisy values biases gamma. Outliers lose weight. If the estimate from
-    the brighter entries differs significantly, it is used: ambient light in attached shadows is not
-    first-order.
+    fit, because selection by noisy values biases gamma. Outliers lose weight. A significantly
+    different estimate from the brighter entries is preferred: ambient light in attached shadows is
+    not first-order.
 
     Args:
         encoded: Values as in the files; 1 is full scale.
@@ -214,8 +210,7 @@ def gamma_of_photographs(views: Views, *, mask: Mask | None = None, rank: int = 
     """Estimate the gamma of photographs that a fixed camera took under several lights.
 
     Args:
-        views: Views loaded with :data:`~pimper_torch.ground.radiometry.LINEAR`; only pixels in all
-            of their masks are used.
+        views: Loaded with :data:`~pimper_torch.ground.radiometry.LINEAR`; masks are intersected.
         mask: True on the object, for all photographs.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:

@@ -38,7 +38,7 @@ Columns = Float[Tensor, "*batch rank sample"]
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """Manifold of all vectors, for low-rank factorization; of rank 3, they are albedo times normal."""
+    """Manifold of all vectors, for low-rank factorization; with rank 3, albedo times normal."""
 
     rank: int = 3
     flat: ClassVar[bool] = True
@@ -148,8 +148,7 @@ class Restarted(Record):
 
     Attributes:
         best: Factors as a batch of one, rows as views and columns as samples.
-        repeated: Whether ``repeats`` starts reached the best minimum; otherwise a better one is
-            likely to exist.
+        repeated: Whether ``repeats`` starts reached the best minimum; else a better one may exist.
     """
 
     best: Factors

@@ -10,9 +10,8 @@ system is solved to convergence, so the result does not depend on the solver.
 
 At a crease or an occlusion boundary, the slope along a step changes by more than on the adjacent
 steps, and the predicted step is wrong by up to that change (kink). Where the slope across a step
-changes in this way (twist), both sides meet in at most one point. Such steps are not tested. They
-and the rejected steps keep a small weight, which aligns components of undetermined relative depth
-in the mean of their border.
+changes so (twist), both sides meet in at most one point. Such steps are not tested. They and the
+rejected steps keep a small weight, which aligns separate components in the mean of their border.
 
 Source: Black & Rangarajan, IJCV 19(1), 1996, for the loss and its graduation; the partition into
 continuous components and borders follows Milano, Chung, Ott & Siegwart, 2025, but components
@@ -33,8 +32,7 @@ from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, joined
 
 # The final scale, the residual at which a step keeps a quarter of its weight: in pixel widths at
-# the surface's depth, and at least in deviations of the residuals, so that noisy normals do not
-# cause discontinuities.
+# the surface's depth; at least in deviations of residuals, so noise causes no discontinuities.
 _SCALE_PX, _NOISE_SCALES = 0.3, 6.0
 
 # Maximum kink of a tested step, about the tangent of a crease's angle; and maximum twist, which
@@ -53,8 +51,7 @@ class Continuity(Record):
     """Weights of the steps between pixels.
 
     Attributes:
-        right: Weight in [0, 1] of each step to the right: 1 continuous, 1e-4 rejected, 0
-            outside.
+        right: Weight of each step to the right: 1 continuous, 1e-4 rejected, 0 outside.
         convergence: Convergence of the weights; the residual of continuous steps is in pixels.
     """
 

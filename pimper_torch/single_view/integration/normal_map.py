@@ -63,14 +63,11 @@ def integrate_normal_map(
             viewer, of any length. The surface is interpolated where they are not finite, zero or
             facing away. Rasters are tensors or NumPy arrays.
         mask: Pixels of the surface; all by default.
-        intrinsics: Intrinsics of a pinhole camera, in pixels from the corner of the top-left
-            pixel; by default rays are parallel.
+        intrinsics: Of a pinhole, in pixels from the top-left corner; by default rays are parallel.
         spacing: Distance of neighbouring pixels in a row and in a column, for parallel rays.
-        weight: Weight of each normal relative to a known depth, by default 1; normals of weight 0
-            are ignored.
+        weight: Of each normal relative to a known depth, by default 1; with 0 it is ignored.
         known_depth: Depth at known pixels, NaN elsewhere.
-        method: ``"discontinuities"`` preserves depth discontinuities; ``"weighted"`` is least
-            squares.
+        method: ``"discontinuities"`` preserves them in depth; ``"weighted"`` is least squares.
 
     Raises:
         InputError: Unusable rasters, or normals encoded as colours or with z to the viewer.

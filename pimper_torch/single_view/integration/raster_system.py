@@ -27,15 +27,13 @@ class RasterSystem:
     r"""The matrix :math:`D^T W D + \mathrm{diag}(a)` of a raster, for any number of solves.
 
     Args:
-        weight_right: Weight of the step from each pixel to the next in its row; finite, not
-            negative.
+        weight_right: Of the step from each pixel to the next in its row; finite, not negative.
         known_weight: ``a``, weight of each pixel's known height; not negative, ``None`` for zero.
         tolerance: Relative error of a solution in the energy norm.
 
     A free component, which is connected and has no known height, has mean 0; the mean of its
     right-hand side is ignored. Weights may vary over ten orders, with holes, islands and single
-    pixels. Heights are computed in float64, and returned in the device and dtype of the
-    right-hand side.
+    pixels. Heights are computed in float64, with the right-hand side's device and dtype.
 
     >>> system = RasterSystem(torch.ones(2, 1), torch.ones(1, 2))
     >>> system.fit_steps(torch.ones(2, 1), torch.zeros(1, 2))

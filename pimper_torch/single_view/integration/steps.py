@@ -32,9 +32,8 @@ StepsDown = Shaped[Tensor, "steps_down width"]
 # Cosine between ray and normal below which a normal is not used (slope 1000); chosen by hand.
 _GRAZING = 1e-3
 
-# The cubic through four slopes is used where it differs from the chord by less than the first
-# value, and far from creases, where the change of slope exceeds its neighbours' by the second.
-# Chosen by hand.
+# The cubic through four slopes is used where it differs from the chord by less than the first, and
+# not near creases, where a change of slope exceeds its neighbours' by the second. Chosen by hand.
 _MAX_DIFFERENCE, _MAX_KINK = 0.5, 0.3
 
 
@@ -47,8 +46,7 @@ class Steps(Record):
         slope: Slope of every step; 0 outside.
         units: Change of the unknown on a step of slope 1, to the right and down.
         reliable: True if both pixels are inside and have usable normals.
-        kink: Change of the slope along the step, minus that of the steps before and after:
-            0 on a smooth surface.
+        kink: Change of the slope along the step, minus that of adjacent steps; 0 if smooth.
         twist: The same for the slope across the step. It is large at depth discontinuities: sides
             of different slope meet in at most one point.
         valid: Pixels with a usable normal.
@@ -99,8 +97,7 @@ def orthographic_steps(
     """Return the steps of depth for parallel rays, differentiable in the normals.
 
     Args:
-        normals: Unit normals, ``n_z < 0``; where they are not finite or face away, slopes are
-            inpainted and steps not reliable.
+        normals: Unit, ``n_z < 0``; others are inpainted, and their steps not reliable.
         spacing: Distance of neighbouring pixels in a row and in a column.
     """
     towards = normals.new_tensor([0, 0, 1]).double()
@@ -110,8 +107,7 @@ def orthographic_steps(
 def perspective_steps(normals: VectorMap, mask: Mask, intrinsics: Matrix3) -> Steps:
     r"""Return the steps of the logarithm of depth for a pinhole camera.
 
-    On a step, the tangent planes of both pixels meet on the ray half-way, which is exact for
-    planes:
+    The tangent planes of both pixels meet on the ray half-way, which is exact for planes:
 
     .. math:: x_b - x_a = \log \frac{(n_a \cdot r_a)(n_b \cdot r_m)}
                                     {(n_a \cdot r_m)(n_b \cdot r_b)}.

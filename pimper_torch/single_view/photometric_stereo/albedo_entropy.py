@@ -24,10 +24,9 @@ Candidates = Float[Tensor, "candidate 3"]
 def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Labels:
     """Return clusters of pixels of similar chromaticity, without the lights' colours.
 
-    The logarithms ``e`` and ``a`` are estimated alternately by weighted least squares; weights are
-    the square of brightness. Repeatedly, the colour with the most neighbours becomes a cluster, and
-    its neighbours are removed. Then every pixel is assigned to the nearest cluster within the
-    radius.
+    The logarithms ``e`` and ``a`` are estimated alternately by least squares, weighted by squared
+    brightness. Repeatedly, the colour with the most neighbours becomes a cluster, and these are
+    removed. Then every pixel is assigned to the nearest cluster within the radius.
 
     Args:
         radiance: Linear radiance of at least two channels; with one, all pixels are one cluster.
@@ -94,13 +93,11 @@ def resolve_by_albedo_entropy(shading: Shading, groups: Labels | None = None) ->
     local search with decreasing steps and kernel widths.
 
     Args:
-        shading: Albedo times normal, up to a bas-relief transformation; vectors that are zero or
-            not finite are ignored.
+        shading: Albedo times normal, up to bas-relief; zero and infinite vectors are ignored.
         groups: Labels of pixels of equal chromaticity (:func:`.chromaticity_groups`), within which
             the entropy of brightness is minimized; by default all pixels are one group.
 
-    Fails if the surface has as many albedos as pixels, or few different normals. Convex surfaces
-    stay convex.
+    Fails for surfaces with as many albedos as pixels, or few normals. Convex ones stay convex.
 
     Source: Alldrin, Mallick & Kriegman, CVPR 2007. The logarithm, which replaces their fixed
     scale, the standard form and the use of colour are ours.
@@ -136,8 +133,8 @@ def albedo_entropy(
         candidates: mu, nu and the logarithm of lambda.
         width: Standard deviation of the kernel, in logarithm of albedo.
     """
-    # A cubic B-spline is nearly a Gaussian of width 1 / sqrt(3) bins, and the entropy of its samples
-    # hardly depends on their position within a bin.
+    # A cubic B-spline is nearly a Gaussian of width 1 / sqrt(3) bins, and the entropy of its
+    # samples hardly depends on their position within a bin.
     bins_per_unit = 1 / (3**0.5 * width)
     bins = int(2 * _REACH * bins_per_unit) + 4
     x, y, z = shading

@@ -40,8 +40,7 @@ class Curls(Record):
 
     Attributes:
         across: ``s ^ ds/dx``, pairs (0, 1), (0, 2), ... of components.
-        noise: Covariance of ``across``, and of ``down``, for white noise of the pseudo-normals;
-            up to a factor.
+        noise: Covariance of ``across`` and ``down`` for white noise of ``s``, up to a factor.
     """
 
     across: Float[Tensor, "equation 3"]
@@ -151,7 +150,7 @@ def _least(equations: Curls) -> Float[Tensor, " both"]:
         weight = equations.weight * cauchy_weights(residual, scale)
     second = vectors[:, 1]
     terms = full * torch.kron(torch.eye(2), torch.ones(3, 3)).to(full)
-    # If the curl of the second best solution is rounding error relative to its terms, it fits, too.
+    # If the curl of the second best solution is rounding error, it is also a solution.
     if not float(second @ full @ second) > 1e-12 * float(second @ terms @ second):
         raise InputError(
             "integrability: more than one matrix makes these pseudo-normals a surface, as for a "

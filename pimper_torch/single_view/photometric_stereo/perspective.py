@@ -53,9 +53,8 @@ def factorize_in_perspective(
         radius: Radius of the squares, which must be inside the mask.
 
     Returns:
-        Shading and lights in the camera frame, unique up to one factor between them; the lights'
-        root mean square is 1. Pixels observed in fewer than three views have the vector zero.
-        Constant to autograd.
+        Shading and lights in the camera frame, up to one factor; the lights' root mean square is 1.
+        Pixels observed in fewer than three views have the vector zero. Constant to autograd.
 
     The error is proportional to the inverse of the field of view. On a ball, and on some other
     surfaces, the images do not determine the result; this is only detected on noisy images.
@@ -132,9 +131,8 @@ def _mixing_matrix(
     rays, by_ray = rays[centres].mT, intrinsics[:2, :2]  # derivatives of u and v by x and y
     along_x, along_y = torch.einsum("st,scp->tcp", by_ray, torch.stack(slopes))
     rows = integrability_equations(b, along_x, along_y, rays)
-    # Noise of the factors is white; after whitening it has a covariance, which normalization
-    # divides by the vectors' squared length. This is the covariance of each vector's cross product
-    # with the noise.
+    # Covariance of each vector's cross product with noise: the factors' white noise has one after
+    # whitening, which normalization divides by the vectors' squared length.
     cross = torch.linalg.cross(torch.eye(3).to(b)[None], b.mT[:, None], dim=-1)
     noise_covariance = cross @ (white @ white.mT) @ cross.mT
     noise_covariance = noise_covariance / size[centres[mask]].square()[:, None, None]

@@ -57,8 +57,7 @@ def regress(radiance: Samples, weight: Samples, lights: Lights, *, robust: bool 
     light from behind (:math:`l_v^\top b \le 0`) have weight 0. The initial fit weights samples by
     their brightness, up to the pixel's median, because shadows are dark.
 
-    For an underdetermined pixel, one of the minima is returned; see :func:`determined`. In float64;
-    constant to autograd.
+    An underdetermined pixel has one of its minima; see :func:`determined`. Float64, no gradient.
 
     Source: Holland & Welsch 1977 for the weights; robust weights instead of thresholds for shadows
     and highlights are common practice since Ikehata et al., CVPR 2012.
@@ -103,7 +102,7 @@ def brightness(radiance: Samples, seen: Bool[Tensor, "view pixel"]) -> Samples:
 
 
 def determined(weight: Samples, lights: Lights) -> Bool[Tensor, " pixel"]:
-    """Return whether pixels have at least as many samples as unknowns, and lights that span them."""
+    """Return whether pixels have enough samples, under lights that span the unknowns."""
     count = (weight > 0.1 * weight.amax(dim=0).clamp_min(1e-300)).sum(dim=0)
     basis = normalize(lights.double(), dim=0, eps=1e-300)
     unknowns = lights.shape[1]
@@ -184,10 +183,9 @@ def factorize_photographs(
 ) -> Factored:
     """Return factors of photographs with missing samples, shadows and highlights.
 
-    For complete photographs and without robust weights, they are from the singular value
-    decomposition. Otherwise lights are estimated from an even subset of pixels by variable
-    projection, with Cauchy's weights if ``robust``, and the shading of all pixels is regressed on
-    them. Constant to autograd.
+    For complete photographs without robust weights, by singular value decomposition. Otherwise
+    lights are estimated from an even subset of pixels by variable projection, with Cauchy's weights
+    if ``robust``, and the shading of all pixels is regressed on them. Constant to autograd.
 
     Source: Hayakawa, JOSA A 11(11), 1994, for the decomposition.
     """

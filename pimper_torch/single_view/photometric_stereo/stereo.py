@@ -28,8 +28,8 @@ from pimper_torch.single_view.photometric_stereo.regress_lights import (
     factorize_photographs,
 )
 
-# Methods with the resolvers of their bas-relief ambiguity; "rounded" is a convention. Entropy is the
-# default: on rendered objects it is closest to the true lights (benchmarks/photometric_stereo.py).
+# Methods with the resolvers of their bas-relief ambiguity; "rounded" is a convention. The default
+# is entropy, closest to true lights on rendered objects (benchmarks/photometric_stereo.py).
 METHODS: dict[str, tuple[str, ...]] = {
     "calibrated": (),
     "integrability": ("albedo_entropy", "rounded", "equal_strength"),
@@ -43,8 +43,7 @@ class PhotometricStereo(Record):
 
     Attributes:
         normals: Unit normals, camera frame; where not valid, an estimate or zero.
-        albedo: Albedo, not negative. For unknown lights it is up to one factor, chosen so that
-            lights have the median length 1.
+        albedo: Not negative; with unknown lights in units in which their median length is 1.
         lights: Direction to the point light times its irradiance; zero for a view without samples.
         lit: True where a sample is an inlier: observed, not in shadow, not a highlight.
         valid: True where a pixel has at least as many samples as unknowns, their lights span
