@@ -57,7 +57,7 @@ class CommonOptions:
 
     Attributes:
         preset: Settings to start from: default, fast, paper, or your own YAML file.
-        reference: Photograph for sample spacing and rendered views; by default chosen by the run.
+        reference: Photograph for sample spacing and rendered views; by default automatic.
         device: Device of the stages after structure from motion; cuda has not been tested on a GPU.
         max_size_px: Longer side to which larger photographs are scaled down; 0 keeps all sizes.
         overwrite: Replace the result in OUT.
@@ -132,13 +132,13 @@ class InputOptions:
             side of other markers in millimetres. With --sparse, only markers of a given side count.
         unit: Unit of given lengths, and of the result if its size is known.
         silhouettes: Folder of soft masks of a segmentation network, for all or some photographs, of
-            any size: PNG, JPEG, EXR, NPZ or NPY. Other views overrule them if they contradict.
+            any size: PNG, JPEG, EXR, NPZ or NPY. Contradicting views overrule them.
         object_at: Pixel of a photograph on the object; may be repeated.
         normals: Folder of a network's normal maps, named like photographs: PNG, EXR, NPZ or NPY.
         axes: Axes of these normals; auto detects them from point cloud and outlines.
-        normals_error_deg: Root mean square error of these normals, if no file has their variance.
+        normals_error_deg: Root mean square error in degrees, if no file has their variance.
         depth: Folder of depth maps of a network; their kind is detected from the point cloud.
-        depth_error: The same for depths, as a fraction of their range.
+        depth_error: Root mean square error over the range of depths, if no file has their variance.
     """
 
     masks: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None

@@ -52,8 +52,7 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
     ) -> _Job:
         """Print the settings of a preset as YAML with their meaning, or explain one.
 
-        The output is a valid `--preset` (`pimper config paper > mine.yaml`), of which unchanged
-        lines may be deleted.
+        The output is a valid `--preset`, also with lines deleted: `pimper config > mine.yaml`.
 
         Args:
             name: A preset to print (default, fast, paper, or a YAML file); or a section or a

@@ -22,8 +22,7 @@ class Journal:
     """Events and listeners of a call.
 
     Attributes:
-        events: Cautions (texts), failures, entries of guards, and reports of stages, in order of
-            arrival; ``None`` if they are not collected.
+        events: Cautions (texts), failures, entries of guards, reports of stages; or ``None``.
         collects: Whether failures and entries of guards are events; else failures warn at once.
         fail: Whether a failure ends the run.
         quiet: Whether cautions are only events, without warnings.

@@ -36,8 +36,7 @@ def side_by_side(
 ) -> Iterator[Result]:
     """Yield ``work(item)`` for every item in order, computed in parallel.
 
-    At most as many results as workers are buffered, so memory is bounded. Context variables and
-    the gradient mode are those of the caller.
+    To bound memory, one result per worker is buffered. Context and gradient mode are the caller's.
 
     Args:
         work: Called in a worker thread.

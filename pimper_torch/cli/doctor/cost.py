@@ -39,8 +39,8 @@ def planned(
     """List the stages of the default chain with their estimated seconds on 2 cores.
 
     Compilation, noticeable only in an installation's first run, is excluded. Stages on photographs
-    take time proportional to all pixels, or to the number of photographs if they scale them down;
-    stages on the surface, to the pixels of one photograph and the square of the scale.
+    grow with all pixels, or with the number of photographs if they scale them down; stages on the
+    surface grow with the pixels of one photograph and the square of the scale.
     """
     pairs, one = num_views * (num_views - 1) / 2, megapixels / max(1, num_views)
     if num_views > 66:  # each is matched with its 20 most similar views, many pairs twice

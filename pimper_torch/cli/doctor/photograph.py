@@ -25,8 +25,7 @@ def edge_blur_px(grey: Map) -> float:
     An ideal edge under a Gaussian blur of variance :math:`s^2` has, after smoothing with variances
     :math:`a^2` and :math:`b^2`, gradients in the ratio
     :math:`R^2 = (s^2 + b^2) / (s^2 + a^2)`, so that :math:`s^2 = (b^2 - R^2 a^2) / (R^2 - 1)`.
-    The most blurred orientation of edges counts, because motion only blurs edges across it. NaN
-    without edges.
+    The most blurred orientation counts, as motion blurs edges across it only. NaN without edges.
 
     Source: Zhuo & Sim, Defocus map estimation from a single image, Pattern Recognition 44, 2011.
     """

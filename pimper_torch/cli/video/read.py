@@ -30,8 +30,7 @@ def luma_frames(path: Path) -> Iterator[UInt8[Tensor, "height width"]]:
     """Yield the luma of every frame in display order, without the rotation of the video.
 
     Raises:
-        InputError: The file is not a video, cannot be decoded, has pixels that are not square or
-            interlaced frames; or PyAV is not installed.
+        InputError: No decodable video with square pixels and progressive frames, or no PyAV.
     """
     for number, frame in enumerate(_frames(path)):
         if number == 0 and int(frame.color_trc) in _HIGH_RANGE:

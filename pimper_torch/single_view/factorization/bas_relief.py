@@ -97,8 +97,7 @@ def convex(relief: BasRelief, shading: Shading, weight: PerPixel, mask: Mask) ->
     """Return the transformation or its mirror image, which fits equally well: the convex one.
 
     Args:
-        shading: Shading before the transformation, in raster order. After the returned one,
-            normals point outwards on average.
+        shading: Untransformed, in raster order; transformed normals then point outwards on average.
     """
     upright = relief.to(shading.dtype)
     sideways, w = upright.on_shading(shading)[:2], weight.to(shading)
@@ -118,8 +117,7 @@ def relief_from_strength(
 
     Args:
         lights: Lights of the same factorization as the shading; zero rows are ignored.
-        shading: Albedo times normal up to a bas-relief transformation, in raster order; it
-            distinguishes convex from concave.
+        shading: Albedo times normal up to bas-relief, in raster order, to decide on convexity.
     """
     rows = lights[(lights != 0).any(dim=1)].detach().double()
     if len(rows) < 4:

@@ -8,7 +8,7 @@ exponent, the residual is computed in encoded values, where the noise is,
 
 and is therefore comparable between exponents. A residual in radiance, even relative to radiance,
 is not: ``M ** gamma`` tends to a matrix of ones, of rank 1, as gamma decreases. To first order,
-noise adds its variance times the degrees of freedom to ``f`` and does not shift the minimum.
+noise adds its variance times the degrees of freedom to ``f`` for any exponent, without a shift.
 """
 
 import math
@@ -165,8 +165,7 @@ def estimate_gamma(encoded: Samples, seen: Seen, *, rank: int = 4) -> GammaEstim
 
     Dark and saturated values are excluded: first by observed values, then by predictions of the
     fit, because selection by noisy values biases gamma. Outliers lose weight. A significantly
-    different estimate from the brighter entries is preferred: ambient light in attached shadows is
-    not first-order.
+    different estimate from brighter entries is preferred, as attached shadows need a higher order.
 
     Args:
         encoded: Values as in the files; 1 is full scale.
@@ -174,8 +173,7 @@ def estimate_gamma(encoded: Samples, seen: Seen, *, rank: int = 4) -> GammaEstim
         rank: 3 for distant point lights only, 4 with ambient light.
 
     Raises:
-        InputError: Values outside [0, 1] or not finite, an impossible rank, or fewer
-            views or samples than the rank needs.
+        InputError: Values outside [0, 1], an impossible rank, or too few views or samples for it.
 
     Constant to autograd.
     """
@@ -288,9 +286,8 @@ def _minimise(fit: EncodedFit, low: float, high: float) -> tuple[float, float, E
     r"""Return the gamma of least loss, its sandwich standard error, and its fit.
 
     With the derivative :math:`s_k` of the loss of sample (or view) k along the profile, and the
-    second derivative h of the total loss, the variance is :math:`\sum_k s_k^2 / h^2`, over samples
-    or over views, whichever is larger; it needs no model of the noise. The standard error is
-    infinite if the loss has almost no curvature.
+    second derivative h of the total loss, the variance is :math:`\sum_k s_k^2 / h^2`, the larger of
+    that over samples and over views; it needs no noise model. Infinite for almost no curvature.
     """
 
     def loss(logarithm: float) -> float:

@@ -74,8 +74,7 @@ def low_rank_problem(matrix: Matrices, weight: Matrices, start: LeftFactors) -> 
         start: Left factors of full rank.
 
     Raises:
-        InputError: A rank larger than the matrices allow, a negative weight, or a value that is
-            not finite with a positive weight.
+        InputError: Impossible rank, negative weight, or non-finite value of positive weight.
     """
     rows, columns = matrix.shape[1:]
     rank = start.shape[2]

@@ -47,8 +47,8 @@ class Steps(Record):
         units: Change of the unknown on a step of slope 1, to the right and down.
         reliable: True if both pixels are inside and have usable normals.
         kink: Change of the slope along the step, minus that of adjacent steps; 0 if smooth.
-        twist: The same for the slope across the step. It is large at depth discontinuities: sides
-            of different slope meet in at most one point.
+        twist: The same for the slope across the step; large at depth discontinuities, whose sides
+            meet in at most one point.
         valid: Pixels with a usable normal.
     """
 

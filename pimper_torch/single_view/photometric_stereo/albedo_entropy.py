@@ -32,8 +32,7 @@ def chromaticity_groups(radiance: Float[Tensor, "view channel pixel"]) -> Labels
         radiance: Linear radiance of at least two channels; with one, all pixels are one cluster.
 
     Returns:
-        Labels of the pixels, 0 for the largest group; -1 for pixels in no group, and for pixels
-        that are too dark in some channel of every view.
+        Labels of pixels, 0 for the largest group; -1 without a group, or too dark in every view.
     """
     values = radiance.double()
     brightest = values.flatten(1).amax(dim=1)[:, None]
@@ -93,7 +92,7 @@ def resolve_by_albedo_entropy(shading: Shading, groups: Labels | None = None) ->
     local search with decreasing steps and kernel widths.
 
     Args:
-        shading: Albedo times normal, up to bas-relief; zero and infinite vectors are ignored.
+        shading: Albedo times normal, up to bas-relief; zero and non-finite vectors are ignored.
         groups: Labels of pixels of equal chromaticity (:func:`.chromaticity_groups`), within which
             the entropy of brightness is minimized; by default all pixels are one group.
 

@@ -58,9 +58,8 @@ def wedge(u: Vectors, v: Vectors) -> Vectors:
 def curls(pseudo: Shading, weight: PerPixel, mask: Mask) -> Curls:
     """Return the equations of integrability over a raster.
 
-    Pseudo-normals are whitened and normalized first, so that albedo and its edges do not affect
-    the differences. These are taken over the four corners of a square; squares with a pixel
-    outside the mask, or of weight 0, are excluded.
+    Pseudo-normals are whitened and normalized, so that albedo and its edges do not affect the
+    differences. These use the four corners of squares, all of whose pixels must have weight.
 
     Args:
         pseudo: ``s`` of the pixels inside the mask, in raster order.
@@ -117,8 +116,7 @@ def integrable(pseudo: Shading, weight: PerPixel, mask: Mask) -> Matrix3:
     arbitrary. The third component of most normals is negative. Constant to autograd.
 
     Raises:
-        InputError: Fewer than six equations, or a surface (a plane, a cylinder) that
-            satisfies them with more than one matrix.
+        InputError: Fewer than six equations, or several solutions (for a plane, a cylinder).
 
     Source: Yuille & Snow, CVPR 1997; the noise model, the averaging and the weights are ours.
     """

@@ -46,8 +46,7 @@ class PhotometricStereo(Record):
         albedo: Not negative; with unknown lights in units in which their median length is 1.
         lights: Direction to the point light times its irradiance; zero for a view without samples.
         lit: True where a sample is an inlier: observed, not in shadow, not a highlight.
-        valid: True where a pixel has at least as many samples as unknowns, their lights span
-            space, and the normal faces the viewer.
+        valid: True for pixels with enough samples, lights that span space, and a visible normal.
         applied: The transformation that resolved the method's ambiguity, if any.
         free: The remaining ambiguity, in words.
     """
@@ -91,8 +90,7 @@ def photometric_stereo(
         mask: True on the object.
         lights: For ``calibrated``: direction to the point light times its irradiance, camera frame.
         intrinsics: ``K``, for ``perspective``; the other methods are orthographic.
-        weight: Weights of samples ``(view, height, width)``, not negative; 0 for missing,
-            saturated, or known shadowed samples.
+        weight: Of samples ``(view, height, width)``; 0 if missing, saturated, or in known shadow.
         robust: Whether shadows and highlights lose weight.
 
     >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
@@ -215,41 +213,23 @@ def _refuse(
     intrinsics: Tensor | None,
     weight: Tensor,
 ) -> None:
-    size, image_size, count = tuple(mask.shape), tuple(images.shape[2:]), len(images)
-    num_lights = 0 if lights is None else len(lights)
-    resolvers = METHODS[method]
-    for invalid, found, needed in (
-        (
-            image_size != size,
-            f"images are {image_size}, the mask {size}",
-            "one size; resize the mask",
-        ),
-        (not mask.any(), "the mask is empty", "pixels of the object; is it inverted?"),
-        (
-            num_lights != (count if method == "calibrated" else 0),
-            f"{num_lights} lights for {count} photographs",
-            "one light per photograph for calibrated, no lights otherwise",
-        ),
-        (
-            (intrinsics is not None) != (method == "perspective"),
-            f"intrinsics are {'not ' if intrinsics is None else ''}given",
-            "the camera's for perspective, none for orthographic methods",
-        ),
-        (
-            resolve is not None and resolve not in resolvers,
-            f"resolve is {resolve!r}",
-            ", ".join(resolvers) or "none",
-        ),
-        (
-            tuple(weight.shape) != (count, *size),
-            f"weights are {tuple(weight.shape)}",
-            f"{(count, *size)}, one per sample",
-        ),
-        (
-            not ((weight >= 0) & weight.isfinite()).all(),
-            "some weights are negative or not finite",
-            "0 or more",
-        ),
-    ):
-        if invalid:
+    def require(valid: bool, found: str, needed: str) -> None:
+        if not valid:
             raise InputError(f"photometric stereo, {method}: {found}; needed: {needed}.")
+
+    size, image_size, weight_size = map(tuple, (mask.shape, images.shape[2:], weight.shape))
+    require(image_size == size, f"images are {image_size}, the mask {size}", "one size")
+    require(bool(mask.any()), "the mask is empty", "pixels of the object; is it inverted?")
+    count, num_lights = len(images), 0 if lights is None else len(lights)
+    found = f"{num_lights} lights for {count} photographs"
+    needed = "one light per photograph for calibrated, no lights otherwise"
+    require(num_lights == (count if method == "calibrated" else 0), found, needed)
+    found = f"intrinsics are {'not ' if intrinsics is None else ''}given"
+    needed = "the camera's for perspective, none for orthographic methods"
+    require((intrinsics is not None) == (method == "perspective"), found, needed)
+    needed = ", ".join(METHODS[method]) or "none"
+    require(resolve is None or resolve in METHODS[method], f"resolve is {resolve!r}", needed)
+    needed = f"{(count, *size)}, one per sample"
+    require(weight_size == (count, *size), f"weights are {weight_size}", needed)
+    usable = bool(((weight >= 0) & weight.isfinite()).all())
+    require(usable, "some weights are negative or not finite", "0 or more")
