@@ -62,17 +62,17 @@ class CommonOptions:
         max_size_px: Longer side to which larger photographs are scaled down; 0 keeps all sizes.
         overwrite: Replace the result in OUT.
         faces: Maximum number of faces of the mesh, or all; by default as few as the shape needs.
-        watertight: Close the mesh; the added caps are marked as not measured.
+        watertight: Close the mesh; caps are marked as not measured.
         stl: Also write the mesh as STL.
         obj: Also write mesh and asset as OBJ.
         usdz: Also write the asset as USDZ; needs pip install "pimper_torch[usd]".
         texture: Format of the textures in asset.glb.
         asset_cameras: Include the cameras of the photographs in asset.glb.
         no_report: Do not write report.html.
-        fresh: Recompute all stages, even if an earlier run kept their records.
+        fresh: Ignore the records that earlier runs kept.
         cache: Folder for the records of stages, which later runs reuse; OUT/.stages by default.
         max_kept: Maximum size of this folder, such as 2GB.
-        view: Show cameras and the surface of each pass in the browser during the run.
+        view: Show cameras and each pass in the browser.
     """
 
     preset: str = "default"
@@ -122,8 +122,8 @@ class InputOptions:
         mask_object: Brightness of the object in the masks; auto decides from all masks together.
         sparse: Known cameras: folder of a COLMAP model, transforms.json, cameras.xml, .sfm or .npz.
         mesh: Rough surface to start from (PLY, OBJ, STL, GLB), in the frame of these cameras.
-        object: Compute the object's silhouettes (auto), use the masks (masks), or reconstruct
-            everything in view (everything), such as walls and scenes. (default: auto)
+        object: Compute the object's silhouettes (auto), use the masks (masks), or reconstruct all
+            in view, such as walls (everything). (default: auto)
         region: Box around the object: smallest and largest corner in scene units, such as
             (-1,-1,0,1,1,2).
         scale_bar: Two points in photographs, in pixels, and their distance; may be repeated.
