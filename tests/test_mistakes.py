@@ -117,8 +117,8 @@ def test_a_misspelt_stage_or_setting_suggests_the_nearest(call, message):
     [
         ("photos/", "views is str; needed: Views or SparseScene. `load_views` reads"),
         (Path("photos"), "views is PosixPath; .* `load_views` reads"),
-        (torch.zeros(3, 3, 8, 8), "views is Tensor; .* `scene_of` puts images"),
-        (np.zeros((3, 3, 8, 8)), "views is ndarray; .* `scene_of` puts images"),
+        (torch.zeros(3, 3, 8, 8), "views is Tensor; .* `scene_of` combines images"),
+        (np.zeros((3, 3, 8, 8)), "views is ndarray; .* `scene_of` combines images"),
         (None, "views is NoneType; .*The caller of the stage passed it"),
     ],
 )
@@ -132,5 +132,5 @@ def test_a_wrong_argument_for_views_names_the_function_that_makes_views(preset, 
 def test_load_views_is_suggested_only_for_arguments_of_type_views(given):
     with pytest.raises(pt.InputError, match=r"^Warp: views is str; .* `load_views` reads"):
         pt.Warp()("photos/", given.cameras, None)
-    with pytest.raises(pt.InputError, match=r"^Decompose: coarse is Tensor; .*It comes from whoe"):
+    with pytest.raises(pt.InputError, match=r"^Decompose: coarse is Tensor; .*The caller of the"):
         pt.Decompose()(torch.zeros(3, 3), given.cameras)

@@ -54,7 +54,7 @@ def test_an_oversized_header_is_refused_before_allocation(tmp_path, text):
         archive.writestr("a.npy", header(text) + bytes(64))
     before = getrusage(RUSAGE_SELF).ru_maxrss
     for read in (read_npy, read_npz):
-        with pytest.raises(ValueError, match="it is no ar"):
+        with pytest.raises(ValueError, match="it is not a NumPy ar"):
             read(tmp_path / ("a.npy" if read is read_npy else "a.npz"))
     assert getrusage(RUSAGE_SELF).ru_maxrss - before < 1e4  # kB
 

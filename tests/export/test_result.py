@@ -140,7 +140,7 @@ def grey(path):
         (lambda out, photos: (photos / "b.png").unlink(), r"photographs b\.png are not in"),
         (lambda out, photos: grey(out / "masks" / "c.png"), r"c\.png: has 50 x 40 .*: 60 x 40"),
         (lambda out, photos: (out / "config.yaml").unlink(), r"holds no config\.yaml"),
-        (lambda out, photos: out.rename(out.parent / "away"), "is not a folder"),
+        (lambda out, photos: out.rename(out.parent / "away"), "is no folder"),
     ],
 )
 def test_a_damaged_or_mismatching_result_is_refused(folder, photographs, change, why):

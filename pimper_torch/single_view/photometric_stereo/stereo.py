@@ -218,7 +218,8 @@ def _refuse(
             raise InputError(f"photometric stereo, {method}: {found}; needed: {needed}.")
 
     size, image_size, weight_size = map(tuple, (mask.shape, images.shape[2:], weight.shape))
-    require(image_size == size, f"images are {image_size}, the mask {size}", "one size")
+    found = f"images are {image_size}, the mask {size}"
+    require(image_size == size, found, "one size; resize the mask")
     require(bool(mask.any()), "the mask is empty", "pixels of the object; is it inverted?")
     count, num_lights = len(images), 0 if lights is None else len(lights)
     found = f"{num_lights} lights for {count} photographs"

@@ -122,7 +122,7 @@ def test_starts_are_repeated_until_the_best_minimum_is(product, generator):
     ("change", "found"),
     [
         (lambda X, w: (X, -w), "weight that is negative"),
-        (lambda X, w: (torch.full_like(X, torch.inf), w), "no finite value"),
+        (lambda X, w: (torch.full_like(X, torch.inf), w), "without a finite value"),
         (lambda X, w: (X[..., :2], w[..., :2]), "rank is 3"),
     ],
 )

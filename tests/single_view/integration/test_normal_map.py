@@ -312,11 +312,11 @@ OPENGL = torch.tensor([1.0, -1, -1]).double()
 @pytest.mark.parametrize(
     ("change", "given", "needed"),
     [
-        (lambda n: n * OPENGL, {}, "100% of them have z tow"),
+        (lambda n: n * OPENGL, {}, "100% have z tow"),
         (lambda n: 0.5 + 0.5 * n * OPENGL, {}, "decode them as 2 n - 1"),
         (lambda n: n[..., :2], {}, r"of shape \(40, 40, 2\); needed: floating point"),
         (lambda n: (127 * n).to(torch.int8), {}, "normals are int8"),
-        (lambda n: n, {"mask": torch.zeros(40, 40, dtype=torch.bool)}, "no pixel"),
+        (lambda n: n, {"mask": torch.zeros(40, 40, dtype=torch.bool)}, "mask is empty"),
         (lambda n: n, {"mask": torch.ones(40, 41, dtype=torch.bool)}, "needed: one size"),
         (lambda n: n, {"weight": -torch.ones(40, 40)}, "1600 values"),
         (

@@ -85,7 +85,7 @@ def test_the_dtype_is_kept_and_empty_vectors_are_left_out():
 @pytest.mark.parametrize(
     ("shading", "needed"),
     [
-        (torch.ones(3, 49), "50 at least"),
+        (torch.ones(3, 49), "at least 50"),
         (torch.tensor([[0.0], [0], [-1]]).expand(3, 60), "parallel"),
     ],
 )

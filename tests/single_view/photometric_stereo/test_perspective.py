@@ -134,7 +134,7 @@ THREE = (torch.arange(12) < 3)[:, None].expand(12, 64**2)
         (lambda images, mask, K: (images[:2], mask, K), "2 views"),
         (lambda images, mask, K: (images, mask, -K), "focal lengths"),
         (lambda images, _, K: (images, THIN, K), "squares of 7 x 7"),
-        (lambda images, mask, K: (images[:1].expand(5, -1, -1, -1), mask, K), "rank two"),
+        (lambda images, mask, K: (images[:1].expand(5, -1, -1, -1), mask, K), "rank 2"),
         (lambda images, mask, K: (images, mask, K, THREE), "0 pixels more than 3"),
     ],
 )

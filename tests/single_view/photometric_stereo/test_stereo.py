@@ -100,8 +100,11 @@ EYE = torch.eye(3).double()
     ("settings", "needed"),
     [
         ({"method": "woodhem"}, "needed: one of calibrated, integrability"),
-        ({}, "0 lights for 6 photographs; needed: one for each"),
-        ({"method": "integrability", "lights": SIX}, "6 lights for 6 photographs; .* else none"),
+        ({}, "0 lights for 6 photographs; needed: one light per"),
+        (
+            {"method": "integrability", "lights": SIX},
+            "6 lights for 6 photographs; .* no lights otherwise",
+        ),
         ({"lights": SIX[:5]}, "5 lights for 6 photographs"),
         ({"lights": SIX / 0}, "lights are not finite"),
         ({"lights": SIX, "intrinsics": EYE}, "intrinsics are given; .* orthographic"),
