@@ -25,7 +25,7 @@ def test_each_object_has_a_line_and_failures_set_the_exit_code(world, capsys, fa
     if failing:
         assert cup.endswith("it is so.")
         assert totals.startswith("1 ended, 1 failed; ")
-        text = " ".join(told.err.split())
+        text = " ".join(printed.err.split())
         assert "1 of 2 objects have no result, for example cup: it is so." in text
 
 
