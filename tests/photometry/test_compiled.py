@@ -1,4 +1,4 @@
-"""The compiled solver against the torch module that it stands in for."""
+"""The compiled solver against its torch reference."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ def solve(given, how, iterations=60, tolerance=1e-4, **settings):
 
 
 def noisy(problem, generator, **settings):
-    """Problems like those of photographs: noise, outliers, priors, and lights that are pulled."""
+    """Return a problem as from photographs, with noise, outliers and priors."""
     given, _, _ = problem(**settings)
     draw = torch.randn(given.radiance.shape, generator=generator, dtype=torch.float64)
     gross = torch.rand(given.radiance.shape, generator=generator) < 0.05
@@ -47,7 +47,7 @@ def test_solutions_are_those_of_the_reference(problem, generator, missing, loss)
     found, expected = (solve(given, how, small_steps=1) for how in ("numba", "torch"))
     assert_close(found.convergence.cause, expected.convergence.cause)
     assert (found.convergence.iterations - expected.convergence.iterations).abs().max() <= 1
-    # Rounding of float32, and what a tolerance of 1e-4 leaves where one takes a step more.
+    # Rounding of float32, and the tolerance of 1e-4 if one solver takes a step more.
     assert_close(found.lights, expected.lights, rtol=0, atol=2e-3)
     assert_close(found.shading, expected.shading, rtol=0, atol=2e-3)
     assert_close(found.weight, expected.weight, rtol=0, atol=2e-2)
@@ -57,7 +57,7 @@ def test_solutions_are_those_of_the_reference(problem, generator, missing, loss)
 
 @dataclass(frozen=True)
 class Welsch(Loss):
-    """A loss of one's own, which no kernel knows."""
+    """A custom loss without a compiled kernel."""
 
     scale: float = 2.985
 
@@ -68,7 +68,7 @@ class Welsch(Loss):
         return torch.exp(-square)
 
 
-def test_a_loss_of_ones_own_is_solved_for_as_it_is(problem, generator):
+def test_a_custom_loss_without_kernel_is_minimized(problem, generator):
     given = noisy(problem, generator, patches=2, views=10, samples=60)
     found, cauchy = (solve(given.replace(loss=loss), "numba") for loss in (Welsch(), Cauchy()))
     residual = given.radiance - found.lights @ found.shading
@@ -78,8 +78,8 @@ def test_a_loss_of_ones_own_is_solved_for_as_it_is(problem, generator):
 
 
 @pytest.mark.parametrize("loss", ["huber", "geman-mcclure", "welsch"])
-def test_factorize_finds_the_optimum_of_the_loss_that_it_is_given(scene, monkeypatch, loss):
-    monkeypatch.setitem(LOSSES, "welsch", Welsch)  # which no kernel knows
+def test_factorize_minimizes_the_given_loss(scene, monkeypatch, loss):
+    monkeypatch.setitem(LOSSES, "welsch", Welsch)  # it has no kernel
     seen = scene().seen.to(torch.float32)
 
     def normals(how, loss):
@@ -88,13 +88,13 @@ def test_factorize_finds_the_optimum_of_the_loss_that_it_is_given(scene, monkeyp
         return torch.cat([each.normals_patch.flatten(0, -2) for each in found.buckets])
 
     found = normals("numba", loss)
-    # Solvers stop at 1e-6 of the objective: 5e-4 is measured, and 0.26 from Cauchy's normals.
+    # Solvers stop at 1e-6 of the objective: measured 5e-4, and 0.26 from Cauchy's normals.
     assert_close(found, normals("torch", loss), rtol=0, atol=5e-3)
     assert (found - normals("numba", "cauchy")).abs().max() > 0.1
 
 
 @pytest.mark.parametrize("subset", [{"stride": 3}, {"curvature_samples": 40}])
-def test_a_part_of_the_samples_tells_spread_and_curvature(problem, generator, subset):
+def test_a_subset_of_samples_suffices_for_spread_and_curvature(problem, generator, subset):
     given = noisy(problem, generator, patches=2, views=12, samples=128, missing=0.3)
     given = given.replace(stride=subset.get("stride", 1))
     steer = {"curvature_samples": subset.get("curvature_samples")}
@@ -104,7 +104,7 @@ def test_a_part_of_the_samples_tells_spread_and_curvature(problem, generator, su
     assert (whole.weight - found.weight).abs().max() > 1e-5 or "stride" not in subset
 
 
-def test_whole_factorizations_agree_and_nan_is_missing(scene):
+def test_factorizations_agree_and_nan_counts_as_missing(scene):
     seen = scene().seen.to(torch.float32)
     radiance = seen.buckets[0].radiance.clone()
     radiance[2] = torch.nan
@@ -125,7 +125,7 @@ def test_whole_factorizations_agree_and_nan_is_missing(scene):
         assert_close(one.information, other.information, rtol=1e-3, atol=rounding)
 
 
-def test_thinned_templates_keep_samples_where_they_were(scene, monkeypatch):
+def test_thinned_templates_keep_sample_positions(scene, monkeypatch):
     true = scene(bumps=0.0)
     monkeypatch.setattr("pimper_torch.method.photometry.lights.LIGHT_SAMPLES", 30)
     thin = thinned(true.seen.patches)

@@ -5,7 +5,7 @@ from torch.testing import assert_close
 from pimper_torch.method.photometry.cone import project_to_cone, split_shading, tangent_columns
 
 
-def test_projection_finds_the_nearest_point_of_the_cone(generator):
+def test_projection_is_the_nearest_point_of_the_cone(generator):
     shading = torch.randn(64, 4, generator=generator, dtype=torch.float64)
     found = project_to_cone(shading)
     assert_close(found[:, 0], found[:, 1:].norm(dim=-1))  # on the cone, so not the identity

@@ -1,4 +1,4 @@
-"""A ball without texture that an arc of views sees, and the surface of its visual hull."""
+"""An untextured ball seen from an arc of views, and the surface of its visual hull."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ VIEWS = 16
 
 
 def scene_of(num_views=VIEWS, texture=None):
-    """Return the scene of a ball of radius 1, its silhouettes' contours, and its light."""
+    """Return the scene of a ball of radius 1, the contours of its silhouettes, and its light."""
     generator = torch.Generator().manual_seed(3)
     cameras = arc_cameras(
         num_views, width=120, height=90, focal_px=112.5, distance=3.0, span_deg=50.0
@@ -67,16 +67,16 @@ def ball(radius=1.0):
 
 
 def off(cloud):
-    """Return distances from the ball, and angles of the normals to its own."""
+    """Return distances to the ball, and angles between the normals and those of the ball."""
     radius = cloud.points_world.norm(dim=1)
     cosine = (cloud.points_world * cloud.normals_world).sum(dim=1) / radius
     return (radius - 1).abs(), torch.rad2deg(cosine.clamp(-1, 1).acos())
 
 
-def test_the_ball_is_found_inside_its_hull(arc):
+def test_the_ball_is_recovered_inside_its_hull(arc):
     scene, contours, field = arc
     hull = surface_of(contours)
-    # Seen from an arc the hull is far from the ball.
+    # From an arc of views, the hull is far from the ball.
     assert (hull.vertices_world.norm(dim=1) - 1).abs().median() > 0.02
     cloud = DepthFromLight()(scene, contours, hull, field)
     distance, angle = off(cloud)
@@ -87,7 +87,7 @@ def test_the_ball_is_found_inside_its_hull(arc):
     assert cloud.points_world.dtype == torch.float64
 
 
-def test_lights_that_a_wrong_surface_turned_do_not_move_depths(arc):
+def test_rotated_lights_do_not_bias_depths(arc):
     scene, contours, field = arc
     turn = torch.matrix_exp(torch.tensor([[0, 0, 0.35], [0, 0, 0], [-0.35, 0, 0]]).double())
     turned = field.replace(point_light=field.point_light @ turn.mT)
@@ -97,19 +97,19 @@ def test_lights_that_a_wrong_surface_turned_do_not_move_depths(arc):
     assert angle.median() < 8  # of 20 degrees
 
 
-def test_a_surface_that_is_right_is_not_contradicted(arc):
+def test_a_correct_surface_yields_no_points(arc):
     scene, contours, field = arc
     assert len(DepthFromLight()(scene, contours, ball(), field).points_world) == 0
 
 
-def test_under_soft_light_nothing_is_found(arc):
+def test_soft_light_yields_no_points(arc):
     scene, contours, field = arc
     soft = torch.cat([field.soft[:, :1], field.point_light, field.soft[:, 4:]], dim=1)
     soft = field.replace(soft=soft, point_light=torch.zeros_like(field.point_light))
     assert len(DepthFromLight()(scene, contours, surface_of(contours), soft).points_world) == 0
 
 
-def test_lights_of_one_direction_and_any_size_leave_points_finite(arc):
+def test_parallel_lights_of_any_strength_yield_finite_points(arc):
     scene, contours, field = arc
     same = 1e6 * field.point_light[:1].expand_as(field.point_light)
     scene, field = scene.to(torch.float32), field.replace(point_light=same).to(torch.float32)
@@ -120,7 +120,7 @@ def test_lights_of_one_direction_and_any_size_leave_points_finite(arc):
     assert cloud.normals_world.isfinite().all()
 
 
-def test_few_views_or_silhouettes_that_leave_nothing_out_find_nothing(arc):
+def test_few_views_or_full_silhouettes_yield_no_points(arc):
     scene, contours, field = scene_of(num_views=7)
     hull = surface_of(contours)
     assert len(DepthFromLight()(scene, contours, hull, field).points_world) == 0
@@ -130,7 +130,7 @@ def test_few_views_or_silhouettes_that_leave_nothing_out_find_nothing(arc):
     assert len(found.points_world) == 0
 
 
-def test_photographs_without_shading_contradict_nothing(arc):
+def test_unshaded_photographs_yield_no_points(arc):
     scene, contours, field = arc
     even = scene.views.replace(images=torch.full_like(scene.views.images, 0.3))
     found = DepthFromLight()(scene.replace(views=even), contours, surface_of(contours), field)

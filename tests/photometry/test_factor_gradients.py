@@ -18,7 +18,7 @@ from pimper_torch.single_view.factorization.low_rank import Free
 
 @pytest.fixture
 def noisy(generator):
-    """A small problem whose data no lights and normals explain, all freedom held."""
+    """A small problem with noise and with priors on all factors."""
 
     def make(manifold, loss=None, patches=2, views=8, samples=9):
         def draw(*shape):
@@ -53,7 +53,7 @@ def solved(problem):
 
 
 @pytest.mark.parametrize("manifold", [Free(), Cone()])
-def test_gradients_are_those_of_the_solver(noisy, manifold, generator):
+def test_implicit_gradients_match_differences_of_the_solver(noisy, manifold, generator):
     problem = noisy(manifold)
     start = solved(problem)
     assert start.convergence.converged.all()
@@ -74,7 +74,7 @@ def test_gradients_are_those_of_the_solver(noisy, manifold, generator):
     assert_close(found, answer(*data, lambda _: start))
     probe = torch.randn(found.shape, generator=generator, dtype=torch.float64)
     slopes = torch.autograd.grad((probe * found).sum(), leaves)
-    # The solver compares objectives, so that it knows its answer to 1e-8: steps of 1e-3 leave
+    # The solver compares objectives, so its solution has an error of 1e-8: steps of 1e-3 leave
     # five digits of a difference.
     step = 1e-3
     for place, slope in enumerate(slopes):
@@ -88,7 +88,7 @@ def test_gradients_are_those_of_the_solver(noisy, manifold, generator):
         assert_close((slope * way).sum(), expected, rtol=1e-3, atol=1e-5)
 
 
-def test_robust_weights_and_the_deviation_they_rest_on_take_part(noisy, generator):
+def test_robust_weights_and_their_deviation_are_differentiated(noisy, generator):
     problem = noisy(Cone(), Cauchy(), patches=1, samples=12)
 
     def answer(x):
@@ -109,7 +109,7 @@ def test_robust_weights_and_the_deviation_they_rest_on_take_part(noisy, generato
 
 @pytest.mark.parametrize("stride", [1, 3])
 @pytest.mark.parametrize("loss", [Squares(), Cauchy(), GemanMcClure(), Huber()])
-def test_the_compiled_adjoint_is_that_of_the_reference(noisy, generator, loss, stride):
+def test_the_compiled_adjoint_matches_the_reference(noisy, generator, loss, stride):
     given = noisy(Cone(), loss, samples=40).replace(stride=stride)
     weight = given.weight.clone()
     weight[:, 3], weight[:, :, 5] = 0, 0  # a view and a sample without data
@@ -132,14 +132,14 @@ def test_the_compiled_adjoint_is_that_of_the_reference(noisy, generator, loss, s
     counts = (weight > 0).any(dim=1)[:, None]
     for one, other in zip(*outputs, strict=True):
         some = counts if one.ndim == 3 and one.shape[2] == 40 else torch.ones(())
-        assert_close(some * one, some * other, rtol=0, atol=1e-9)  # as far as Newton's steps go
+        assert_close(some * one, some * other, rtol=0, atol=1e-9)  # error of the Newton steps
     for name, one, other in zip(names, *slopes, strict=True):
         some = {"weight": weight > 0, "prior": counts}.get(name, torch.ones(()))
         expected = some * other
         assert_close(some * one, expected, rtol=0, atol=1e-8 * float(expected.abs().max()))
 
 
-def test_a_solution_that_stopped_early_is_taken_to_rest(noisy):
+def test_an_unconverged_solution_is_refined_to_convergence(noisy):
     problem = noisy(Cone(), Cauchy(), patches=2, samples=20)
     early = solve_variable_projection(problem, 400, 1e-3, small_steps=1)
     radiance = problem.radiance.clone().requires_grad_()
@@ -150,8 +150,8 @@ def test_a_solution_that_stopped_early_is_taken_to_rest(noisy):
     assert_close(found.shading, exact.shading, rtol=0, atol=1e-10)
 
 
-def test_threads_do_not_disturb_one_another(noisy):
-    # Forward-mode differentiation, which counts its levels for all threads at once, would.
+def test_gradients_are_thread_safe(noisy):
+    # Forward-mode differentiation is not: its levels are counted over all threads.
     problem = noisy(Cone(), Cauchy(), patches=1, samples=12)
     found = solved(problem)
 

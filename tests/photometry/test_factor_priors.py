@@ -20,7 +20,7 @@ from tests.photometry.test_factorize import median_error
 
 
 def carried(seen, **changes):
-    """Views that carry priors, which say nothing but for what is given for every bucket."""
+    """Return views with uninformative priors, except for the given values of every bucket."""
     buckets = []
     for index, bucket in enumerate(seen.buckets):
         blank = torch.zeros_like(bucket.radiance[:, 0, 0])
@@ -37,7 +37,7 @@ def carried(seen, **changes):
     return seen.replace(buckets=tuple(buckets))
 
 
-def test_the_default_list_is_what_the_settings_weigh(scene):
+def test_default_priors_are_those_of_the_settings(scene):
     seen = scene(bumps=0.2).seen
     found = solved(Factorize(FactorizeConfig(light_prior=0.5, geometry_weight=0.2)), seen)
     listed = solved(Factorize(priors=[FieldLights(0.5), SurfaceNormals(0.2)]), seen)
@@ -56,7 +56,7 @@ def test_the_default_list_is_what_the_settings_weigh(scene):
         Factorize(priors=[nn.Identity()])
 
 
-def test_guessed_normals_bring_bumps_nearer_and_only_through_their_entry(scene):
+def test_normal_priors_reduce_the_error_of_bumps(scene):
     true = scene(bumps=0.3)
     information = [torch.full_like(each[..., 0], math.radians(2) ** -2) for each in true.normals]
     seen = carried(true.seen, normals_patch=true.normals, normal_information=information)
@@ -64,7 +64,7 @@ def test_guessed_normals_bring_bumps_nearer_and_only_through_their_entry(scene):
     assert median_error(led, true) < 0.8 * median_error(plain, true)
 
 
-def test_guessed_albedo_is_in_any_unit_and_comes_out(scene):
+def test_albedo_priors_reduce_the_error_in_any_unit(scene):
     true = scene(bumps=0.2)
     priors = [FieldLights(), SurfaceNormals(0.0), MapPriors()]
     found = []
@@ -80,7 +80,7 @@ def test_guessed_albedo_is_in_any_unit_and_comes_out(scene):
     assert median_error(found[0], true) < median_error(plain, true)
 
 
-def test_guessed_inliers_leave_out_what_does_not_fit(scene):
+def test_inlier_priors_suppress_outliers(scene):
     true = scene(bumps=0.2)
     spoilt, inlier = [], []
     for bucket in true.seen.buckets:
@@ -99,7 +99,7 @@ def test_guessed_inliers_leave_out_what_does_not_fit(scene):
     assert float(median_error(deaf, true)) > 0.9 * float(blind)
 
 
-def test_guessed_lights_count_by_their_variance_and_in_any_unit(scene):
+def test_light_priors_are_weighted_by_variance_in_any_unit(scene):
     true = scene(bumps=0.2)
     plain = solved(Factorize(priors=[FieldLights(1e6)]), true.seen)
     lights = [3.0 * bucket.lights_patch for bucket in plain.buckets]
@@ -113,6 +113,6 @@ def test_guessed_lights_count_by_their_variance_and_in_any_unit(scene):
             assert bool((cosine > 0.9999).all()) == pulled
 
 
-def test_variances_are_worth_views():
+def test_views_worth_follows_from_information():
     information = torch.tensor([math.radians(5.44) ** -2, 0.0, 1e9])
     assert_close(views_worth(information), torch.tensor([0.1, 0.0, 1.0]), rtol=0.01, atol=1e-6)

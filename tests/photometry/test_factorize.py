@@ -36,7 +36,7 @@ def median_error(found, scene):
     ).median()
 
 
-def test_the_mesh_starts_at_the_truth_and_stays_when_it_is_the_truth(scene):
+def test_exact_coarse_normals_are_kept(scene):
     true = scene(bumps=0.0)
     found = solved(Factorize(EXACT), true.seen)
     ratios = []
@@ -56,7 +56,7 @@ def test_the_mesh_starts_at_the_truth_and_stays_when_it_is_the_truth(scene):
 
 
 @pytest.mark.parametrize("solver", ["variable-projection", "balm"])
-def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
+def test_bumps_missing_from_the_mesh_are_recovered(scene, solver):
     true = scene(bumps=0.2)
     start = torch.cat(
         [
@@ -77,7 +77,7 @@ def test_bumps_that_the_mesh_does_not_know_are_found(scene, solver):
 
 
 @pytest.mark.parametrize("loss", factorize.LOSSES)
-def test_every_loss_finds_the_bumps_and_has_gradients(scene, loss):
+def test_every_loss_recovers_bumps_and_has_gradients(scene, loss):
     true = scene(bumps=0.2)
     config = FactorizeConfig(loss=loss, geometry_weight=0.0)
     seen = true.seen.to(torch.float32)
@@ -90,18 +90,18 @@ def test_every_loss_finds_the_bumps_and_has_gradients(scene, loss):
     assert slope.any()
 
 
-def test_the_published_method_stays_at_the_ambiguity_of_its_start(scene):
+def test_the_published_method_keeps_the_gauge_of_its_start(scene):
     true = scene(bumps=0.3)
     paper = load_config("paper")
     found = solved(Factorize(paper.factorize), true.seen, **asdict(paper.light))
     assert median_error(found, true) < 5  # the bumps have 17 degrees
 
 
-def test_samples_lit_by_few_have_no_say(scene):
+def test_samples_lit_in_few_views_keep_coarse_normals(scene):
     true = scene()
     first = true.seen.buckets[0]
     valid = first.valid.clone()
-    valid[1, 3:, 4:7] = False  # three views left in these rows
+    valid[1, 3:, 4:7] = False  # leaves three views in these rows
     seen = first_bucket(true.seen, valid=valid)
     found = solved(Factorize(), seen).buckets[0]
     assert not found.valid[1, 4:7].any()
@@ -111,7 +111,7 @@ def test_samples_lit_by_few_have_no_say(scene):
     assert found.valid[1, 8:].any()
 
 
-def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
+def test_constant_light_warns_and_keeps_coarse_normals(scene):
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(lights=light * torch.linspace(0.5, 1.5, 12, dtype=torch.float64)[:, None])
     with pytest.warns(PimperWarning, match=r"8 of 8 patches keep .* silhouettes are wrong"):
@@ -125,12 +125,12 @@ def test_light_that_never_changes_is_told_and_the_mesh_delivered(scene):
         assert (bucket.albedo[templates.inside] > 0).float().mean() > 0.9
 
 
-def test_without_normals_a_patch_still_has_its_own_lights_and_albedo(scene):
+def test_a_patch_without_normals_still_has_lights_and_albedo(scene):
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(bumps=0.0, lights=light.expand(12, 4))
     first = true.seen.buckets[0]
     radiance = first.radiance.clone()
-    radiance[2, 3] *= 0.6  # a shadow over one patch in one view, which the field does not know
+    radiance[2, 3] *= 0.6  # a shadow on one patch in one view, missing from the field
     seen = first_bucket(true.seen, radiance=radiance)
     with pytest.warns(PimperWarning, match="light varies too little"):
         found = solved(Factorize(), seen)
@@ -146,9 +146,7 @@ def test_without_normals_a_patch_still_has_its_own_lights_and_albedo(scene):
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_a_patch_in_shadow_has_albedo_of_the_shadow_where_that_is_at_rest(
-    scene, monkeypatch, moves, recwarn
-):
+def test_a_shadowed_patch_has_albedo_only_under_constant_light(scene, monkeypatch, moves, recwarn):
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(bumps=0.0, lights=None if moves else light.expand(12, 4))
 
@@ -159,7 +157,7 @@ def test_a_patch_in_shadow_has_albedo_of_the_shadow_where_that_is_at_rest(
     monkeypatch.setattr(factorize, "_illuminated", illuminated)
     photometric = solved(Factorize(), true.seen)
     found, counts = photometric.buckets[0], figures(photometric)
-    assert counts["few_views_patches"] == 1  # of all: a figure, and no warning
+    assert counts["few_views_patches"] == 1  # one of 8: a figure, not a warning
     assert counts["constant_light_patches"] == (0 if moves else 7)
     assert counts["determined_patches"] == (7 if moves else 0)
     assert bool(recwarn.list) is not moves
@@ -177,15 +175,13 @@ def test_a_patch_in_shadow_has_albedo_of_the_shadow_where_that_is_at_rest(
 
 
 @pytest.mark.parametrize("strength", [1.0, 100.0])
-def test_in_the_lamps_shadow_the_rooms_light_tells_normals_where_it_is_strong(
-    scene, monkeypatch, strength
-):
+def test_soft_light_determines_normals_in_cast_shadow_if_strong(scene, monkeypatch, strength):
     true = scene()
     lamp = strength * torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(12, 3)
     field = LightField(
         origin=torch.zeros(3).double(),
         soft=pad(true.lights, (0, 5)),
-        point_light=lamp,  # shadowed all over
+        point_light=lamp,  # shadowed everywhere
         inverse_distance=torch.zeros(12).double(),
     )
     monkeypatch.setattr(FitLight, "_field", lambda *_: field)
@@ -203,7 +199,7 @@ def test_in_the_lamps_shadow_the_rooms_light_tells_normals_where_it_is_strong(
     assert median_error(solved(Factorize(EXACT), true.seen), true) < 0.1
 
 
-def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
+def test_light_colours_do_not_change_normals_and_albedo(scene, generator):
     true = scene()
     colour = (0.3 * torch.randn(12, 3, generator=generator, dtype=torch.float64)).exp()
     colour = colour / colour.log().mean(dim=0).exp()
@@ -221,11 +217,11 @@ def test_colours_of_the_lights_leave_normals_and_albedo(scene, generator):
 
         assert off(two) < 0.02
         assert off(three) > 2 * off(two)
-        # Brightness of the views differs, and with it what robust weights do; bumps have 17.
+        # Brightness differs among views and affects robust weights; bumps have 17 degrees.
         assert angles_deg(two.normals_patch, one.normals_patch, one.valid).median() < 0.5
 
 
-def test_exposures_of_the_views_are_those_of_the_lights_and_leave_normals(scene):
+def test_exposures_scale_lights_and_do_not_change_normals(scene):
     true = scene()
     exposure = torch.tensor([1.0, 4, 1, 0.25, 1, 1, 2, 1, 0.5, 1, 1, 1], dtype=torch.float64)
     exposed = each_bucket(
@@ -258,7 +254,7 @@ def spoil(seen: PatchViews, how: str) -> PatchViews:
 
 
 @pytest.mark.parametrize("how", ["masked", "nan"])
-def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how):
+def test_a_bad_patch_is_flagged_and_does_not_affect_others(scene, how):
     true = scene()
     without = spoil(true.seen, "masked")
     keep = torch.tensor([0, 1, 3, 4])
@@ -275,7 +271,7 @@ def test_a_bad_patch_is_flagged_and_its_neighbours_are_as_without_it(scene, how)
     assert bad.determined[keep].all()
 
 
-def test_nothing_seen_at_all_is_told_not_raised(scene):
+def test_views_without_valid_samples_warn(scene):
     true = scene()
     nothing = each_bucket(
         true.seen, lambda one: one.replace(radiance=0 * one.radiance, valid=one.valid & False)
@@ -287,7 +283,7 @@ def test_nothing_seen_at_all_is_told_not_raised(scene):
         assert (bucket.albedo == 0).all()
 
 
-def test_information_is_the_inverse_variance_that_noise_makes(scene, generator):
+def test_information_is_the_inverse_variance_of_normals(scene, generator):
     true = scene(bumps=0.0)  # lights fitted to the mesh are exact but for the noise
 
     def noisy(one):

@@ -30,7 +30,7 @@ def test_albedo_is_that_of_weighted_least_squares(drawn):
     assert found[3].isnan()
 
 
-def test_weights_are_those_that_the_loss_descends_with(drawn):
+def test_weights_are_derivatives_of_the_loss(drawn):
     samples, shading, _ = drawn
     albedo = torch.full((40,), 0.4, dtype=torch.float64)
     residual = samples.residual(albedo, shading).requires_grad_()
@@ -49,7 +49,7 @@ def test_residuals_without_noise_have_a_scale_above_zero(drawn):
     assert_close(scale, CAUCHY_TUNING * 1e-4 * mean)
 
 
-def test_brightness_of_a_product_gives_its_factors(generator):
+def test_brightness_factorizes_a_rank_one_product(generator):
     gain = torch.tensor([0.2, 1.0, 2.0, 0.0]).double()
     albedo = 0.1 + torch.rand(31, generator=generator, dtype=torch.float64)
     seen = torch.ones(31, 4, dtype=torch.bool)
@@ -57,7 +57,7 @@ def test_brightness_of_a_product_gives_its_factors(generator):
     radiance = torch.where(seen, albedo[:, None] * gain, 0)
     found, relative = ImageSamples(radiance=radiance, seen=seen).brightness()
     kept = torch.arange(31) != 5
-    middle = albedo[kept].kthvalue(15).values  # the lower median, as torch takes it, of 30
+    middle = albedo[kept].kthvalue(15).values  # the lower median of 30, as in torch
     assert_close(found, gain * middle)
     assert_close(relative[kept], albedo[kept] / middle)
     assert relative[5] == 0

@@ -1,4 +1,4 @@
-"""What must not change normals: order of views and of patches, brightness. On random orders."""
+"""Normals are invariant to the order of views and patches and to brightness."""
 
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -23,7 +23,7 @@ def shuffled(count, seed):
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(seed=SEEDS, power=st.integers(-10, 10))
-def test_order_of_views_and_patches_and_brightness_leave_normals(scene, seed, power):
+def test_order_and_brightness_do_not_change_normals(scene, seed, power):
     seen = scene().seen
     usual = solved(Factorize(), seen)
     gain, views = 2.0**power, shuffled(12, seed)

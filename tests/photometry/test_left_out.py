@@ -3,7 +3,7 @@ import torch
 from pimper_torch.method.photometry.light_models import left_out, predicts_better
 
 
-def test_a_fifth_of_every_sample_and_of_every_view_is_left_out_of_what_is_seen(generator):
+def test_a_fifth_of_seen_samples_is_held_out_per_sample_and_view(generator):
     found = left_out(torch.ones(100, 10, dtype=torch.bool))
     assert (found.sum(dim=0) == 20).all()
     assert (found.sum(dim=1) == 2).all()
@@ -11,7 +11,7 @@ def test_a_fifth_of_every_sample_and_of_every_view_is_left_out_of_what_is_seen(g
     assert (left_out(seen) == found & seen).all()
 
 
-def test_a_gain_must_be_significant_over_the_views_and_no_trifle(generator):
+def test_a_gain_must_be_significant_and_large_enough(generator):
     simpler = 1 + 0.1 * torch.rand(12, generator=generator)
     assert predicts_better(0.9 * simpler, simpler)
     assert not predicts_better(0.97 * simpler, simpler)
@@ -20,7 +20,7 @@ def test_a_gain_must_be_significant_over_the_views_and_no_trifle(generator):
     assert not predicts_better(uneven * simpler, simpler)
 
 
-def test_views_without_what_was_left_out_decide_nothing():
+def test_views_without_held_out_samples_are_ignored():
     simpler = torch.tensor([1.0, 1.01, torch.nan, 1.0])
     assert predicts_better(0.5 * torch.tensor([1.0, 1.0, 1.0, torch.nan]), simpler)
     assert not predicts_better(torch.full((4,), torch.nan), simpler)

@@ -38,7 +38,7 @@ def seen_by(field, points, normals, albedo):
     return albedo[:, None] * (field.soft[:, 0] + direct)
 
 
-def test_a_point_light_falls_off_with_the_square_and_points_at_its_place():
+def test_a_point_light_falls_off_with_squared_distance():
     place = torch.tensor([0.0, 3.0, 4.0], dtype=torch.float64)
     field = LightField(
         origin=torch.zeros(3).double(),
@@ -54,7 +54,7 @@ def test_a_point_light_falls_off_with_the_square_and_points_at_its_place():
     assert_close(field.lights_at(points, normalize(points + 1, dim=1))[:, 0, 1:], found)
 
 
-def test_point_lights_are_found_where_they_are(room, generator):
+def test_point_lights_are_recovered(room, generator):
     points, normals, field = room
     albedo = 0.2 + torch.rand(len(points), generator=generator, dtype=torch.float64)
     J = seen_by(field, points, normals, albedo)
@@ -78,7 +78,7 @@ def test_point_lights_survive_cast_shadows_and_highlights(room, generator):
     assert (found.inverse_distance / field.inverse_distance - 1).abs().max() < 0.1
 
 
-def test_light_from_all_sides_is_taken_for_no_point_light(room, generator):
+def test_soft_light_is_not_mistaken_for_a_point_light(room, generator):
     points, normals, _ = room
     soft = torch.cat([torch.ones(6, 1), 0.5 * torch.randn(6, 3, generator=generator)], dim=1)
     soft = soft.double()
@@ -93,7 +93,7 @@ def test_light_from_all_sides_is_taken_for_no_point_light(room, generator):
     assert (asked.point_light.norm(dim=1) > 0).all()
 
 
-def test_a_room_at_rest_is_told_from_the_lamp_that_moves_in_it(room, generator):
+def test_static_soft_light_is_separated_from_a_moving_point_light(room, generator):
     points, normals, field = room
     exposure = torch.linspace(0.8, 1.3, 6).double()[:, None]
     shape = torch.tensor([1.0, -0.6, 0.3, 0.2, 0.1, -0.1, 0.2, 0.1, -0.05]).double()
@@ -113,11 +113,11 @@ def test_a_room_at_rest_is_told_from_the_lamp_that_moves_in_it(room, generator):
     assert off(found) < 0.1
     assert off(fit_light_field(J, seen, normals, points, model="point_light")) > 2
     one = found.soft / found.soft[:, :1]
-    assert_close(one, one[:1].expand(6, 9))  # a room for all views, in their exposures
-    assert_close(one[0, 1:3], shape[1:3], rtol=0, atol=0.15)  # what albedo cannot mimic
+    assert_close(one, one[:1].expand(6, 9))  # one shape for all views, scaled by exposure
+    assert_close(one[0, 1:3], shape[1:3], rtol=0, atol=0.15)  # albedo cannot mimic these
 
 
-def test_soft_light_near_a_normal_has_its_value_and_slope_there(generator):
+def test_linearized_soft_light_has_value_and_slope_at_the_normal(generator):
     normals = normalize(torch.randn(5, 3, generator=generator, dtype=torch.float64), dim=1)
     lights = torch.randn(7, 9, generator=generator, dtype=torch.float64)
     found = linearized(lights, normals)
@@ -131,7 +131,7 @@ def test_soft_light_near_a_normal_has_its_value_and_slope_there(generator):
     assert error(aside).abs().max() < 1e-6  # 1e-8 times twice the coefficients
 
 
-def test_what_faces_away_from_the_point_light_is_told():
+def test_normals_facing_away_from_the_point_light_are_unlit():
     point_light = torch.tensor([[[0.0, 0, -2], [0, 0, 0]]])
     normals = torch.tensor([[[0.0, 0, -1], [0, 0, 1], [1, 0, 0]]])
     assert faces_light(point_light, normals).tolist() == [
@@ -150,8 +150,8 @@ def test_a_field_without_data_is_dark():
 
 
 @pytest.mark.parametrize("contrast", [0.3, 0.9])
-def test_point_lights_are_found_in_spite_of_what_they_leave_in_shadow(generator, contrast):
-    # What a camera sees of a ball, lit from all sides; in every view a wall shadows a fifth.
+def test_point_lights_are_recovered_despite_cast_shadows(generator, contrast):
+    # The visible part of a ball under lights from all sides; a wall shadows a fifth of each view.
     def unit(rows):
         return normalize(torch.tensor(rows, dtype=torch.float64), dim=-1)
 

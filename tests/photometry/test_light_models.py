@@ -23,7 +23,7 @@ def samples(generator):
 
 
 def lights(generator, model, views=6):
-    """Lights off all bounds; point lights three times as far as the samples."""
+    """Return lights within all bounds; point lights are three times as far as the samples."""
     soft = draw(generator, views, model.basis.shape[1])
     soft[:, 0] = 0.1 + soft[:, 0].abs()
     if model.points is None:
@@ -49,10 +49,10 @@ def test_the_jacobian_is_the_derivative_of_shading(model, generator):
     assert (found.abs().amax(dim=0) > 0).all()
     off = whole.clone()
     off[:, view, view] = 0
-    assert (off == 0).all()  # a view's shading depends on its own light alone
+    assert (off == 0).all()  # the shading of a view depends on its light only
 
 
-def test_both_lights_shade_as_the_light_field_does(samples, generator):
+def test_shading_matches_the_light_field(samples, generator):
     normals, points = samples
     model = LightModel(basis=basis(normals), normals=normals, points=points)
     given = lights(generator, model)
@@ -66,7 +66,7 @@ def test_both_lights_shade_as_the_light_field_does(samples, generator):
     assert_close(model.shade(given), basis(normals) @ field.soft.mT + direct)
 
 
-def test_parameters_are_projected_on_their_bounds_and_those_there_are_marked(samples):
+def test_parameters_are_clamped_and_bounds_marked(samples):
     normals, points = samples
     outside = torch.tensor([[-1.0, 2, -3, 4, -0.5], [1.0, 0, 0, 1, 9.0], [1.0, 0, 0, 1, 0.2]])
     model = LightModel(basis=harmonics(normals)[:, :1], normals=normals, points=points)

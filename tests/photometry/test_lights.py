@@ -32,7 +32,7 @@ def test_lights_survive_a_fifth_of_gross_outliers(generator):
     assert (found - lights).abs().max() < 0.02
 
 
-def test_a_view_without_samples_has_no_light_and_disturbs_none(generator):
+def test_a_view_without_samples_is_dark_and_does_not_affect_others(generator):
     J, n, lights, _ = data(generator)
     seen = torch.ones(J.shape, dtype=torch.bool)
     seen[:, 3] = False
@@ -43,7 +43,7 @@ def test_a_view_without_samples_has_no_light_and_disturbs_none(generator):
     assert_close(found[others], lights[others] / scale, rtol=1e-5, atol=1e-5)
 
 
-def test_one_light_for_all_views_leaves_the_room_to_the_albedo(generator):
+def test_constant_light_leaves_the_shared_soft_light_unchanged(generator):
     _, n, _, rho = data(generator)
     model = LightModel(basis=harmonics(n)[:, :1], normals=n, points=n)
     lights = torch.tensor([0.6, 0.1, 0.2, -0.8, 0.0]).double().expand(9, 5)
@@ -53,7 +53,7 @@ def test_one_light_for_all_views_leaves_the_room_to_the_albedo(generator):
     basis = torch.cat([harmonics(n), second_harmonics(n)], dim=1)
     room = torch.eye(9, dtype=torch.float64)[:1]
     found = _fit_room(LightFit(model=model, lights=lights, albedo=rho), samples, basis, room)
-    # Both sides of its equations are zero but for rounding, whose quotient is of any size.
+    # Both sides of the equations are zero up to rounding: their quotient would be arbitrary.
     assert_close(found, room, rtol=0, atol=1e-3)
 
 
@@ -68,7 +68,7 @@ def test_shading_is_the_same_in_every_frame(generator):
     assert_close(rotated, lights @ harmonics(n).mT)
 
 
-def test_lights_of_many_views_are_exact_though_they_are_fitted_in_groups(generator, monkeypatch):
+def test_lights_fitted_in_groups_are_exact(generator, monkeypatch):
     J, n, lights, _ = data(generator, views=11)
     seen = torch.rand(J.shape, generator=generator) > 0.3
     monkeypatch.setattr("pimper_torch.method.photometry.lights._TOGETHER", 4)
@@ -78,29 +78,27 @@ def test_lights_of_many_views_are_exact_though_they_are_fitted_in_groups(generat
 
 
 @pytest.mark.slow
-def test_gradients_of_lights_that_are_fitted_in_groups_are_those_of_differences(
-    generator, monkeypatch
-):
+def test_gradients_of_lights_fitted_in_groups_match_differences(generator, monkeypatch):
     J, n, _, _ = data(generator, samples=40, views=7)
     J = J + 0.01 * torch.randn(J.shape, generator=generator, dtype=torch.float64)
     change = 0.01 * torch.randn(J.shape, generator=generator, dtype=torch.float64)
     weight = torch.randn(7, 9, generator=generator, dtype=torch.float64)
     monkeypatch.setattr("pimper_torch.method.photometry.lights._TOGETHER", 4)
 
-    def told(step):
+    def evaluate(step):
         radiance = (J + step * change).requires_grad_()
         field = fit_light_field(radiance, torch.ones_like(J) > 0, n, model="soft")
         return (field.soft * weight).sum(), radiance
 
-    value, radiance = told(0.0)
+    value, radiance = evaluate(0.0)
     (gradient,) = torch.autograd.grad(value, radiance)
     step = 1e-4
-    difference = (told(step)[0] - told(-step)[0]).detach() / (2 * step)
+    difference = (evaluate(step)[0] - evaluate(-step)[0]).detach() / (2 * step)
     assert_close((gradient * change).sum(), difference, rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize("model", ["soft", "point_light"])
-def test_gradients_of_a_light_field_are_those_of_differences(generator, model):
+def test_gradients_of_a_light_field_match_differences(generator, model):
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
@@ -114,19 +112,19 @@ def test_gradients_of_a_light_field_are_those_of_differences(generator, model):
     weights = draw(6, 9), draw(6, 3), draw(6)
     data = {"radiance": radiance, "normals": normals, "points": points}
 
-    def told(values):
+    def evaluate(values):
         leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
         field = fit_light_field(seen=seen, model=model, **leaves)
         parts = field.soft, field.point_light, field.inverse_distance
         total = sum((a * b).sum() for a, b in zip(weights, parts, strict=True))
         return total, leaves
 
-    total, leaves = told(data)
+    total, leaves = evaluate(data)
     slopes = dict(zip(data, torch.autograd.grad(total, leaves.values()), strict=True))
     step = 1e-6
     for name, value in data.items():
         way = draw(*value.shape)
-        ends = [told(data | {name: value + sign * step * way})[0].detach() for sign in (1, -1)]
+        ends = [evaluate(data | {name: value + sign * step * way})[0].detach() for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / (2 * step)
         # Central differences leave six digits.
         assert_close((slopes[name] * way).sum(), expected, rtol=1e-5, atol=1e-6)

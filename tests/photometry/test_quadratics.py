@@ -12,7 +12,7 @@ def dense(packed, size):
     return matrix
 
 
-def test_packed_systems_are_solved_as_dense_ones_are(generator):
+def test_packed_and_dense_systems_agree(generator):
     for size in (3, 4):
         rows = torch.randn(2, 5, 9, size, generator=generator, dtype=torch.float64)
         packed = outer(rows.mT).sum(dim=-1).mT  # 2, packed, 5

@@ -27,28 +27,28 @@ def test_the_spread_solves_its_equation(generator):
     assert_close(fraction.mean(dim=1), torch.full((2,), 0.5, dtype=torch.float64))
 
 
-def test_outliers_up_to_a_half_are_borne(generator):
+def test_the_spread_tolerates_40_percent_outliers(generator):
     noise = drawn(generator, 20_000)
     noise[:8_000] *= 1e8
     found = robust_deviation(noise, torch.ones_like(noise, dtype=torch.bool))
-    # 8 in 20 of them lie beyond any scale: the median absolute value gives 2.05.
+    # 8 of 20 are beyond any scale: the median absolute value gives 2.05.
     assert 1 < found < 3
 
 
-def test_the_spread_of_exact_data_and_of_nothing_is_zero():
+def test_the_spread_of_exact_or_missing_data_is_zero():
     residual = torch.zeros(2, 9)
     residual[0, :4] = 1
     seen = torch.tensor([[True], [False]]).expand(2, 9)
     assert_close(robust_deviation(residual, seen), torch.zeros(2))
 
 
-def test_the_spread_has_the_gradient_of_its_differences(generator):
+def test_gradients_of_the_spread_match_differences(generator):
     noise = drawn(generator, 2, 30).requires_grad_()
     seen = torch.rand(2, 30, generator=generator) > 0.2
     assert torch.autograd.gradcheck(lambda residual: robust_deviation(residual, seen), noise)
 
 
-# Names of the losses in SciPy, and each of ours; those that it lacks are of one's own there.
+# Names of the losses in SciPy and ours; None: SciPy lacks it.
 LOSSES = {"linear": Squares(), "cauchy": Cauchy(), "huber": Huber(), None: GemanMcClure()}
 
 
@@ -77,7 +77,7 @@ def test_each_loss_is_95_percent_efficient_on_gaussian_noise(loss):
     one = torch.ones((), dtype=torch.float64)
     bend, slope = loss.curvatures(x, one), loss.weights(x, one) * x
     efficiency = (bend * density).sum() ** 2 / (slope.square() * density).sum()
-    assert efficiency == pytest.approx(0.95, abs=2e-4)  # of scales to four digits
+    assert efficiency == pytest.approx(0.95, abs=2e-4)  # scales have four digits
 
 
 def test_the_median_deviation_of_gaussian_noise_is_its_standard_deviation(generator):
@@ -88,7 +88,7 @@ def test_the_median_deviation_of_gaussian_noise_is_its_standard_deviation(genera
     assert median_deviation(noise, torch.zeros_like(seen)) == 0
 
 
-def test_what_is_not_seen_does_not_matter_to_the_spread(generator):
+def test_unseen_samples_do_not_affect_the_spread(generator):
     noise = drawn(generator, 3, 400)
     seen = torch.rand(3, 400, generator=generator) > 0.2
     found = robust_deviation(torch.where(seen, noise, 1e6), seen)

@@ -7,7 +7,7 @@ from pimper_torch.records import Convergence
 
 
 def solved_under(problem, lights):
-    """Every sample's least squares, lights given."""
+    """Return the least-squares factors of every sample under given lights."""
     equations = equations_of_samples(problem, lights, problem.weight)
     patches = torch.zeros(len(lights))
     return Factors(
@@ -43,12 +43,12 @@ def test_information_is_the_inverse_variance_of_normals_under_noise(problem, gen
     square = (normals - true).square().sum(dim=-1)  # the angle's, to second order
     ratio = variance.mean(dim=0) / square.mean(dim=0)
     assert ratio.mean() == pytest.approx(1, abs=0.02)
-    # Mean squares of a thousand draws are off by 3 to 4 percent, and these are 40.
+    # Mean squares of a thousand draws are off by 3 to 4 percent; there are 40.
     assert ratio.min() > 0.85
     assert ratio.max() < 1.15
 
 
-def test_every_channels_albedo_is_that_of_least_squares(problem, generator):
+def test_albedo_per_channel_is_that_of_least_squares(problem, generator):
     given, lights, _ = problem(patches=2, views=6, samples=5, missing=0.2)
     basis = torch.randn(2, 4, 5, generator=generator, dtype=torch.float64)
     radiance = torch.rand(2, 6, 3, 5, generator=generator, dtype=torch.float64)

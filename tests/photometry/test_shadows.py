@@ -22,7 +22,7 @@ def ball_over_plane():
 
 
 def point_lights(places, distant=False):
-    """Point lights at places, or in their directions."""
+    """Return point lights at positions, or distant ones in those directions."""
     places = torch.tensor(places, dtype=torch.float64)
     distance = places.norm(dim=1)
     return LightField(
@@ -35,7 +35,7 @@ def point_lights(places, distant=False):
 
 @pytest.fixture
 def plane():
-    """A raster on the plane, samples 0.02 apart."""
+    """A raster on the plane with a spacing of 0.02."""
     side = torch.linspace(-2, 2, 201, dtype=torch.float64)
     y, x = torch.meshgrid(side, side, indexing="ij")
     points = torch.stack([x, y, torch.zeros_like(x)], dim=-1)
@@ -43,7 +43,7 @@ def plane():
 
 
 def ellipse(points, direction):
-    """Signed distance, roughly, to the contour of a ball's shadow under a distant point light."""
+    """Approximate signed distance to the contour of the ball's shadow, light at infinity."""
     direction = normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
     centre = -HEIGHT * direction[:2] / direction[2]
     along = normalize(direction[:2], dim=0)
@@ -52,18 +52,18 @@ def ellipse(points, direction):
     return ((u * direction[2]) ** 2 + v**2).sqrt() - RADIUS
 
 
-def test_a_distant_point_light_casts_the_ellipse_of_a_ball(ball_over_plane, plane):
+def test_a_distant_point_light_casts_an_elliptic_shadow_of_a_ball(ball_over_plane, plane):
     points, normals = plane
     direction = (0.5, 0.2, 0.9)
     found = cast_shadows(point_lights([direction], True), ball_over_plane, points, normals, 1e-4)
     contour = ellipse(points, direction)
-    clear = contour.abs() > 0.003  # the icosphere lies 0.0005 inside the ball
+    clear = contour.abs() > 0.003  # the icosphere is up to 0.0005 inside the ball
     assert clear.float().mean() > 0.98
     assert (found.lit[..., 0] == (contour > 0))[clear].all()
-    assert 0.03 < (~found.lit).float().mean() < 0.2  # a shadow was there to be found
+    assert 0.03 < (~found.lit).float().mean() < 0.2  # there is a shadow
 
 
-def test_what_stands_behind_the_point_light_casts_no_shadow(ball_over_plane, plane):
+def test_occluders_behind_the_point_light_cast_no_shadow(ball_over_plane, plane):
     points, normals = plane
     found = cast_shadows(
         point_lights([(0, 0, HEIGHT - 0.6)]), ball_over_plane, points, normals, 1e-4
@@ -71,12 +71,12 @@ def test_what_stands_behind_the_point_light_casts_no_shadow(ball_over_plane, pla
     assert found.lit.all()
 
 
-def test_the_ball_s_own_shadow_ends_where_it_turns_from_the_point_light(ball_over_plane, generator):
+def test_the_attached_shadow_of_a_ball_ends_at_the_terminator(ball_over_plane, generator):
     normals = normalize(torch.randn(2000, 3, generator=generator, dtype=torch.float64), dim=1)
     points = RADIUS * normals + torch.tensor([0, 0, HEIGHT]).double()
     direction = normalize(torch.tensor([0.3, -0.4, 0.8]).double(), dim=0)
     field = point_lights([direction.tolist()], True)
-    # Points lie off the faces by up to 0.0005: without any lift some would shade themselves.
+    # Points are off the faces by up to 0.0005: without a lift some would shadow themselves.
     found = cast_shadows(field, ball_over_plane, points, normals, 1e-3, guard=1e-3)
     facing = normals @ direction
     clear = facing.abs() > 0.05
@@ -84,7 +84,7 @@ def test_the_ball_s_own_shadow_ends_where_it_turns_from_the_point_light(ball_ove
     assert found.sure[clear].all()
 
 
-def test_edges_nearer_than_the_guard_make_unsure_and_no_others(ball_over_plane, plane):
+def test_only_samples_near_shadow_edges_are_unsure(ball_over_plane, plane):
     points, normals = plane
     point_light_height, guard = 3.0, 0.1
     found = cast_shadows(
@@ -121,7 +121,7 @@ def test_a_view_without_a_point_light_is_lit_everywhere(ball_over_plane, plane):
 
 
 @pytest.mark.parametrize("stride", [1, 4])
-def test_sparse_rays_answer_for_their_neighbours_except_near_edges(ball_over_plane, plane, stride):
+def test_sparse_rays_agree_with_dense_ones_except_near_edges(ball_over_plane, plane, stride):
     points, normals = plane
     field = point_lights([(1.0, 0.4, 2.5), (-0.5, 0.2, 4.0)])
     raster = points[None, :, :150], normals[None, :, :150]  # no multiple of the stride

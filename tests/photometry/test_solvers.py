@@ -15,7 +15,7 @@ def objective(*given):
 
 
 def solve_projection(problem, max_iterations, tolerance):
-    # Others' tolerances are on shading vectors, which its objective grows with the square of.
+    # Other tolerances are on shading vectors; the objective grows with their square.
     return solve_variable_projection(problem, max_iterations, tolerance**2)
 
 
@@ -28,7 +28,7 @@ SOLVERS = pytest.mark.parametrize("solve", [solve_balm, solve_projection, solve_
 
 
 def error(found, truth, weight, least=7):
-    """Largest error of shading vectors seen often enough, the ambiguity undone."""
+    """Largest error of shading vectors with enough observations, up to the ambiguity."""
     often = (weight.sum(dim=1) >= least).double()
     rotation = align_factorizations(found, truth, often)
     return ((rotation.on_shading(found) - truth).abs().amax(dim=1) * often).max()
@@ -44,7 +44,7 @@ def test_factors_are_recovered_up_to_lorentz_with_60_percent_missing(problem, so
     assert (found.shading - given.shading).abs().max() > 0.05
 
 
-def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
+def test_the_slope_with_respect_to_lights_is_minus_half_the_gradient(problem, generator):
     given, _, _ = problem(patches=2, samples=40, missing=0.3)
     _, normals = given.manifold.split(given.shading.mT)
     given = given.replace(
@@ -55,7 +55,7 @@ def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
     noise = torch.randn(given.radiance.shape, generator=generator, dtype=torch.float64)
     given = given.replace(radiance=given.radiance + 0.1 * noise)
     lights = given.lights.clone().requires_grad_()
-    # The shading is the best for the lights: its own change does not matter to first order.
+    # The shading is optimal for the lights, so its change does not matter to first order.
     equations = equations_of_samples(given, given.lights, given.weight)
     shading = update_shading(given, *equations, given.shading, 60)
     (eliminated,) = torch.autograd.grad(
@@ -72,7 +72,7 @@ def test_the_slope_by_the_lights_is_minus_half_the_gradient(problem, generator):
 
 
 @SOLVERS
-def test_lights_that_are_held_stay(problem, solve):
+def test_lights_with_a_strong_prior_keep_its_mean(problem, solve):
     given, _, _ = problem()
     held = given.replace(regularization=torch.full_like(given.regularization, 1e9))
     assert_close(solve(held, 40, 1e-6).lights, given.prior_mean, rtol=0, atol=1e-5)
@@ -80,7 +80,7 @@ def test_lights_that_are_held_stay(problem, solve):
 
 
 @SOLVERS
-def test_robust_weights_keep_outliers_out(problem, solve, generator):
+def test_robust_weights_suppress_outliers(problem, solve, generator):
     given, lights, shading = problem(views=20)
     gross = torch.rand(given.radiance.shape, generator=generator) < 0.1
     given = given.replace(
@@ -96,7 +96,7 @@ def test_robust_weights_keep_outliers_out(problem, solve, generator):
 
 
 @SOLVERS
-def test_a_patch_is_solved_as_if_it_were_alone(problem, solve):
+def test_patches_of_a_batch_are_solved_independently(problem, solve):
     given, _, _ = problem(patches=3, samples=60)
     empty = given.replace(
         weight=given.weight * torch.tensor([1.0, 0, 1]).double()[:, None, None],
@@ -111,7 +111,7 @@ def test_a_patch_is_solved_as_if_it_were_alone(problem, solve):
     assert together.lights.isfinite().all()
 
 
-def test_the_last_step_reaches_the_minimum_of_every_sample_and_differentiates_it(problem):
+def test_refinement_reaches_the_minimum_per_sample_with_its_gradient(problem):
     given, lights, _ = problem(patches=1, samples=12, off=0.02)
     given = given.replace(
         lights=lights, prior_mean=lights, regularization=torch.full_like(given.regularization, 1e9)
@@ -136,10 +136,10 @@ def test_the_last_step_reaches_the_minimum_of_every_sample_and_differentiates_it
     assert (radiance.grad[0, :, :3] == 0).all()
 
 
-def test_factors_are_recovered_when_whole_blocks_are_missing(problem):
+def test_factors_are_recovered_with_contiguous_blocks_missing(problem):
     given, _, shading = problem()
     weight = torch.ones_like(given.weight)
-    for view in range(20):  # each view misses another contiguous half, as occlusion does
+    for view in range(20):  # each view lacks a different contiguous half, as under occlusion
         away = (torch.arange(150) - 7 * view) % 150 < 75
         weight[:, view, away] = 0
     given = given.replace(weight=weight, radiance=weight * given.radiance)

@@ -4,7 +4,7 @@ from pimper_torch.method.photometry.status import light_varies, patch_status
 from pimper_torch.records import PatchStatus
 
 
-def test_light_varies_as_the_third_singular_value_says(generator):
+def test_light_variation_is_the_ratio_of_the_third_singular_value(generator):
     lights = torch.randn(30, 8, 4, generator=generator, dtype=torch.float64)
     lights[:, :, 2:] *= 0.1 * torch.rand(30, 1, 1, generator=generator, dtype=torch.float64)
     lights[0, :, 1:] = 0  # one light for all, at any exposure
