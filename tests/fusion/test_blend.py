@@ -1,4 +1,4 @@
-"""What blended patches say of the vertices that they share."""
+"""Normals, offsets and variances of blended patches at shared vertices."""
 
 import math
 
@@ -53,7 +53,7 @@ def blended(lift):
             4.0,
             swept.buckets,
         )
-        # The facets (0, 1, 2) and (0, 2, 3), or as wound to face the views, share 0 and 2.
+        # The facets (0, 1, 2) and (0, 2, 3), in either winding, share 0 and 2.
         seam = subdivision.barycentric.amin(dim=1) < 1e-9
         ends = (subdivision.points - coarse.mesh.vertices_world[[0, 2], None]).norm(dim=2)
         along = (ends.sum(dim=0) - ends[:, seam].sum(dim=0).amin()).abs() < 1e-9
@@ -77,18 +77,18 @@ def test_normals_and_offsets_of_a_seam_are_weighted_by_their_inverse_variances(b
 
 
 def test_the_inverse_variance_of_a_seam_is_the_mean_of_both(blended):
-    # Patches that see the same photographs err alike: the sum would count them twice.
+    # Patches of the same photographs share errors: the sum would count them twice.
     found, seam = blended()
     wanted = torch.full((int(seam.sum()),), (FIRST + SECOND) / 2).double()
     assert_close(found.normal_information[seam], wanted)
     assert_close(found.offset_information[seam], wanted)
 
 
-def test_a_patch_that_knows_nothing_leaves_the_normal_and_adds_to_its_variance(blended):
+def test_a_patch_without_normals_only_raises_the_variance(blended):
     found, seam = blended(known=False)
     first, _ = normals_of_the_facets(blended)
     assert_close(found.normals_world[seam], first.expand(int(seam.sum()), 3))
-    # Half of the weight has normals: twice the variance, and 8 degrees of the other half.
+    # Half of the weight has normals: twice the variance, plus 8 degrees for the other half.
     variance = torch.full((int(seam.sum()),), 2 / FIRST + math.radians(8) ** 2).double()
     assert_close(1 / found.normal_information[seam], variance)
     unknown = found.normal_information == 0

@@ -1,4 +1,4 @@
-"""Fusion by overlapping blocks against fusion of the whole, on a cap of a sphere of 96 facets."""
+"""Fusion by overlapping blocks against complete fusion, on a spherical cap of 96 facets."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ def drawn(cap):
 
 @pytest.fixture(scope="module")
 def ball():
-    """A closed surface of 8 facets, each cut in four three times."""
+    """A closed surface: an octahedron with three 1-to-4 subdivisions."""
     corners = torch.cat([torch.eye(3), -torch.eye(3)]).double()
     faces = torch.tensor([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2]])
     faces = torch.cat([faces, torch.tensor([[1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])])
@@ -38,7 +38,7 @@ def ball():
     return mesh, subdivide(corners, faces, torch.full((len(faces),), 0.4).double())
 
 
-def test_blocks_add_up_to_a_closed_surface_without_a_vertex_twice(ball):
+def test_blocks_partition_a_closed_surface(ball):
     mesh, whole = ball
     parts = parts_of(whole, mesh, len(whole.points) / 3)
     assert len(parts) > 3
@@ -64,26 +64,26 @@ def test_blocks_add_up_to_a_closed_surface_without_a_vertex_twice(ball):
     )
 
 
-def test_a_noisy_surface_by_blocks_is_the_whole_one_within_its_noise(drawn):
+def test_fusion_by_blocks_matches_the_complete_one_within_noise(drawn):
     fuse = Fuse()
     whole, blocks = fuse(drawn, free()), fuse(drawn, free(), True, MOST)
     assert torch.equal(whole.faces, blocks.faces)
     assert torch.equal(whole.information, blocks.information)
     off = (whole.vertices_world - blocks.vertices_world).norm(dim=1) / whole.expected_error
-    assert off.max() > 0  # several blocks, and not the whole
+    assert off.max() > 0  # there are several blocks
     assert off.square().mean().sqrt() < 0.2
     assert off.max() < 1
     true = off_sphere(whole.vertices_world), off_sphere(blocks.vertices_world)
     assert true[1].square().mean() < 1.1 * true[0].square().mean()
 
 
-def test_blocks_have_the_same_bits_in_every_run_and_on_any_number_of_threads(drawn):
+def test_blocks_are_bitwise_reproducible_on_any_number_of_threads(drawn):
     one, two = on_threads(lambda: Fuse()(drawn, free(), True, MOST), 1, 2)
     assert torch.equal(one.vertices_world, two.vertices_world)
     assert torch.equal(one.albedo, two.albedo)
 
 
-def test_gradients_go_through_blocks(drawn):
+def test_gradients_propagate_through_blocks(drawn):
     heights = tuple(
         found.replace(offset=found.offset.clone().requires_grad_()) for found in drawn.buckets
     )

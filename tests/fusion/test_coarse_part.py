@@ -11,13 +11,13 @@ def subdivision():
     return subdivided_square(0.02)
 
 
-def test_what_is_linear_on_every_facet_is_coarse_whole(subdivision):
+def test_functions_linear_on_facets_are_entirely_coarse(subdivision):
     corners = torch.tensor([0.3, -1.0, 2.0, 0.7], dtype=torch.float64)
     values = subdivision.interpolate(corners[:, None], FACETS)[:, 0]
     assert_close(CoarsePart(subdivision, FACETS)(values), values, rtol=0, atol=1e-4)
 
 
-def test_a_needle_and_waves_are_none_of_it(subdivision):
+def test_needles_and_waves_have_no_coarse_part(subdivision):
     needle = torch.zeros(len(subdivision.points), dtype=torch.float64)
     needle[len(needle) // 2] = 1.0
     assert CoarsePart(subdivision, FACETS)(needle).abs().max() < 0.01
@@ -25,12 +25,12 @@ def test_a_needle_and_waves_are_none_of_it(subdivision):
     assert CoarsePart(subdivision, FACETS)(waves).abs().max() < 0.05
 
 
-def test_it_is_the_nearest_and_can_be_differentiated(subdivision):
+def test_the_coarse_part_is_a_differentiable_projection(subdivision):
     generator = torch.Generator().manual_seed(79)
     values = torch.randn(len(subdivision.points), generator=generator, dtype=torch.float64)
     values.requires_grad_()
     found = CoarsePart(subdivision, FACETS)(values)
-    # What is left is at right angles to all functions that are linear on the facets.
+    # The remainder is orthogonal to all functions that are linear on the facets.
     for corner in torch.eye(4, dtype=torch.float64):
         hat = subdivision.interpolate(corner[:, None], FACETS)[:, 0]
         assert abs(float(hat @ (values - found).detach())) < 1e-2

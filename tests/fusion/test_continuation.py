@@ -18,7 +18,7 @@ def ramp(points):
     return torch.stack([points[:, 0], 2 - points[:, 1]], dim=1)
 
 
-def test_the_walk_is_drawn_to_what_is_known_otherwise(square):
+def test_continuation_is_pulled_to_prior_values_by_their_weight(square):
     points, faces = square
     known = points[:, 0] < 0.5
     far = points[:, 0] > 0.9
@@ -39,20 +39,20 @@ def test_the_walk_is_drawn_to_what_is_known_otherwise(square):
     assert torch.equal(tight[known], ones[known])
 
 
-def test_only_what_known_vertices_surround_is_enclosed(square):
+def test_only_holes_among_known_vertices_are_enclosed(square):
     points, faces = square
     hole = (points[:, :2] - torch.tensor([0.3, 0.3])).norm(dim=1) < 0.15
     bay = (points[:, :2] - torch.tensor([1.0, 0.7])).norm(dim=1) < 0.2
     assert torch.equal(enclosed(~(hole | bay), faces), hole)
     joined = hole | bay | ((points[:, 1] - 0.5 - 0.3 * (points[:, 0] - 0.6)).abs() < 0.3)
     assert not enclosed(~joined, faces).any()
-    # Nothing encloses what is dark all over, not even a surface without border.
+    # A surface without known vertices has no enclosed ones, even if it is closed.
     ball = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
     assert not enclosed(torch.zeros(4, dtype=torch.bool), ball).any()
     assert enclosed(torch.tensor([True, False, False, False]), ball).sum() == 3
 
 
-def test_what_varies_much_from_step_to_step_is_not_transferred_far(square):
+def test_noise_is_not_continued_far(square):
     points, faces = square
     generator = torch.Generator().manual_seed(3)
     known = points[:, 0] < 0.5
@@ -65,7 +65,7 @@ def test_what_varies_much_from_step_to_step_is_not_transferred_far(square):
     assert of_ramp.abs().max() > 0.2 * steady[known].std()
 
 
-def test_parts_without_anything_known_take_the_mean(square):
+def test_components_without_known_vertices_have_the_mean(square):
     points, faces = square
     apart = torch.cat([faces, faces + len(points)])
     values = torch.cat([ramp(points), torch.full_like(ramp(points), 100.0)])
@@ -76,17 +76,17 @@ def test_parts_without_anything_known_take_the_mean(square):
 
 
 @pytest.mark.parametrize("everywhere", [True, False])
-def test_with_everything_or_nothing_known_nothing_is_changed(square, everywhere):
+def test_fully_known_or_unknown_values_are_unchanged(square, everywhere):
     points, faces = square
     known = torch.full((len(points),), everywhere)
     assert torch.equal(about_mean(ramp(points), known, face_edges(faces)[0]), ramp(points))
 
 
-def test_gradients_are_those_of_what_is_known(square):
+def test_gradients_reach_known_values_only(square):
     points, faces = square
     known = (points[:, :2] - 0.5).norm(dim=1) > 0.25
     values = ramp(points).requires_grad_()
     about_mean(values, known, face_edges(faces)[0])[~known].sum().backward()
     assert (values.grad[~known] == 0).all()
-    # Fractions of those round it and of the mean: they add up to one for each unknown value.
+    # Each unknown value is a weighted mean of its surroundings: weights sum to one.
     assert_close(values.grad.sum(), torch.tensor(2.0 * int((~known).sum())).double())

@@ -18,7 +18,7 @@ def smooth() -> torch.Tensor:
 
 
 def steps(noise: torch.Tensor, deviation: float) -> Equations:
-    """Differences of a chain of heights, each measured three times, as in a triangle mesh."""
+    """Return steps of a chain of heights, each measured three times, as in a triangle mesh."""
     first = torch.arange(COUNT - 1).repeat(3)
     return Equations(
         unknowns=torch.stack([first, first + 1], dim=1),
@@ -49,17 +49,17 @@ def drawn(generator, deviation: float, count: int = COUNT) -> torch.Tensor:
     return deviation * torch.randn(count, generator=generator, dtype=torch.float64)
 
 
-def test_the_noise_of_each_kind_is_found_whatever_it_claims(generator):
+def test_noise_factors_correct_wrong_variances(generator):
     kinds = [
-        steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.005),  # claims a quarter of its noise
-        places(drawn(generator, 0.1), 0.18),  # and nearly twice its own
+        steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.005),  # states a quarter of its noise
+        places(drawn(generator, 0.1), 0.18),  # states nearly twice its noise
     ]
     found = fused(kinds, iterations=12)
     assert abs(found.factors[0] / 16 - 1) < 0.25
     assert abs(found.factors[1] * 3.24 - 1) < 0.25
 
 
-def test_outliers_are_let_go(generator):
+def test_outliers_lose_their_weight(generator):
     wrong = drawn(generator, 0.05)
     wrong[::10] = 4.0
     found = fused([steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02), places(wrong, 0.05)])
@@ -88,7 +88,7 @@ def test_one_solve_is_plain_least_squares(generator):
     assert_close(fused(kinds, iterations=1).heights, torch.linalg.lstsq(J, right).solution)
 
 
-def test_vertices_that_nothing_is_known_of_stay():
+def test_vertices_without_equations_keep_their_heights():
     kind = places(torch.zeros(COUNT).double(), 0.1)
     some = kind.replace(
         unknowns=kind.unknowns[:10],
@@ -104,13 +104,13 @@ def test_vertices_that_nothing_is_known_of_stay():
 
 
 def with_common_errors(kind, together: float):
-    """Let equations share an error, beside their own, that is so many times its variance."""
+    """Add a shared error with `together` times the variance of each equation."""
     total = 1 / kind.information + together / kind.information
     return kind.replace(information=1 / total, correlated=torch.full_like(total, 1 + together))
 
 
-def test_a_solve_with_common_errors_takes_the_weights_of_one_without(generator):
-    # Slopes that seem too sure of themselves, and places that seem too unsure; some are outliers.
+def test_a_solve_with_shared_errors_reuses_robust_weights(generator):
+    # Overconfident slopes and underconfident places, some of which are outliers.
     noise = drawn(generator, 0.1)
     noise[::50] += 5
     kinds = [steps(drawn(generator, 0.005, 3 * (COUNT - 1)), 0.02), places(noise, 0.02)]
@@ -134,13 +134,13 @@ def test_a_solve_with_common_errors_takes_the_weights_of_one_without(generator):
 
 
 @pytest.mark.parametrize("kernels", ["numba", "torch"])
-def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch, kernels):
+def test_cholesky_solves_if_multigrid_does_not_converge(generator, monkeypatch, kernels):
     kinds = [steps(drawn(generator, 0.02, 3 * (COUNT - 1)), 0.02), places(0 * smooth(), 0.1)]
     expected = fused(kinds)
     stuck = []
 
-    def refusing(*told):
-        stuck.append(told)
+    def refusing(*arguments):
+        stuck.append(arguments)
         raise SingularSystemError("no convergence")
 
     monkeypatch.setattr("pimper_torch.ground.linalg.systems._CHOLESKY_UNKNOWNS", 100)
@@ -155,7 +155,7 @@ def test_where_multigrid_gets_stuck_a_factor_solves(generator, monkeypatch, kern
 
 
 @pytest.mark.parametrize("outliers", [0, 1000])
-def test_the_noise_is_told_in_spite_of_outliers(generator, outliers):
+def test_the_noise_factor_is_robust_to_outliers(generator, outliers):
     square = 9.0 * drawn(generator, 1.0, 20000).square()
     square[:outliers] = 1e6
     assert abs(noise_factor(square) / 9 - 1) < (0.25 if outliers else 0.05)

@@ -11,20 +11,20 @@ from pimper_torch.method.fusion.estimate import fuse_terms
 from pimper_torch.method.fusion.expected_error import expected_error, regions
 from pimper_torch.method.fusion.normal_bias import CoarsePart
 
-# Standard errors from so many draws are off by 4 %; of all vertices, by three times that.
+# Standard errors from 300 draws are off by 4 %; the worst of all vertices, by three times that.
 DRAWS, CLOSE = 300, 0.13
 
 
 @pytest.fixture(scope="module")
 def square():
-    """A square of 32 facets, subdivided; four regions that err alike."""
+    """A subdivided square of 32 facets in four regions of shared errors."""
     mesh = table(0.5, cells=4)
     corners, facets = mesh.vertices_world + torch.tensor([0.5, 0.5, 0.0]), mesh.faces
     return subdivide(corners, facets, torch.full((32,), 0.1).double()), facets
 
 
 def differences(subdivision, deviation, correlated=1.0, evaluated=True):
-    """Say how heights differ along all edges."""
+    """Return equations of height differences along all edges."""
     edges = face_edges(subdivision.faces)[0]
     length = (subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]]).norm(dim=1)
     return Equations(
@@ -56,7 +56,7 @@ def solved(subdivision, *kinds):
 
 
 def dense(fused):
-    """The matrix that was solved, and what each target is multiplied by."""
+    """Return the normal matrix and the solution per unit of each target."""
     count = len(fused.damping)
     rows = []
     for kind in fused.kinds:
@@ -80,13 +80,13 @@ def test_independent_noise_gives_the_diagonal_of_the_inverse(square):
     near(found, torch.linalg.inv(dense(fused)[0]).diagonal().sqrt())
 
 
-def test_what_a_region_errs_by_together_does_not_average_out(square):
+def test_errors_shared_by_a_region_do_not_average_out(square):
     subdivision, facets = square
     sure, alike = heights(subdivision, 0.05), heights(subdivision, 0.05, correlated=12.0)
     tied = differences(subdivision, 0.02)
     fused = solved(subdivision, tied, alike)
     found = expected_error(fused, fused, subdivision, facets, DRAWS)
-    # Oracle: the covariance of the targets, written out.
+    # Oracle: the dense covariance of the targets.
     facet = subdivision.facet
     count = torch.bincount(facet)[facet].double()
     fraction = (11 / (count - 1)).clamp(0, 1)
@@ -103,12 +103,12 @@ def test_what_a_region_errs_by_together_does_not_average_out(square):
     assert (found > 1.5 * expected_error(trusting, trusting, subdivision, facets, DRAWS)).all()
 
 
-def test_a_tilt_of_a_region_turns_edges_by_where_they_point(square):
+def test_a_tilt_of_a_region_acts_on_edges_by_direction(square):
     subdivision, facets = square
-    kept = differences(subdivision, 0.1, evaluated=False)  # all of it is alike
+    kept = differences(subdivision, 0.1, evaluated=False)  # the error is entirely shared
     fused = solved(subdivision, kept, heights(subdivision, 0.01, vertices=torch.tensor([0])))
     found = expected_error(fused, fused, subdivision, facets, DRAWS)
-    # Oracle: one tilt of five times 0.1 a region, along both axes of the plane.
+    # Oracle: one tilt of five times 0.1 per region, about both axes of the plane.
     edges = kept.unknowns
     along = normalize(subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]], dim=1)
     region = regions(subdivision)[subdivision.facet[edges[:, 0]]]
@@ -122,7 +122,7 @@ def test_a_tilt_of_a_region_turns_edges_by_where_they_point(square):
     near(found[1:], total.diagonal().sqrt()[1:])
 
 
-def test_detail_of_one_solve_and_shape_of_another_err_by_the_same_noise(square):
+def test_detail_and_coarse_shape_share_their_noise(square):
     subdivision, facets = square
     tied = differences(subdivision, 0.03, correlated=9.0)
     fine = solved(subdivision, differences(subdivision, 0.03), heights(subdivision, 0.1))
@@ -132,7 +132,7 @@ def test_detail_of_one_solve_and_shape_of_another_err_by_the_same_noise(square):
     low = torch.stack([CoarsePart(subdivision, facets)(one) for one in eye], dim=1)
     (_, of_fine), (_, of_coarse) = dense(fine), dense(coarse)
     answer = of_fine + low @ (of_coarse - of_fine)
-    # Noise is that of the coarse solve: in a region, edges share a part of it.
+    # Noise is that of the coarse solve; edges of a region share part of it.
     edges = tied.unknowns
     along = normalize(subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]], dim=1)
     facet = subdivision.facet[edges[:, 0]]
@@ -148,17 +148,17 @@ def test_detail_of_one_solve_and_shape_of_another_err_by_the_same_noise(square):
     near(found, total.diagonal().sqrt())
 
 
-def test_facets_whose_vertices_name_others_have_regions():
+def test_facets_without_vertices_have_regions():
     corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]).double()
     facets = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     subdivision = subdivide(corners, facets, torch.full((4,), 9.0).double())
-    assert int(subdivision.facet.max()) < 3  # four vertices, each named after one of its facets
+    assert int(subdivision.facet.max()) < 3  # four vertices, each assigned to one facet
     assert len(regions(subdivision)) == 4
 
 
-def test_no_kind_is_taken_to_be_surer_than_it_claims(square, generator):
+def test_noise_factors_below_one_do_not_reduce_the_error(square, generator):
     subdivision, facets = square
-    exact = [differences(subdivision, 0.1), heights(subdivision, 0.1)]  # without noise at all
+    exact = [differences(subdivision, 0.1), heights(subdivision, 0.1)]  # without noise
     count = len(subdivision.points)
     damping = torch.full((count,), 1e-6).double()
     modest = fuse_terms(exact, torch.zeros(count).double(), damping, 5)
@@ -170,26 +170,26 @@ def test_no_kind_is_taken_to_be_surer_than_it_claims(square, generator):
     )
 
 
-def test_what_nothing_tells_may_be_anywhere(square):
+def test_vertices_without_evidence_have_large_errors(square):
     subdivision, facets = square
     known = heights(subdivision, 0.01, vertices=torch.arange(10))
     fused = solved(subdivision, known)
     found = expected_error(fused, fused, subdivision, facets, 20)
     assert (found[:10] < 0.03).all()
-    assert (found[10:] > 300).all()  # held by 1e-6
+    assert (found[10:] > 300).all()  # damping is 1e-6
 
 
-def test_outliers_that_lost_their_weight_are_no_part_of_the_noise(square, generator):
+def test_downweighted_outliers_do_not_raise_the_error(square, generator):
     subdivision, facets = square
-    told = heights(subdivision, 0.05)
-    noise = 0.05 * torch.randn(len(told.targets), generator=generator, dtype=torch.float64)
+    measured = heights(subdivision, 0.05)
+    noise = 0.05 * torch.randn(len(measured.targets), generator=generator, dtype=torch.float64)
     wild = noise.clone()
     wild[::15] += 3.0
     count = len(subdivision.points)
     damping = torch.full((count,), 1e-6).double()
     tied = differences(subdivision, 0.02)
     plain, spoiled = (
-        fuse_terms([tied, told.replace(targets=one)], torch.zeros(count).double(), damping, 6)
+        fuse_terms([tied, measured.replace(targets=one)], torch.zeros(count).double(), damping, 6)
         for one in (noise, wild)
     )
     clean = expected_error(plain, plain, subdivision, facets, DRAWS)

@@ -34,7 +34,7 @@ def without(*names: str) -> tuple[str, ...]:
     return tuple(name for name in FuseConfig().terms if name not in names)
 
 
-# Silhouettes that constrain nothing.
+# Silhouettes without constraint.
 FREE = Contours.none(
     Silhouettes(
         inside=torch.ones(1, 1, 1), reliable=torch.zeros(1, dtype=torch.bool), source="everything"
@@ -64,7 +64,7 @@ def off_plane(lifted, surface) -> torch.Tensor:
     return (surface.vertices_world.double() @ lifted.normal) / spacing
 
 
-def test_facets_beside_a_plane_come_to_lie_on_it(swept):
+def test_facets_off_a_plane_are_moved_onto_it(swept):
     lifted, given = swept(-1.5)
     surface = Fuse()(given, FREE)
     off = off_plane(lifted, surface).abs()
@@ -81,16 +81,16 @@ def test_facets_beside_a_plane_come_to_lie_on_it(swept):
     )
 
 
-def test_heights_alone_do_and_slopes_alone_stay_where_they_are(swept):
+def test_heights_alone_move_facets_and_slopes_alone_do_not(swept):
     lifted, given = swept(1.0)
     heights = Fuse(FuseConfig(terms=without("normals")))(given, FREE)
     assert off_plane(lifted, heights).abs().median() < 0.05
     slopes = Fuse(FuseConfig(terms=without("swept_heights", "cloud_points")))(given, FREE)
-    # Nothing knows how high: the facets, which are parallel, stay a sample above.
+    # Heights are undetermined: the facets, which are parallel, stay a sample above.
     assert (off_plane(lifted, slopes) - lifted.height).abs().max() < 0.05
 
 
-def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
+def test_normal_bias_of_a_facet_does_not_tilt_it(swept):
     lifted, given = swept(0.5)
 
     def tilt(found):
@@ -104,7 +104,7 @@ def test_normals_that_err_alike_on_a_facet_do_not_tilt_it(swept):
     assert kept.std() < 0.5 * trusting.std()
 
 
-def test_normals_at_right_angles_to_the_direction_of_heights_raise_no_fold(swept):
+def test_normals_perpendicular_to_the_heights_raise_no_fold(swept):
     lifted, given = swept(1.0)
 
     def spoil(found):
@@ -131,7 +131,7 @@ def spoiled(given, **changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"normals_patch": torch.tensor([0.0, 0, 1]).double()}, "1 of .* face away"),
         ({"normals_patch": torch.tensor([1.0, 0, 0]).double()}, "1 of .* face away"),
@@ -140,20 +140,20 @@ def spoiled(given, **changes):
         ({"information": torch.nan}, "such as nan"),
     ],
 )
-def test_normals_and_information_that_cannot_be_are_refused(swept, changes, told):
+def test_impossible_normals_and_information_are_rejected(swept, changes, message):
     _, given = swept(0.5)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         Fuse()(spoiled(given, valid=True, **changes), FREE)
 
 
-def test_normals_that_are_not_valid_may_face_anywhere(swept):
+def test_invalid_normals_may_face_away(swept):
     _, given = swept(0.5)
     away = spoiled(given, valid=False, normals_patch=torch.tensor([0.0, 0, 1]).double())
     assert Fuse()(away, FREE).vertices_world.isfinite().all()
 
 
 def with_points(given, points, claimed: float):
-    """Give the coarse mesh points of a cloud, each said to be so many scene units off."""
+    """Add cloud points to the coarse mesh, with `claimed` as their standard error."""
     covariance = claimed**2 * torch.eye(3).double().expand(len(points), 3, 3)
     facet = (points[:, 1] > points[:, 0]).long()
     cloud = FacetPoints(points_world=points, covariance_world=covariance, facet=facet)
@@ -163,7 +163,7 @@ def with_points(given, points, claimed: float):
 
 
 def near_plane(lifted, noise: float, count: int = 24) -> torch.Tensor:
-    """Points so many scene units off the plane."""
+    """Return points near the plane, with noise in scene units."""
     generator = torch.Generator().manual_seed(75)
     xy = torch.tensor([0.5, 0.4]) * (torch.rand(count, 2, generator=generator) - 0.5)
     xy, normal = xy.double(), lifted.normal
@@ -171,25 +171,25 @@ def near_plane(lifted, noise: float, count: int = 24) -> torch.Tensor:
     return points + noise * torch.randn(points.shape, generator=generator).double()
 
 
-def test_heights_that_err_alike_do_not_outvote_points(swept):
+def test_biased_heights_do_not_outvote_points(swept):
     lifted, given = swept(0.5)
     spacing = float(given.patches.buckets[0].spacing[0])
     known = with_points(given, near_plane(lifted, 0.1 * spacing), 0.1 * spacing)
-    # A shading that is wrong all over moves what views seem to agree on all over.
+    # Wrong shading shifts all heights at which views agree.
     wrong = tuple(b.replace(offset=b.offset + 1.5 * spacing) for b in given.buckets)
     misled = known.replace(buckets=wrong)
     off = off_plane(lifted, Fuse()(misled, FREE))
     assert off.abs().quantile(0.9) < 0.1
     assert off_plane(lifted, Fuse(FuseConfig(bias_iterations=0))(misled, FREE)).median() > 0.5
-    # Heights that are right still help: they know more than a few points.
+    # Correct heights still help: they carry more information than a few points.
     assert off_plane(lifted, Fuse()(known, FREE)).abs().quantile(0.9) < 0.05
 
 
 class Touching(Contours):
-    """Contours that touch at given places, whatever the surface."""
+    """Contours with given tangent points, independent of the surface."""
 
     def __init__(self, points, normal, sigma):
-        told = ContourPoints(
+        tangent = ContourPoints(
             points_world=points,
             normals_world=normal.expand_as(points),
             variance=torch.full_like(points[:, 0], sigma**2),
@@ -198,19 +198,19 @@ class Touching(Contours):
         )
         for name in ("silhouettes", "rays", "cameras", "hull"):
             object.__setattr__(self, name, getattr(FREE, name))
-        object.__setattr__(self, "told", told)
+        object.__setattr__(self, "tangent", tangent)
 
     def touching(self, points_world, normals_world):
-        return self.told
+        return self.tangent
 
 
-def test_contours_bring_the_surface_to_where_it_touches_them(swept):
+def test_contours_pull_the_surface_to_tangency(swept):
     lifted, given = swept(1.0)
     spacing = float(given.patches.buckets[0].spacing[0])
     along = torch.tensor([1.0, 0.0, 0.0]).double()
     ray = normalize(along - (along @ lifted.normal) * lifted.normal, dim=0)
     points = near_plane(lifted, 0.0, count=60)
-    # A contour may touch anywhere on its ray, which lies in the plane.
+    # The tangent point may be anywhere on its ray, which is in the plane.
     points = points + 3 * spacing * torch.linspace(-1, 1, 60).double()[:, None] * ray
     contours = Touching(points, lifted.normal, 0.1 * spacing)
     silent = FuseConfig(terms=without("swept_heights", "cloud_points"))
@@ -218,16 +218,16 @@ def test_contours_bring_the_surface_to_where_it_touches_them(swept):
     deaf = FuseConfig(terms=without("swept_heights", "cloud_points", "contour_rays"))
     unheard = Fuse(deaf)(given, contours)
     assert (off_plane(lifted, unheard) - lifted.height).abs().max() < 0.05
-    # A tenth of them lie beside the object: the others outvote them.
+    # A tenth of them are off the object: the others outvote them.
     points[::10] += 5 * spacing * lifted.normal
     wrong = Fuse(silent)(given, Touching(points, lifted.normal, 0.1 * spacing))
     assert off_plane(lifted, wrong).abs().quantile(0.9) < 0.3
 
 
-def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
+def test_overconfident_points_raise_no_pimples(swept):
     lifted, given = swept(0.5)
     spacing = float(given.patches.buckets[0].spacing[0])
-    # Facets tilted against each other: what cannot be blended must not cost the detail.
+    # Facets tilted against each other: tilts that cannot be blended must not cost detail.
     buckets = []
     for found, templates in zip(given.photometric.buckets, given.patches.buckets, strict=True):
         lean = 0.1 * (1 - 2 * templates.facet.double())[:, None, None]
@@ -244,19 +244,18 @@ def test_points_surer_of_themselves_than_they_should_be_raise_no_pimples(swept):
     assert pimple.abs().max() < 0.1
 
 
-def test_where_light_tells_nothing_the_surface_keeps_its_shape(swept):
+def test_an_unlit_surface_keeps_its_shape(swept):
     lifted, given = swept(0.8)
     dark = each_bucket(unlit(given), lambda found: found.replace(information=0 * found.information))
     surface = Fuse()(dark, FREE)
     off = off_plane(lifted, surface)
-    assert off.std() < 1e-4  # as flat as the facets, and where they were
+    assert off.std() < 1e-4  # as flat as the facets, and not moved
     assert abs(float(off.mean()) - lifted.height) < 0.02
     assert (surface.confidence == 0).all()
 
 
 def in_the_centre_of_each(found, spoiled):
-    """Make a square in the centre of every template dark, and something else of its height
-    field."""
+    """Make a square in the centre of every template dark, and apply ``spoiled`` to it."""
     valid = found.valid.clone()
     centre = valid.shape[-1] // 2
     square = (slice(None), slice(centre - 4, centre + 4), slice(centre - 4, centre + 4))
@@ -265,7 +264,7 @@ def in_the_centre_of_each(found, spoiled):
     return found.replace(valid=valid, information=found.information * valid)
 
 
-def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
+def test_albedo_of_unlit_surface_is_inpainted_from_its_surroundings(swept):
     _, given = swept(0.8)
     photometric = each_bucket(
         given.photometric, lambda found: in_the_centre_of_each(found, lambda square: None)
@@ -279,7 +278,7 @@ def test_what_no_light_tells_has_the_albedo_of_what_lies_round_it(swept):
 
 
 def with_dark_dents(given, spacings: float):
-    """Carry a dent in the centre of every template, where neither light nor sweep tells of it."""
+    """Add a dent without light or swept heights to the centre of every template."""
     spacing = float(given.patches.buckets[0].spacing[0])
     templates, found, heights = [], [], []
     buckets = zip(given.patches.buckets, given.photometric.buckets, given.buckets, strict=True)
@@ -298,24 +297,24 @@ def with_dark_dents(given, spacings: float):
     return given.replace(photometric=photometric, buckets=tuple(heights))
 
 
-def test_a_dent_that_nothing_tells_of_is_bridged(swept):
+def test_a_dent_without_evidence_is_bridged(swept):
     lifted, given = swept(0.0)
     surface = Fuse()(with_dark_dents(given, 5.0), FREE)
     assert (surface.confidence == 0).any()
     assert off_plane(lifted, surface).abs().max() < 0.5
 
 
-def test_what_is_continued_does_not_outvote_points(swept):
+def test_inpainted_normals_do_not_outvote_points(swept):
     lifted, given = swept(0.0)
     spacing = float(given.patches.buckets[0].spacing[0])
     holed = with_dark_dents(given, 0.0)
-    fuse = Fuse(FuseConfig(max_lost=0.0))  # vertices as close in and beside the holes
+    fuse = Fuse(FuseConfig(max_lost=0.0))  # the same vertex spacing in the holes as elsewhere
     flat = fuse(holed, FREE)
     (dark,) = torch.nonzero((flat.confidence == 0) & (flat.facet == 0), as_tuple=True)
     places = flat.vertices_world[dark].double()
     inner = (places - places.mean(dim=0)).norm(dim=1) < 2.5 * spacing
     raised = places[inner] + 0.5 * spacing * lifted.normal
-    # The raised points are a sixth of all, so that they are no noise of the cloud.
+    # The raised points are a sixth of all: too many to count as noise of the cloud.
     points = torch.cat([near_plane(lifted, 0.0, count=240), raised])
     surface = fuse(with_points(holed, points, 0.02 * spacing), FREE)
     off = off_plane(lifted, surface)
@@ -323,13 +322,13 @@ def test_what_is_continued_does_not_outvote_points(swept):
     assert off[surface.confidence > 0].median() < 0.01
 
 
-def test_without_any_evidence_nothing_can_be_fused():
+def test_fusion_without_terms_is_rejected():
     with pytest.raises(ConfigError, match=r"fuse\.terms"):
         FuseConfig(terms=())
 
 
 class At(Term):
-    """All vertices lie at one height above the facets."""
+    """Equations that place all vertices at one height above the facets."""
 
     position = True
 
@@ -352,7 +351,7 @@ class At(Term):
         ]
 
 
-def test_a_term_from_elsewhere_joins_the_list_and_its_parameters_have_gradients(swept):
+def test_a_custom_term_is_fused_and_its_parameters_have_gradients(swept):
     lifted, given = swept(1.0)
     spacing = float(given.patches.buckets[0].spacing[0])
     own = At(0.7 * spacing)
@@ -362,21 +361,21 @@ def test_a_term_from_elsewhere_joins_the_list_and_its_parameters_have_gradients(
         off_plane(lifted, surface), torch.full_like(surface.information, 1.7), atol=1e-2, rtol=0
     )
     surface.vertices_world.sum().backward()
-    # The facets are raised as one: every vertex moves along its direction.
+    # All facets are raised together: every vertex moves along its direction.
     assert own.height.grad.abs() > 0.9 * len(surface.information) * abs(float(lifted.normal.sum()))
     with pytest.raises(ConfigError, match="modules derived from Term"):
         Fuse(terms=[nn.Identity()])
 
 
-def test_the_list_of_settings_is_the_list_of_terms(swept):
+def test_named_terms_equal_listed_terms(swept):
     _, given = swept(1.0)
     named = Fuse(FuseConfig(terms=without("cloud_points")))(given, FREE)
     listed = [KeptSlopes(), TouchedRays(), SweptHeights(), Normals()]
     assert torch.equal(named.vertices_world, Fuse(terms=listed)(given, FREE).vertices_world)
 
 
-def guessed(lifted, given, lean: float, error_deg: float):
-    """Guesses of the plane's normal, all of them leaning alike."""
+def with_prior_normals(lifted, given, lean: float, error_deg: float):
+    """Add priors of the plane's normal, all with the same tilt."""
     buckets = []
     for own, templates in zip(given.buckets, given.patches.buckets, strict=True):
         axis = torch.tensor([1.0, 0.0, 0.0]).double()
@@ -402,37 +401,37 @@ def unlit(given):
     return given.replace(photometric=each_bucket(given.photometric, dark))
 
 
-def test_a_guess_that_the_photographs_contradict_is_not_believed_however_sure_it_is(swept):
+def test_a_contradicted_prior_is_overruled_despite_its_small_error(swept):
     lifted, given = swept(0.5)
     surface = Fuse()(given, FREE)
     plain = off_plane(lifted, surface).abs()
     for error_deg in (5.0, 1.0):
-        wrong = guessed(lifted, given, lean=0.3, error_deg=error_deg)
+        wrong = with_prior_normals(lifted, given, lean=0.3, error_deg=error_deg)
         off = off_plane(lifted, Fuse()(wrong, FREE)).abs()
         assert off.quantile(0.9) < plain.quantile(0.9) + 0.05
     deaf = Fuse(FuseConfig(terms=without("prior_normals")))(wrong, FREE)
     assert torch.equal(deaf.vertices_world, surface.vertices_world)
 
 
-def test_guessed_normals_tell_slopes_where_light_tells_none(swept):
+def test_normal_priors_determine_slopes_of_unlit_surface(swept):
     lifted, given = swept(0.5)
     axis = torch.tensor([1.0, 0.0, 0.0]).double()
     across = normalize(axis - (axis @ lifted.normal) * lifted.normal, dim=0)
     silent = FuseConfig(terms=without("swept_heights", "cloud_points"), bias_iterations=0)
-    surface = Fuse(silent)(guessed(lifted, unlit(given), 0.1, 0.5), FREE)
+    surface = Fuse(silent)(with_prior_normals(lifted, unlit(given), 0.1, 0.5), FREE)
     away = off_plane(lifted, surface)
     along = surface.vertices_world.double() @ across
     along = along / float(given.patches.buckets[0].spacing[0])
     slope = ((along - along.mean()) * away).mean() / along.var(correction=0)
-    assert -0.1 < slope < -0.08  # kept slopes stand beside it
+    assert -0.1 < slope < -0.08  # kept slopes pull against it
 
 
-def test_a_run_tells_how_far_guesses_are_from_the_photographs_and_warns(swept):
+def test_disagreement_of_priors_is_reported_and_warned_of(swept):
     lifted, given = swept(0.5)
     assert figures(given) == {}
-    right = figures(guessed(lifted, given, lean=0.0, error_deg=1.0))
+    right = figures(with_prior_normals(lifted, given, lean=0.0, error_deg=1.0))
     assert right["prior_normals_deg"] < 0.1
-    wrong = figures(guessed(lifted, given, lean=0.3, error_deg=1.0))
+    wrong = figures(with_prior_normals(lifted, given, lean=0.3, error_deg=1.0))
     assert abs(wrong["prior_normals_deg"] - math.degrees(math.atan(0.3))) < 0.5
     with pytest.warns(PimperWarning, match=r"Prior normals deviate .* 7\.0 times"):
         warn_of_priors(wrong)
@@ -441,5 +440,5 @@ def test_a_run_tells_how_far_guesses_are_from_the_photographs_and_warns(swept):
         warn_of_priors(right)
 
 
-def test_settings_know_the_kinds_of_terms():
+def test_settings_list_the_kinds_of_terms():
     assert tuple(TERMS) == KINDS

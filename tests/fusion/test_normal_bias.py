@@ -14,7 +14,7 @@ def subdivision():
     return subdivided_square(0.1)
 
 
-def test_a_tilt_that_all_normals_share_is_found_and_detail_is_not(subdivision):
+def test_a_shared_tilt_is_removed_and_detail_kept(subdivision):
     generator = torch.Generator().manual_seed(73)
     shape = torch.tensor([0.0, 0, 1]).double().expand(len(subdivision.points), 3)
     detail = 0.05 * torch.randn(shape.shape, generator=generator, dtype=torch.float64)
@@ -28,7 +28,7 @@ def test_a_tilt_that_all_normals_share_is_found_and_detail_is_not(subdivision):
     assert (corrected - shape - detail * torch.tensor([1, 1, 0])).norm(dim=1).max() < 0.03
 
 
-def test_the_blend_is_continuous_and_only_normals_that_are_known_count(subdivision):
+def test_the_blend_is_continuous_and_ignores_unknown_normals(subdivision):
     shape = torch.tensor([0.0, 0, 1]).double().expand(len(subdivision.points), 3)
     normals = shape.clone()
     upper = subdivision.facet == 1
@@ -39,14 +39,14 @@ def test_the_blend_is_continuous_and_only_normals_that_are_known_count(subdivisi
     assert_close(found.tilt[0], torch.zeros(3).double())
     at = found.at(subdivision, FACETS)
     assert at.isfinite().all()
-    # On the diagonal both facets have the same blend: that of its two corners.
+    # On the diagonal, both facets have the blend of its two corners.
     diagonal = (subdivision.points[:, 0] - subdivision.points[:, 1]).abs() < 1e-9
     assert_close(
         at[diagonal][:, 0], found.tilt[1, 0].expand(int(diagonal.sum())), rtol=1e-6, atol=0
     )
 
 
-def test_a_cliff_does_not_turn_a_facet_by_more_than_a_quarter(subdivision):
+def test_the_tilt_of_a_facet_is_bounded(subdivision):
     shape = torch.tensor([0.0, 0, 1]).double().expand(len(subdivision.points), 3)
     sideways = torch.tensor([1.0, 0, 0]).double().expand_as(shape)
     known = torch.ones(len(shape), dtype=torch.bool)
@@ -56,7 +56,7 @@ def test_a_cliff_does_not_turn_a_facet_by_more_than_a_quarter(subdivision):
     )
 
 
-def test_the_variance_of_tilts_is_told_whatever_their_number():
+def test_the_variance_of_tilts_is_recovered():
     corners = torch.rand(602, 3, generator=torch.Generator().manual_seed(76)).double()
     facets = torch.stack([torch.arange(600), torch.arange(1, 601), torch.arange(2, 602)], dim=1)
     subdivision = subdivide(corners, facets, torch.full((600,), 0.3, dtype=torch.float64))
@@ -71,13 +71,13 @@ def test_the_variance_of_tilts_is_told_whatever_their_number():
     assert_close(found.count, torch.bincount(subdivision.facet).double()[subdivision.facet])
 
 
-def test_what_heights_of_a_facet_are_off_by_together_is_told_where_it_can_be():
+def test_the_shared_error_of_heights_is_estimated_at_positions():
     facet = torch.arange(800).repeat_interleave(50)
     generator = torch.Generator().manual_seed(78)
     nothing = torch.zeros(len(facet), dtype=torch.float64)
     shared = 0.3 * torch.randn(800, generator=generator).double()
     own = torch.randn(len(facet), generator=generator).double()
-    shared[400:] += 10  # where nothing else is known, the surface may be wrong instead
+    shared[400:] += 10  # without other evidence, the surface itself may be wrong
     shared[:10] = 5.0
     information = torch.ones_like(nothing)
     information[facet == 399] = 0
@@ -91,7 +91,7 @@ def test_what_heights_of_a_facet_are_off_by_together_is_told_where_it_can_be():
     assert shared.count[facet == 399].unique().tolist() == [0]
 
 
-def test_heights_that_nothing_else_can_judge_are_taken_at_their_word():
+def test_without_other_positions_heights_have_no_shared_error():
     facet = torch.zeros(4, dtype=torch.long)
     ones = torch.ones(4, dtype=torch.float64)
     found = swept_heights(0 * ones, ones, ones, ones, ones)

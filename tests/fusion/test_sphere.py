@@ -1,4 +1,4 @@
-"""Fusion on a cap of a sphere over 24 facets, against its closed form and draws of noise."""
+"""Fusion on a spherical cap of 24 facets, against its closed form and draws of noise."""
 
 import math
 
@@ -32,7 +32,7 @@ from pimper_torch.records import (
 )
 from tests.threads import on_threads
 
-# The sphere is of radius 1 about this point, and seen from -z.
+# Center of the sphere of radius 1, which is seen from -z.
 CENTER = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 SPACING = 0.03
 
@@ -42,12 +42,12 @@ def off_sphere(points):
 
 
 def cameras():
-    build_problem = torch.eye(4, dtype=torch.float64)[None].clone()
-    build_problem[0, 2, 3] = 4
+    cam_from_world = torch.eye(4, dtype=torch.float64)[None].clone()
+    cam_from_world[0, 2, 3] = 4
     focal = 4 / SPACING
     return Cameras(
         intrinsics=torch.tensor([[[focal, 0, 50], [0, focal, 50], [0, 0, 1]]]).double(),
-        cam_from_world=build_problem,
+        cam_from_world=cam_from_world,
         sizes_px=torch.tensor([[100, 100]]),
     )
 
@@ -71,7 +71,7 @@ def wide():
 
 
 def cap_of(count, samples_per_pixel=1.0):
-    """Facets in some rings, whose corners lie on the sphere, with its exact normals and heights."""
+    """Return rings of facets inscribed in the sphere, with exact normals and heights."""
     rings = [torch.zeros(1, 2, dtype=torch.float64)]
     for ring in range(1, count + 1):
         angle = torch.arange(6 * ring) * (math.tau / (6 * ring)) + 0.3
@@ -94,7 +94,7 @@ def cap_of(count, samples_per_pixel=1.0):
 
 
 def exact(coarse, templates):
-    """Where rays from the flat templates meet the sphere, and its normals there."""
+    """Return the normals and heights where rays from the flat templates meet the sphere."""
     world_from_patch = invert_rigid(templates.patch_from_world)
     start = transform(world_from_patch, templates.points_patch.flatten(1, 2)) - CENTER
     along = rotate(world_from_patch, transferred_normals(coarse, templates).flatten(1, 2))
@@ -111,9 +111,9 @@ def exact(coarse, templates):
 
 
 def noisy(cap, rotation, lift, generator):
-    """Add noise to normals, radians in each direction, and to heights, in samples.
+    """Add noise to normals, in radians per axis, and to heights, in samples.
 
-    Both claim a quarter of its standard deviation.
+    Stated standard deviations are a quarter of the noise.
     """
 
     def drawn(like):
@@ -139,7 +139,7 @@ def noisy(cap, rotation, lift, generator):
 
 
 def rippled(cap, period, **sizes):
-    """Waves of a period in samples, in albedo, normals or heights of one facet."""
+    """Add waves, period in samples, to albedo, normals or heights of one facet."""
     photometry, heights = list(cap.photometric.buckets), list(cap.buckets)
     first = torch.arange(len(photometry[0].albedo)) == 0
     columns = torch.arange(photometry[0].albedo.shape[2])
@@ -160,7 +160,7 @@ def rippled(cap, period, **sizes):
     ("period", "sizes", "apart"),
     [
         (4, {}, 4),
-        (4, {"normals": 0.02}, 1),  # twice what they claim
+        (4, {"normals": 0.02}, 1),  # twice the stated error
         (4, {"normals": 0.002}, 4),
         (16, {"normals": 0.04}, 2),
         (4, {"heights": 0.2 * SPACING}, 1),
@@ -169,7 +169,7 @@ def rippled(cap, period, **sizes):
         (4, {"albedo": 0.02}, 4),
     ],
 )
-def test_vertices_lie_as_close_as_the_detail_of_their_facet_asks_for(wide, period, sizes, apart):
+def test_vertex_spacing_follows_the_detail_of_each_facet(wide, period, sizes, apart):
     swept = rippled(wide, period, **sizes)
     finest = vertex_spacing(swept.patches, 1.0)
     expected = torch.full_like(finest, 4.0)
@@ -178,7 +178,7 @@ def test_vertices_lie_as_close_as_the_detail_of_their_facet_asks_for(wide, perio
     assert torch.equal(spacing_of(swept, 0.5, 0.0), 0.5 * finest)
 
 
-def test_a_ripple_on_one_facet_is_kept_and_the_others_are_coarse(wide):
+def test_a_ripple_is_kept_while_other_facets_are_coarse(wide):
     """Its slopes are photometric: heights have the wave's amplitude over its wave number."""
     swept = rippled(wide, 8, normals=0.2)
     some, every = (Fuse(FuseConfig(max_lost=lost))(swept, free()) for lost in (0.1, 0.0))
@@ -192,7 +192,7 @@ def test_a_ripple_on_one_facet_is_kept_and_the_others_are_coarse(wide):
     assert off_sphere(some.vertices_world[inner]).std() > 0.05 * SPACING
 
 
-def test_flat_facets_come_to_lie_on_the_sphere(cap):
+def test_flat_facets_are_moved_onto_the_sphere(cap):
     surface = Fuse(FuseConfig(max_lost=0.0))(cap, free())
     mesh = cap.patches.coarse.mesh
     sag = off_sphere(mesh.vertices_world[mesh.faces].mean(dim=1)).abs().max()
@@ -202,13 +202,13 @@ def test_flat_facets_come_to_lie_on_the_sphere(cap):
     assert off.max() < 0.04 * SPACING
     radial = normalize(surface.vertices_world - CENTER, dim=-1)
     angle = (surface.normals_world * radial).sum(dim=-1).clamp(-1, 1).acos().rad2deg()
-    assert angle.quantile(0.9) < 0.5  # a facet's own are off by up to 8
+    assert angle.quantile(0.9) < 0.5  # those of facets are off by up to 8
     assert angle.max() < 2  # at the border, where one side is missing
 
 
 @pytest.mark.parametrize(("rotation", "lift"), [(0.05, 0.5), (0.2, 2.0)])
-def test_the_expected_error_is_that_of_draws_of_noise_whatever_is_claimed(cap, rotation, lift):
-    # Facets that err by nothing together: what their mean shows is chance, and is not sought.
+def test_the_expected_error_matches_draws_despite_wrong_variances(cap, rotation, lift):
+    # Facets share no error, so the normal bias would be chance and is not estimated.
     fuse = Fuse(FuseConfig(bias_iterations=0))
     generator = torch.Generator().manual_seed(7)
     true, expected = [], []
@@ -218,11 +218,11 @@ def test_the_expected_error_is_that_of_draws_of_noise_whatever_is_claimed(cap, r
         expected.append(surface.expected_error.square().mean())
     ratio = (torch.stack(true).mean() / torch.stack(expected).mean()).sqrt()
     # Measured 0.81 and 1.18; eight draws of eight draws. Slopes of neighbouring edges share
-    # a normal's error, which is drawn for each: where normals alone know the shape it is 1.5.
+    # the error of a normal, but errors are drawn per edge: with normals alone it is 1.5.
     assert 0.75 < ratio < 1.25
 
 
-def test_heights_have_a_noise_of_their_own_where_normals_are_coarse(cap):
+def test_heights_without_photometric_normals_have_their_own_noise_factor(cap):
     wild = noisy(cap, 0.0, 1.0, torch.Generator().manual_seed(8)).buckets
     photometry, heights = [], []
     for templates, found, exact_ones, drawn in zip(
@@ -244,13 +244,13 @@ def test_heights_have_a_noise_of_their_own_where_normals_are_coarse(cap):
     assert not torch.isin(own.unknowns, coarse.unknowns).any()
     kinds += [*Normals().equations(problem), *KeptSlopes().equations(problem)]
     fused = fuse_terms(kinds, problem.blend.heights, problem.damping, 4)
-    # A fifth of a spacing is claimed: by heights that are exact, and by others that are off by one.
+    # All heights state a fifth of a spacing: some are exact, others are off by one spacing.
     assert fused.factors[0] < 0.5
     assert fused.factors[1] > 5
 
 
-def test_a_large_surface_has_the_same_bits_on_any_number_of_threads(cap):
-    """Torch divides sums of more than 32,768 numbers among its threads."""
+def test_a_large_surface_is_bitwise_equal_on_any_number_of_threads(cap):
+    """Torch splits sums of more than 32,768 numbers among threads."""
     claimed = noisy(cap, 0.05, 0.3, torch.Generator().manual_seed(5))
     fuse = Fuse(
         FuseConfig(samples_per_vertex=0.25, bias_iterations=1, noise_iterations=1, error_draws=0)
