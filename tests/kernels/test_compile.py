@@ -28,7 +28,7 @@ AHEAD = "from pimper_torch.ground.kernels.compile import *; children = compile_a
 
 @pytest.fixture
 def fresh(tmp_path, monkeypatch):
-    """No kernel is compiled in the processes that a test starts."""
+    """Give subprocesses of a test an empty kernel cache."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
 
 
@@ -37,7 +37,7 @@ def started(code: str) -> "subprocess.Popen[str]":
     return subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, text=True)
 
 
-def test_compiled_functions_answer_as_python_does():
+def test_compiled_functions_agree_with_python():
     @compiled("float64(float64)")
     def halved(value: float) -> float:
         return value / 2
@@ -45,7 +45,7 @@ def test_compiled_functions_answer_as_python_does():
     assert halved(3.0) == 1.5
 
 
-def test_compile_all_leaves_torchs_threads_alone_and_compile_ahead_nothing_to_do():
+def test_compile_all_keeps_torch_threads_and_leaves_nothing_to_compile():
     code = (
         "import torch; torch.set_num_threads(2)\n"
         "from pimper_torch.ground.kernels.compile import compile_ahead, compile_all\n"
@@ -63,10 +63,10 @@ def test_every_kernel_of_a_run_is_compiled():
         for path in sources
         if re.search(r'@compiled\(\s*(f?"|\*|annotated)', path.read_text())
     }
-    assert with_types == {*listed, *GRADIENTS, "lookup"}  # which other kernels import
+    assert with_types == {*listed, *GRADIENTS, "lookup"}  # lookup is imported by other kernels
 
 
-def test_a_run_waits_for_what_another_compiles_and_executes_it(fresh):
+def test_a_run_waits_for_kernels_that_another_process_compiles(fresh):
     code = (
         "from pimper_torch.ground.kernels.compile import cache_folder, load\n"
         "print(cache_folder(), flush=True); input(); load(('line_matches',))\n"
@@ -103,7 +103,7 @@ def test_the_compiling_process_ends_with_its_parent(fresh, end):
     pytest.fail("it compiles on")
 
 
-def test_kernels_are_compiled_where_the_compiling_process_died(fresh):
+def test_kernels_are_compiled_after_the_compiling_process_died(fresh):
     code = (
         f"{AHEAD} [each.kill() for each in children]; load(('line_matches',))\n"
         "from pimper_torch.ground.kernels.line_matches import most_alike as kernel\n"
@@ -115,10 +115,8 @@ def test_kernels_are_compiled_where_the_compiling_process_died(fresh):
 
 
 @pytest.mark.slow
-def test_a_kernel_gives_the_same_bits_compiled_and_from_disk_and_in_another_order(
-    fresh, tmp_path, monkeypatch
-):
-    """The kernel calls many functions, some of which another kernel calls, too."""
+def test_a_kernel_is_bitwise_reproducible_from_disk_and_in_any_order(fresh, tmp_path, monkeypatch):
+    """The kernel calls many functions, some of which are shared with another kernel."""
     code = (
         "import numpy as np\n"
         "from pimper_torch.ground.kernels.compile import load\n"
@@ -151,7 +149,7 @@ def test_an_unknown_kernel_is_an_error():
 
 
 def test_machine_code_is_found_by_the_hash_of_the_kernels(tmp_path, monkeypatch):
-    """Wherever the package is, and whenever it was installed."""
+    """The folder depends neither on the path of the package nor on its time of installation."""
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
     found = []
     for place, code in (("one", "pass"), ("two", "pass"), ("two", "pass  # edited")):
@@ -164,7 +162,7 @@ def test_machine_code_is_found_by_the_hash_of_the_kernels(tmp_path, monkeypatch)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="has no such modes")
-def test_machine_code_is_read_from_folders_of_the_user_alone(tmp_path, monkeypatch):
+def test_machine_code_is_only_read_from_folders_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr("pimper_torch.ground.kernels.__path__", [str(tmp_path)])
     folder = cache_folder.__wrapped__()
@@ -177,7 +175,7 @@ def test_machine_code_is_read_from_folders_of_the_user_alone(tmp_path, monkeypat
     assert tmp_path not in cache_folder.__wrapped__().parents
 
 
-def test_folders_of_other_code_go_when_they_were_not_used_for_long(tmp_path):
+def test_unused_folders_of_old_code_are_removed(tmp_path):
     long_ago = time.time() - 40 * 86_400
     for name, mode, used in (
         ("kernels-" + "0" * 32, 0o700, time.time()),

@@ -4,19 +4,19 @@ from torch.testing import assert_close
 from pimper_torch.ground.kernels.dense_systems import eliminate, solve_damped
 
 
-def test_damped_systems_are_solved_as_lapack_solves_them():
+def test_damped_systems_are_solved_as_by_lapack():
     generator = torch.Generator().manual_seed(3)
     for size in (4, 24, 96):
         root = torch.randn(size, size, generator=generator, dtype=torch.float64)
         matrix, side = root @ root.T, torch.randn(size, generator=generator, dtype=torch.float64)
         expected = torch.linalg.solve(matrix + 0.5 * torch.eye(size), side)
-        upper, found = matrix.triu(), side.clone()  # below the diagonal nothing is read
+        upper, found = matrix.triu(), side.clone()  # the part below the diagonal is not read
         space = torch.empty_like(matrix)
         assert solve_damped(upper.numpy(), 0.5, found.numpy(), space.numpy())
         assert_close(found, expected)
 
 
-def test_matrices_that_are_not_positive_are_told():
+def test_matrices_that_are_not_positive_are_detected():
     matrix, side = (
         torch.diag(torch.tensor([1.0, 1, 1, 1, 1, -1, 1, 1]).double()),
         torch.ones(8).double(),

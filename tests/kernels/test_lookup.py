@@ -33,7 +33,7 @@ def test_bilinear_samples_are_those_of_grid_sample(real):
     assert_close(found, expected, rtol=0, atol=1e-3)  # of values up to 255, in float32
 
 
-def test_points_that_are_no_number_are_clamped_into_the_image():
+def test_nan_points_are_clamped_into_the_image():
     index, right, below, across, down = corners(5, 7, math.nan, math.nan)
     assert (index, right, below, across, down) == (0, 1, 7, 0, 0)
     assert corners(5, 7, math.inf, math.inf)[:3] == (5 * 7 - 1, 0, 0)
@@ -43,7 +43,7 @@ def test_points_that_are_no_number_are_clamped_into_the_image():
     ("area", "expected"),
     [(0.2, (0, 0.0)), (2.0, (0, 0.5)), (4.0, (1, 0.0)), (1e9, (3, 0.0))],
 )
-def test_a_footprint_of_four_times_the_area_is_a_level_coarser(area, expected):
+def test_a_footprint_of_four_times_the_area_is_one_level_coarser(area, expected):
     level, blend = blended_level(area, 4)
     assert level == expected[0]
     assert blend == pytest.approx(expected[1], abs=1e-6)

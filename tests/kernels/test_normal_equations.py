@@ -33,7 +33,7 @@ def test_compressed_rows_are_those_of_the_entries(real):
 
 
 @pytest.mark.parametrize("real", [torch.float32, torch.float64])
-def test_evidence_is_evaluated_as_in_torch(real):
+def test_evaluation_of_evidence_agrees_with_torch(real):
     generator = torch.Generator().manual_seed(5)
 
     def draw(*shape, dtype=real):

@@ -13,13 +13,13 @@ from pimper_torch.records import Mesh
 
 
 def height_field(templates):
-    """A wave on the templates, whose neighbours' depths matter to the level of each sample."""
+    """Return waves: the pyramid level of a sample depends on neighbouring depths."""
     x, y = templates.points_patch[..., 0], templates.points_patch[..., 1]
     return 0.5 * templates.spacing[:, None, None] * torch.sin(30 * x) * torch.cos(20 * y)
 
 
 def waved(patches):
-    """Templates that carry a surface, and a screen before a part of it."""
+    """Return templates with a surface, and a screen in front of part of it."""
     buckets = tuple(
         bucket.replace(
             depth=height_field(bucket),
@@ -45,7 +45,7 @@ def waved(patches):
 
 @pytest.fixture
 def photographed(lift):
-    """Noisy photographs with a mask, of odd size, and templates on them."""
+    """Noisy photographs of odd size with a mask, and templates."""
     lifted = lift(0.4)
     views = lifted.scene.views
     drawn = torch.rand(views.images.shape, generator=torch.Generator().manual_seed(7))
@@ -60,7 +60,7 @@ def photographed(lift):
 
 
 @pytest.mark.parametrize("finer", [1.0, 0.3])
-def test_views_are_resampled_as_in_torch(photographed, finer):
+def test_resampled_views_agree_with_torch(photographed, finer):
     views, cameras, lifted = photographed
     patches = waved(lifted.seen.patches)
     wide = tuple(
@@ -77,12 +77,12 @@ def test_views_are_resampled_as_in_torch(photographed, finer):
         assert torch.equal(one.valid, other.valid)
         assert one.valid.any()
         assert not one.valid.all()
-        assert (free.valid & ~one.valid).any()  # the screen hides something
-        # Pixels are found in float64 there, and in what cameras have here; images are float32.
+        assert (free.valid & ~one.valid).any()  # the screen hides samples
+        # Torch projects in float64, the kernel in the dtype of the cameras; images are float32.
         assert_close(one.radiance, other.radiance, rtol=0, atol=2e-6)
 
 
-def test_the_adjoint_of_resampling_is_that_of_torch(photographed):
+def test_the_adjoint_of_resampling_agrees_with_torch(photographed):
     views, cameras, lifted = photographed
     patches = waved(lifted.seen.patches)
     names = "depth", "spacing", "origin", "patch_from_world"
@@ -114,11 +114,11 @@ def test_the_adjoint_of_resampling_is_that_of_torch(photographed):
         slopes.append(torch.autograd.grad(total, leaves))
     for one, other in zip(*slopes, strict=True):
         assert (other != 0).any()
-        # Geometry is in float32 in torch there: sums of thousands of samples.
+        # Torch's geometry is float32: sums of thousands of samples.
         assert_close(one, other, rtol=0, atol=2e-4 * float(other.abs().max()))
 
 
-def test_heights_are_swept_as_in_torch(photographed):
+def test_swept_heights_agree_with_torch(photographed):
     views, cameras, lifted = photographed
     sources = prepare(views)
     with using("torch"):
@@ -135,7 +135,7 @@ def test_heights_are_swept_as_in_torch(photographed):
 
 
 def hypotheses(views, cameras, lifted, coarser):
-    """What a bucket is swept on, and the leaves of its gradients."""
+    """Return the inputs of the sweep of a bucket, and the leaves of its gradients."""
     bucket, photometry = lifted.seen.patches.buckets[0], lifted.photometric.buckets[0]
     generator = torch.Generator().manual_seed(3)
     drawn = torch.rand(photometry.lights_patch.shape[:2], generator=generator)
@@ -177,7 +177,7 @@ def hypotheses(views, cameras, lifted, coarser):
 
 
 @pytest.mark.parametrize("coarser", [1.0, 2.5])
-def test_costs_of_heights_and_their_gradients_are_those_of_torch(photographed, coarser):
+def test_costs_of_heights_and_their_gradients_agree_with_torch(photographed, coarser):
     views, cameras, lifted = photographed
     found = []
     for how in ("numba", "torch"):

@@ -8,7 +8,7 @@ from pimper_torch.ground.linalg.robust import robust_variance
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_scale_of_residuals_is_the_references_from_any_guess(kind):
+def test_scale_of_residuals_matches_the_reference_from_any_start(kind):
     generator = torch.Generator().manual_seed(4)
     for count, outliers in ((5, 0.0), (400, 0.3), (3000, 0.45)):
         gross = torch.rand(count, generator=generator) < outliers
@@ -21,7 +21,7 @@ def test_scale_of_residuals_is_the_references_from_any_guess(kind):
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_scale_is_zero_where_half_of_the_residuals_are(kind):
+def test_scale_is_zero_if_half_of_the_residuals_are(kind):
     for squares in (torch.zeros(0), torch.zeros(5), torch.tensor([0.0, 1, 0, 1])):
         assert compiled_variance(squares.numpy(), 0.0, kind)[0] == 0
     assert compiled_variance(torch.tensor([0.0, 1, 1]).numpy(), 0.0, kind)[0] > 0

@@ -3,7 +3,7 @@ import torch
 from pimper_torch.ground.kernels.switch import compiled_for
 
 
-def test_kernels_stand_in_only_without_gradients_and_on_the_cpu():
+def test_kernels_are_used_only_without_gradients_and_on_the_cpu():
     values, asked = torch.ones(2), torch.ones(2, requires_grad=True)
     assert compiled_for(values)
     assert not compiled_for(values, asked)

@@ -16,7 +16,7 @@ def random(*shape):
 
 
 @pytest.mark.parametrize(("sides", "dtype"), [(1, torch.float32), (4, torch.float64)])
-def test_solutions_are_scipys(sides, dtype):
+def test_solutions_agree_with_scipy(sides, dtype):
     matrix, rhs = triangles(60, 4.0), random(3600, sides)
     hierarchy = Hierarchy(matrix, dtype)
     options = {"tolerance": 1e-12, "max_iterations": 100}
@@ -32,7 +32,7 @@ def test_solutions_are_scipys(sides, dtype):
     assert_close(kept, exact, rtol=0, atol=0)
 
 
-def test_steps_are_those_of_scipys_and_of_any_number_of_threads():
+def test_steps_agree_with_scipy_and_are_thread_invariant():
     matrix, rhs = triangles(160, 3.0), random(25600, 2)
     hierarchy = Hierarchy(matrix)
 
@@ -59,7 +59,7 @@ def test_steps_are_those_of_scipys_and_of_any_number_of_threads():
 
 
 @pytest.mark.parametrize("wrong", ["nan", "limit"])
-def test_what_does_not_converge_is_said(wrong):
+def test_non_convergence_is_reported(wrong):
     matrix, rhs = triangles(30, 1.0), random(900, 2)
     if wrong == "nan":
         rhs = rhs * torch.nan
