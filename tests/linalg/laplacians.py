@@ -1,12 +1,11 @@
-"""Sparse matrices as the fusion solves them."""
+"""Sparse matrices like those of the fusion."""
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 
 def triangles(side: int, decades: float, seed: int = 0) -> csr_array:
-    """A Laplacian of a triangle subdivided mesh whose weights vary over decades, with holes and
-    anchors."""
+    """Return a Laplacian of a triangle mesh with weights over decades, holes and anchors."""
     generator = np.random.default_rng(seed)
     name = np.arange(side * side).reshape(side, side)
     pairs = (name[:, :-1], name[:, 1:]), (name[:-1], name[1:]), (name[:-1, :-1], name[1:, 1:])

@@ -17,9 +17,9 @@ from tests.linalg.laplacians import triangles
 
 @pytest.mark.parametrize(
     ("side", "decades"),
-    [(60, 10.0), (160, 0.0)],  # the larger one has more rows than a thread is given
+    [(60, 10.0), (160, 0.0)],  # the larger one has more rows than one thread processes
 )
-def test_prolongation_keeps_constants_where_there_is_no_anchor(side, decades):
+def test_prolongation_keeps_constants_without_anchors(side, decades):
     matrix = triangles(side, decades)
     diagonal = np.maximum(matrix.diagonal(), abs(matrix).sum(axis=1) / 2)
     np.testing.assert_allclose(dominant_diagonal(matrix), diagonal, rtol=1e-12)
@@ -33,7 +33,7 @@ def test_prolongation_keeps_constants_where_there_is_no_anchor(side, decades):
 
 
 @pytest.mark.parametrize(("side", "decades"), [(60, 10.0), (300, 0.0)])
-def test_coarse_matrices_are_scipys_products(side, decades):
+def test_coarse_matrices_equal_scipy_products(side, decades):
     matrix = triangles(side, decades)
     spread = prolongation(matrix)
     gather = spread.T.tocsr()
@@ -42,11 +42,11 @@ def test_coarse_matrices_are_scipys_products(side, decades):
     assert abs(found - expected).max() <= 1e-12 * abs(expected).max()
     count = found.nnz
     found.sum_duplicates()
-    assert found.nnz == count  # no column twice in a row
+    assert found.nnz == count  # no duplicate columns in a row
 
 
-def test_rows_of_many_entries_find_room():
-    """Every coarse unknown meets every other: more than the first guess leaves room for."""
+def test_rows_of_many_entries_are_allocated():
+    """Every coarse unknown couples to every other: more than the initial allocation."""
     generator = np.random.default_rng(0)
     matrix = triangles(10, 1.0)
     spread = type(matrix)(generator.random((100, 40)))
@@ -55,7 +55,7 @@ def test_rows_of_many_entries_find_room():
     np.testing.assert_allclose(found.toarray(), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_entries_off_the_diagonal_are_added_up_by_sign():
+def test_off_diagonal_entries_are_summed_by_sign():
     matrix = triangles(20, 2.0)
     matrix.data = matrix.data * np.random.default_rng(1).choice([-1.0, 1.0], len(matrix.data))
     off = matrix.toarray() * (1 - np.eye(400))
@@ -66,7 +66,7 @@ def test_entries_off_the_diagonal_are_added_up_by_sign():
 
 
 @pytest.mark.parametrize("sides", [1, 3])
-def test_a_cycle_in_float32_is_that_in_float64_but_for_rounding(sides):
+def test_a_float32_cycle_equals_a_float64_cycle_up_to_rounding(sides):
     matrix = triangles(160, 3.0)
     side = torch.randn(25600, sides, generator=torch.Generator().manual_seed(1)).double()
     expected = Hierarchy(matrix).cycle(side)

@@ -18,7 +18,7 @@ def random(generator, *shape):
 
 
 def entries(size, generator, decades=6.0, anchor=1e-3):
-    """A path with shortcuts, its weights of every size."""
+    """Return a path graph with shortcuts and weights over many decades."""
     start = torch.cat([torch.arange(size - 1), torch.randint(size, (size,), generator=generator)])
     end = torch.cat([torch.arange(1, size), torch.randint(size, (size,), generator=generator)])
     apart = start != end
@@ -37,7 +37,7 @@ def compressed(rows, cols, values, size):
 
 
 @pytest.mark.parametrize("columns", [(), (0,), (2, 2)])
-def test_solutions_are_those_of_the_factor(columns, generator):
+def test_solutions_equal_those_of_cholesky(columns, generator):
     parts = entries(1500, generator)
     rhs = random(generator, 1500, *columns)
     found = Multigrid(*parts, size=1500).solve(rhs)
@@ -52,13 +52,13 @@ def test_the_cycle_is_symmetric_and_positive(generator):
     inverse = cycle.cycle(torch.eye(500).double())
     assert (inverse - inverse.T).abs().max() <= 1e-9 * inverse.abs().max()
     assert torch.linalg.eigvalsh(inverse).min() > 0
-    # What is left after a cycle of a good one: the spectrum of M A is within (0, 1 + small].
+    # For a good cycle, the spectrum of M A is within (0, 1 + small].
     spectrum = torch.linalg.eigvals(inverse @ torch.from_numpy(matrix.toarray())).real
     assert spectrum.max() < 1.5
     assert spectrum.min() > 0.02
 
 
-def test_unknowns_tied_to_nothing_are_no_coarse_unknowns():
+def test_isolated_unknowns_have_no_coarse_unknown():
     matrix = csr_array(np.diag([1.0, 2.0, 3.0]))
     assert prolongation(matrix).shape == (3, 0)
     tied = np.array([[1.0, -1, 0, 0], [-1, 1, 0, 0], [0, 0, 5, -0.01], [0, 0, -0.01, 5]])
@@ -67,8 +67,8 @@ def test_unknowns_tied_to_nothing_are_no_coarse_unknowns():
     assert (spread[2:] == 0).all()
 
 
-def test_a_light_unknown_follows_a_heavy_one_but_ties_no_two_heavy_ones():
-    """0 = 1 and 3 = 4 are heavy pairs; 2, light, hangs between 1 and 3."""
+def test_weak_couplings_do_not_merge_strongly_coupled_pairs():
+    """0-1 and 3-4 are strongly coupled; 2 is weakly coupled to 1 and 3."""
     matrix = np.zeros((5, 5))
     for one, other, weight in ((0, 1, 1.0), (1, 2, 1e-4), (2, 3, 2e-4), (3, 4, 1.0)):
         matrix[[one, other], [one, other]] += weight
@@ -79,7 +79,7 @@ def test_a_light_unknown_follows_a_heavy_one_but_ties_no_two_heavy_ones():
     assert spread.argmax(axis=1)[0] != spread.argmax(axis=1)[3]
 
 
-def test_creases_where_unknowns_move_less_far_hardly_cost_cycles(generator):
+def test_creases_in_the_near_null_space_cost_few_cycles(generator):
     side = 100
     pixel = torch.arange(side * side).reshape(side, side)
     one = torch.cat([pixel[:, :-1].flatten(), pixel[:-1].flatten()])
@@ -91,10 +91,12 @@ def test_creases_where_unknowns_move_less_far_hardly_cost_cycles(generator):
     rows = torch.cat([one, other, one, other, pixel.flatten()])
     cols = torch.cat([one, other, other, one, pixel.flatten()])
     system = Multigrid(rows, cols, torch.cat([a * a, b * b, -a * b, -a * b, anchor]), side * side)
-    assert system.iterate(random(generator, side * side))[1] <= 40  # 90 if 1 is spread
+    assert (
+        system.iterate(random(generator, side * side))[1] <= 40
+    )  # 90 if the prolongation keeps constants
 
 
-def test_a_matrix_that_smoothing_alone_solves_needs_no_levels(generator):
+def test_a_matrix_solved_by_smoothing_needs_no_levels(generator):
     size = 3000
     rows, cols, values = entries(size, generator, decades=1.0, anchor=0.0)
     loop = torch.arange(size)
@@ -124,7 +126,7 @@ def test_gradients_reach_matrix_and_right_hand_side(generator, monkeypatch):
     assert torch.autograd.gradcheck(solve, [weight, rhs])
 
 
-def test_float32_input_gets_a_float32_answer(generator):
+def test_float32_input_gives_float32_output(generator):
     rows, cols, values = entries(1200, generator, decades=2.0, anchor=1.0)
     rhs = random(generator, 1200).float()
     found = Multigrid(rows, cols, values.float(), size=1200).solve(rhs)
@@ -133,7 +135,7 @@ def test_float32_input_gets_a_float32_answer(generator):
     assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_an_indefinite_matrix_is_refused_with_iterations_and_residual(generator):
+def test_an_indefinite_matrix_is_rejected_with_iterations_and_residual(generator):
     rows, cols, values = entries(900, generator, decades=1.0, anchor=0.0)
     loop = torch.arange(900)
     shifted = torch.cat([values, torch.full((900,), -0.05, dtype=torch.float64)])
@@ -144,7 +146,7 @@ def test_an_indefinite_matrix_is_refused_with_iterations_and_residual(generator)
 
 
 def test_a_smooth_solution_is_accepted_once_its_error_is_below_the_tolerance(generator):
-    """Its right-hand side is small beside its energy norm, and so are residuals that matter not."""
+    """Its right-hand side is small relative to its energy norm, as are negligible residuals."""
     tolerance = 1e-3
     parts = entries(1500, generator, decades=1.0, anchor=1e-6)
     rhs = torch.ones(1500, dtype=torch.float64)
@@ -156,7 +158,7 @@ def test_a_smooth_solution_is_accepted_once_its_error_is_below_the_tolerance(gen
     assert off @ matrix @ off <= tolerance**2 * (expected @ matrix @ expected)
 
 
-def test_the_method_suits_the_matrix(generator, monkeypatch):
+def test_the_solver_is_chosen_by_the_matrix(generator, monkeypatch):
     monkeypatch.setattr("pimper_torch.ground.linalg.systems._CHOLESKY_UNKNOWNS", 100)
     rows, cols, values = entries(200, generator)
     assert isinstance(prepare(rows, cols, values, 200), Multigrid)

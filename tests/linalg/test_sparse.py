@@ -17,7 +17,7 @@ def edges_of_a_path_with_shortcuts(size):
 
 
 def laplacian(weights, start, end, anchor):
-    """Every edge adds four entries, so that diagonal entries repeat."""
+    """Return entries of a Laplacian, four per edge, so that diagonal entries repeat."""
     loop = torch.arange(len(anchor))
     rows = torch.cat([start, end, start, end, loop])
     cols = torch.cat([start, end, end, start, loop])
@@ -64,8 +64,8 @@ def test_gradients_reach_matrix_and_right_hand_side(generator):
     assert torch.autograd.gradgradcheck(solution, inputs)
 
 
-def test_float32_input_gets_a_float32_answer_computed_in_float64():
-    # 1 + 1e-6 and 1 differ by only 8 float32 steps: eliminated in float32, the digits go.
+def test_float32_input_is_solved_in_float64_and_returned_as_float32():
+    # 1 + 1e-6 and 1 differ by only 8 float32 steps: elimination in float32 loses the digits.
     delta = 2.0**-20
     values = torch.tensor([1.0, 1.0, 1.0, 1.0 + delta])
     rows, cols = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 0, 1])
@@ -74,7 +74,7 @@ def test_float32_input_gets_a_float32_answer_computed_in_float64():
     assert_close(found, torch.tensor([-1.0, 1.0]), rtol=1e-6, atol=0)
 
 
-def test_scaling_an_unknowns_unit_does_not_make_the_system_singular(generator):
+def test_badly_scaled_unknowns_do_not_make_the_system_singular(generator):
     start, end, weights, anchor = small_system(generator)
     rows, cols, values = laplacian(weights, start, end, anchor)
     unit = 10 ** torch.linspace(-9, 9, 12, dtype=torch.float64)
@@ -83,7 +83,7 @@ def test_scaling_an_unknowns_unit_does_not_make_the_system_singular(generator):
     assert_close(found * unit, solve(rows, cols, values, rhs))
 
 
-def test_a_free_constant_is_refused_even_when_the_right_hand_side_hides_it(generator):
+def test_a_free_constant_is_rejected_even_if_the_right_hand_side_hides_it(generator):
     start, end, weights, anchor = small_system(generator)
     rows, cols, values = laplacian(weights, start, end, 0 * anchor)
     rhs = torch.zeros(12, dtype=torch.float64)
@@ -96,7 +96,7 @@ SQUARE = ([0, 0, 1, 1], [0, 1, 0, 1])
 
 
 @pytest.mark.parametrize(
-    ("rows", "cols", "values", "rhs", "told"),
+    ("rows", "cols", "values", "rhs", "message"),
     [
         (*SQUARE, [1.0, 2.0, 2.0, 1.0], [1.0, 1.0], "not positive definite"),
         ([0, 2], [0, 2], [1.0, 1.0], [1.0, 1.0, 1.0], "unknown 1"),
@@ -105,12 +105,12 @@ SQUARE = ([0, 0, 1, 1], [0, 1, 0, 1])
         ([0, 1], [0, 1], [1.0, 1.0], [1.0, torch.nan], "finite"),
     ],
 )
-def test_what_has_no_one_solution_is_refused(rows, cols, values, rhs, told):
-    with pytest.raises(SingularSystemError, match=told):
+def test_systems_without_a_unique_solution_are_rejected(rows, cols, values, rhs, message):
+    with pytest.raises(SingularSystemError, match=message):
         solve(*map(torch.tensor, (rows, cols, values, rhs)))
 
 
-def test_nothing_leaks_at_exit_though_a_result_with_gradients_is_alive():
+def test_exit_is_clean_with_a_live_differentiable_result():
     program = (
         "import torch; from pimper_torch.ground.linalg.sparse import SparseCholesky; "
         "index = torch.arange(2); entries = torch.tensor([2.0, 4.0], requires_grad=True); "
