@@ -1,4 +1,4 @@
-"""Every convention of the package, held against somebody else's code or a hand-made case."""
+"""Every convention of the package, against independent code or a hand-computed case."""
 
 import pycolmap
 import torch
@@ -24,7 +24,7 @@ def noise_image(seed):
 
 
 def ramp_image(width, height):
-    # The value of every pixel is where its centre lies: linear, so resampling is exact.
+    # The value of every pixel is the position of its centre: linear, so resampling is exact.
     return pixel_centers(width, height, like=torch.zeros(1).double()).movedim(-1, 0)[None]
 
 
@@ -37,7 +37,7 @@ def test_the_first_pixel_center_is_half_a_pixel_from_both_borders():
     assert centers[-1, -1].tolist() == [WIDTH - 0.5, HEIGHT - 0.5]
 
 
-def test_grid_sample_at_pixel_centers_gives_the_image_back():
+def test_grid_sample_at_pixel_centers_reproduces_the_image():
     image = noise_image(101)
     grid = grid_from_pixels(pixel_centers(WIDTH, HEIGHT, like=image), WIDTH, HEIGHT)
     found = grid_sample(image, grid[None], mode="bilinear", align_corners=False)
@@ -50,7 +50,7 @@ def test_the_corners_of_the_image_are_the_ends_of_the_grid():
     assert_close(grid, torch.tensor([[-1.0, -1.0], [1.0, 1.0]], dtype=torch.float64))
 
 
-def test_an_index_points_at_the_center_of_its_pixel():
+def test_an_index_is_the_center_of_its_pixel():
     image = noise_image(103)
     index = torch.tensor([4.0, 1.0], dtype=torch.float64)
     pixel = pixels_from_indices(index)
@@ -66,12 +66,12 @@ def test_resized_images_keep_corners_and_so_intrinsics_only_scale():
     large, _ = project(points, identity, K)
     small, _ = project(points, identity, scale_intrinsics(K, 0.5, 0.25))
     assert_close(small, large * large.new_tensor([0.5, 0.25]))
-    # Area averaging puts the mean of two centres, 0.5 and 1.5, at 1 = 2 * 0.5.
+    # Area averaging maps the mean of two centres, 0.5 and 1.5, to 1 = 2 * 0.5.
     halved = torch.nn.functional.avg_pool2d(ramp_image(8, 6), 2)
     assert_close(halved, 2 * ramp_image(4, 3))
 
 
-def test_a_cut_moves_pixels_by_its_corner():
+def test_cropping_shifts_pixels_by_the_crop_corner():
     K = torch.tensor([[100.0, 0, 32], [0, 110, 24], [0, 0, 1]], dtype=torch.float64)
     points = torch.tensor([[0.1, 0.2, 2.0], [-0.3, 0.1, 3.0]], dtype=torch.float64)
     identity = torch.eye(4, dtype=torch.float64)
@@ -80,7 +80,7 @@ def test_a_cut_moves_pixels_by_its_corner():
     assert_close(cut, whole - whole.new_tensor([5, 7]))
 
 
-def test_the_pinhole_is_colmaps():
+def test_the_pinhole_agrees_with_colmap():
     camera = pycolmap.Camera(
         model="PINHOLE", width=640, height=480, params=[500.0, 510.0, 321.5, 238.25]
     )

@@ -15,7 +15,7 @@ def random(generator, *shape):
 
 
 def square(count, generator, jitter=0.25):
-    """A triangulated unit square whose inner vertices are moved about."""
+    """Return a triangulated unit square with jittered inner vertices."""
     side = torch.linspace(0, 1, count + 1, dtype=torch.float64)
     places = torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1).reshape(-1, 2)
     inner = ((places > 0) & (places < 1)).all(dim=1, keepdim=True)
@@ -68,7 +68,7 @@ def test_entries_are_half_the_cotangents_of_the_angles_opposite_to_an_edge():
     assert_close(matrix.sum(dim=1), torch.zeros(3, dtype=torch.float64), atol=1e-14, rtol=0)
 
 
-def test_needles_are_taken_for_less_sharp_ones():
+def test_cotangents_of_needles_are_bounded():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.5, 1e-9, 0]], dtype=torch.float64)
     mesh = elements(vertices, torch.tensor([[0, 1, 2]]))
     _, _, sharp = cotangent_laplacian(mesh, torch.ones(1).double())
@@ -77,7 +77,7 @@ def test_needles_are_taken_for_less_sharp_ones():
     assert blunt.abs().max() <= 0.25e4 * (1 + 1e-12)
 
 
-def test_the_masses_of_all_vertices_are_that_of_the_surface(surface):
+def test_vertex_masses_sum_to_the_mass_of_the_surface(surface):
     mesh = elements(*surface)
     density = torch.linspace(1, 2, len(mesh.faces), dtype=torch.float64)
     assert_close(lumped_mass(mesh, density).sum(), (density * mesh.area).sum())
@@ -88,7 +88,7 @@ def test_the_masses_of_all_vertices_are_that_of_the_surface(surface):
 
 @pytest.mark.parametrize("kind", [SparseCholesky, Multigrid])
 def test_the_error_of_a_poisson_problem_falls_as_the_spacing_squared(kind, generator):
-    """Harmonic heights from their border, over triangles without any order."""
+    """Harmonic heights from their boundary values, on irregular triangles."""
     errors = []
     for count in (12, 24, 48):
         vertices, faces = square(count, generator)
@@ -108,7 +108,7 @@ def test_the_error_of_a_poisson_problem_falls_as_the_spacing_squared(kind, gener
         )
         found = system.solve(anchor * wanted)
         errors.append(float((found - wanted).abs().max()))
-    assert errors[0] / errors[2] > 8  # 16 for nested meshes; these are drawn anew
+    assert errors[0] / errors[2] > 8  # 16 for nested meshes; these are drawn independently
 
 
 def test_gradients_reach_weights_and_vertices(generator):

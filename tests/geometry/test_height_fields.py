@@ -37,7 +37,7 @@ def test_lookup_puts_columns_along_x_and_honours_each_patch_origin():
     assert_close(sample_raster(values, xy, origin, spacing).flatten(), values[0, 0, 1, 2].repeat(2))
 
 
-def test_lookup_leaves_invalid_samples_out():
+def test_lookup_ignores_invalid_samples():
     values = torch.tensor([[[[1.0, torch.nan], [1.0, 3.0]]]], dtype=torch.float64)
     valid = values[:, 0].isfinite()
     origin, spacing = torch.zeros(1, 2).double(), torch.ones(1).double()
@@ -64,7 +64,7 @@ def test_rays_meet_a_tilted_plane_exactly_after_one_step(generator):
 def test_rays_meet_a_sphere_with_an_error_of_second_order_in_the_spacing(generator):
     radius = 2.0
     starts, along = oblique_rays(200, generator)
-    along = -along  # the line counts, not its sense
+    along = -along  # only the line matters, not its sense
     worst = []
     for step in (0.1, 0.05):
         x, y, origin, spacing = raster(step)
@@ -73,7 +73,7 @@ def test_rays_meet_a_sphere_with_an_error_of_second_order_in_the_spacing(generat
         points, hit = intersect_height_field(depth, valid, origin, spacing, starts, along, steps=4)
         assert hit.sum() >= 150
         center = torch.tensor([0.0, 0.0, radius], dtype=torch.float64)
-        # Closed form: |o + t d - c| = R, the root nearer to the plane z = 0.
+        # Closed form: |o + t d - c| = R, the root closer to the plane z = 0.
         d = normalize(along, dim=-1)
         oc = starts - center
         b, c = (oc * d).sum(-1), (oc * oc).sum(-1) - radius**2
@@ -88,7 +88,7 @@ def test_rays_meet_a_sphere_with_an_error_of_second_order_in_the_spacing(generat
     assert worst[1] < 0.3 * worst[0]
 
 
-def test_a_ray_hits_only_where_all_samples_it_rests_on_are_valid():
+def test_a_ray_hits_only_if_all_interpolated_samples_are_valid():
     x, _, origin, spacing = raster(0.5)
     valid = x < 0.25
     depth = torch.where(valid, 0.0, torch.nan)
@@ -110,7 +110,7 @@ def test_a_ray_along_the_height_field_misses():
     assert points.isfinite().all()
 
 
-def test_intersections_follow_the_height_field_by_the_implicit_function(generator):
+def test_intersections_have_implicit_gradients(generator):
     x, y, origin, spacing = raster(0.5)
     depth = (0.1 * x * x + 0.05 * y * x).requires_grad_()
     starts, along = oblique_rays(6, generator, spread=0.3)

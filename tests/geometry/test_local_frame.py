@@ -20,7 +20,7 @@ def test_a_far_scene_gets_an_origin_among_its_points(offset):
     poses, points = cameras_and_points(offset)
     found = local_origin(poses, points)
     assert max(abs(one - other) for one, other in zip(found, offset, strict=True)) < 1.5
-    assert found == tuple(map(round, found))  # whole numbers: cameras are 4 units away
+    assert found == tuple(map(round, found))  # integers: cameras are 4 units away
     near = transform(to_local(poses, found), points - points.new_tensor(found))
     assert_close(near, transform(poses, points), rtol=0, atol=1e-7)  # 3e7 in double precision
 
@@ -30,7 +30,7 @@ def test_a_scene_near_its_origin_keeps_it(offset):
     assert local_origin(*cameras_and_points(offset)) == NO_OFFSET
 
 
-def test_points_far_out_do_not_move_the_origin_and_no_points_are_needed():
+def test_the_origin_is_robust_to_outliers_and_needs_no_points():
     poses, points = cameras_and_points(UTM)
     plain = local_origin(poses, points)
     points[:5] = 1e9
@@ -41,7 +41,7 @@ def test_points_far_out_do_not_move_the_origin_and_no_points_are_needed():
     assert max(abs(one - other) for one, other in zip(alone, UTM, strict=True)) < 4
 
 
-def test_single_precision_does_not_reach_the_cameras_places():
+def test_camera_positions_keep_double_precision():
     cameras = all_round()
     placed = from_local(cameras.cam_from_world.float(), UTM)
     centers = cameras.replace(cam_from_world=placed).centers_world

@@ -15,10 +15,10 @@ def square():
 
 
 def brute_force(points, mesh):
-    """Every point against every triangle, by another way to find the nearest place."""
+    """Compare every point with every triangle, by a different algorithm."""
     a, b, c = mesh.vertices_world[mesh.faces].unbind(dim=1)
     best = torch.full((len(points),), torch.inf, dtype=torch.float64)
-    # A corner is a weight of one; edges and inside are quadratic problems, solved one by one.
+    # A corner has weight one; edges and the interior are quadratic problems.
     for first, second, third in zip(a, b, c, strict=True):
         for weights in _candidates(points, first, second, third):
             place = weights @ torch.stack([first, second, third])
@@ -42,7 +42,7 @@ def _candidates(points, a, b, c):
 
 
 def mixed_mesh(generator):
-    """A hundred tiny triangles, a huge one, a needle, and one that is a point."""
+    """Return a hundred tiny triangles, a huge one, a needle, and one degenerate to a point."""
     centre = torch.rand(100, 1, 3, generator=generator, dtype=torch.float64)
     tiny = centre + 0.01 * torch.randn(100, 3, 3, generator=generator, dtype=torch.float64)
     huge = torch.tensor([[[-30.0, -30, -1], [40, -20, -1.5], [0, 50, -2]]], dtype=torch.float64)
@@ -59,13 +59,13 @@ def test_distances_to_tiny_and_huge_triangles_are_those_of_brute_force(generator
     points = 0.5 + spread * torch.randn(120, 3, generator=generator, dtype=torch.float64)
     found = NearestSurface(mesh).query(points)
     assert_close(found.distance, brute_force(points, mesh), rtol=1e-9, atol=1e-9)
-    # The place and the face belong together, so not only the length is right.
+    # Point and face are consistent, not only the distance.
     corners = mesh.vertices_world[mesh.faces[found.face]]
     assert_close(closest_on_triangles(points, corners), found.points)
     assert_close((points - found.points).norm(dim=1), found.distance)
 
 
-def test_points_on_the_surface_far_from_the_origin_are_found_on_it():
+def test_points_on_a_surface_far_from_the_origin_have_distance_zero():
     vertices, faces = icosphere(3)
     far = Mesh(vertices_world=vertices + 1e6, faces=faces)
     found = NearestSurface(far).query(far.vertices_world)
@@ -76,20 +76,20 @@ def test_no_points_have_no_distances(square):
     assert len(NearestSurface(square).query(torch.zeros(0, 3)).distance) == 0
 
 
-def test_without_faces_the_points_themselves_are_the_surface(square):
+def test_without_faces_the_vertices_are_the_surface(square):
     corners = square.replace(faces=torch.zeros(0, 3, dtype=torch.long))
     found = NearestSurface(corners).query(torch.tensor([[0.5, 0.4, 0.0]]).double())
     assert_close(found.distance, torch.tensor([0.41]).double().sqrt())
     assert found.face.tolist() in ([0], [1])
 
 
-def test_a_vertex_without_a_face_is_no_part_of_the_surface(square):
+def test_unused_vertices_are_ignored(square):
     stray = torch.tensor([[5.0, 5, 5]], dtype=torch.float64)
     mesh = square.replace(vertices_world=torch.cat([square.vertices_world, stray]))
     assert float(NearestSurface(mesh).query(stray).distance) > 5
 
 
-def test_an_empty_mesh_is_refused():
+def test_an_empty_mesh_is_rejected():
     empty = Mesh(vertices_world=torch.zeros(0, 3), faces=torch.zeros(0, 3, dtype=torch.long))
     with pytest.raises(InputError, match="no vertices"):
         NearestSurface(empty)

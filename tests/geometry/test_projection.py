@@ -18,7 +18,7 @@ def points():
     return torch.rand(40, 3, generator=generator, dtype=torch.float64) - 0.5
 
 
-def test_a_ray_at_its_depth_comes_back_to_the_point(cameras, points):
+def test_a_ray_at_its_depth_is_the_point(cameras, points):
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
     assert pixels.shape == (3, 40, 2)
     rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)
@@ -35,7 +35,7 @@ def test_skewed_intrinsics_keep_the_round_trip(points):
     assert_close(center + depth[:, None] * rays_through(pixels, cam_from_world, K), points)
 
 
-def test_points_behind_and_beside_the_camera_give_finite_values_and_gradients():
+def test_points_behind_the_camera_give_finite_values_and_gradients():
     K = torch.tensor([[90.0, 0, 30], [0, 85, 20], [0, 0, 1]], dtype=torch.float64)
     points = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, -2.0], [0.0, 0.0, 0.0]]).double()
     points.requires_grad_()
@@ -46,9 +46,9 @@ def test_points_behind_and_beside_the_camera_give_finite_values_and_gradients():
     assert points.grad.isfinite().all()
 
 
-def test_triangulation_angle_is_the_widest_between_rays_that_saw_the_point(monkeypatch):
+def test_triangulation_angle_is_the_largest_between_observing_rays(monkeypatch):
     generator = torch.Generator().manual_seed(122)
-    monkeypatch.setattr(projection, "_POINTS", 3)  # in several parts
+    monkeypatch.setattr(projection, "_POINTS", 3)  # in several chunks
     centers = torch.randn(5, 3, generator=generator, dtype=torch.float64)
     points = torch.randn(7, 3, generator=generator, dtype=torch.float64)
     observed = torch.rand(7, 5, generator=generator) < 0.6

@@ -23,7 +23,7 @@ def ball(level: int = 5) -> Mesh:
 
 
 @pytest.mark.parametrize("max_faces", [200, 5000])
-def test_a_ball_has_no_more_faces_than_asked_for_and_keeps_what_it_knows(max_faces):
+def test_reduction_meets_max_faces_and_keeps_vertex_attributes(max_faces):
     few = reduced(ball(), max_faces)
     assert 0.9 * max_faces <= len(few.faces) <= max_faces
     assert_close(
@@ -38,7 +38,7 @@ def test_a_ball_has_no_more_faces_than_asked_for_and_keeps_what_it_knows(max_fac
     assert not bool(boundary_vertices(few.faces, len(few.vertices_world)).any())
 
 
-def test_far_from_the_origin_a_ball_keeps_its_shape():
+def test_a_ball_far_from_the_origin_keeps_its_shape():
     mesh = ball()
     offset = torch.tensor([4.5e5, 5.4e6, 300.0]).double()
     far = mesh.replace(vertices_world=mesh.vertices_world.double() + offset)
@@ -47,12 +47,12 @@ def test_far_from_the_origin_a_ball_keeps_its_shape():
     assert_close(radius, torch.ones_like(radius), atol=0.03, rtol=0)
 
 
-def test_no_two_faces_run_along_an_edge_the_same_way():
+def test_reduced_faces_are_consistently_oriented():
     few = reduced(ball(), 60)
     assert len(torch.unique(half_edges(few.faces), dim=0)) == 3 * len(few.faces)
 
 
-def test_a_mesh_that_is_small_enough_comes_back_and_fewer_than_four_faces_are_refused():
+def test_a_small_mesh_is_returned_and_fewer_than_four_faces_rejected():
     mesh = ball(1)
     assert reduced(mesh, 80) is mesh
     with pytest.raises(ConfigError, match="faces is 3; needed: 4 at least"):

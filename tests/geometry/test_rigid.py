@@ -12,7 +12,7 @@ def random_rigid(generator, *batch):
     return rigid(rotation.reshape(*batch, 3, 3), translation)
 
 
-def test_points_are_transferred_as_scipy_carries_them(generator):
+def test_transformed_points_agree_with_scipy(generator):
     target_from_source = random_rigid(generator, 1)[0]
     points = torch.randn(9, 3, generator=generator, dtype=torch.float64)
     scipy_transform = RigidTransform.from_matrix(target_from_source.numpy())

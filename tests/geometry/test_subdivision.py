@@ -9,7 +9,7 @@ from pimper_torch.ground.geometry.surfaces import face_normals
 
 
 def ragged_fan(seed=41):
-    """An open disc of triangles whose edges differ twentyfold in length."""
+    """Return an open fan of triangles with edge lengths that differ twentyfold."""
     generator = torch.Generator().manual_seed(seed)
     count = 9
     angle = torch.arange(count, dtype=torch.float64) * (2 * torch.pi / count)
@@ -26,7 +26,7 @@ def euler(num_vertices, faces):
 
 
 def all_spacings(facets, length):
-    """The same of all facets, or by turns."""
+    """Return equal or alternating spacings of facets."""
     lengths = torch.as_tensor(length, dtype=torch.float64).flatten()
     return lengths.repeat(len(facets))[: len(facets)]
 
@@ -57,7 +57,7 @@ def test_the_subdivided_mesh_has_the_topology_of_the_coarse_mesh(scene):
     assert counts.max() <= 2
     if edge_counts(facets)[1].min() == 2:
         assert counts.min() == 2
-    else:  # the rim is cut, not moved: its length is that of the coarse rim
+    else:  # the boundary is divided, not moved: its length is that of the coarse one
 
         def rim(points, faces):
             ends, number = edge_counts(faces)
@@ -67,7 +67,7 @@ def test_the_subdivided_mesh_has_the_topology_of_the_coarse_mesh(scene):
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES.keys())
-def test_no_face_is_turned_and_areas_add_up(scene):
+def test_no_face_is_flipped_and_areas_add_up(scene):
     vertices, facets, length = scene
     subdivision = subdivide(vertices, facets, all_spacings(facets, length))
     normals, whole = (
@@ -89,13 +89,13 @@ def test_edges_are_about_one_spacing_long_where_facets_are_well_shaped():
     assert float(lengths.max()) < 2 * 0.05
 
 
-def test_a_narrow_facet_has_no_more_points_than_its_area_asks_for():
+def test_the_number_of_points_of_a_narrow_facet_follows_its_area():
     spacing = 0.005
     for height in (1.0, 0.3, 0.1, 0.03):
         corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0.4, height, 0]], dtype=torch.float64)
         subdivision = subdivide(corners, torch.tensor([[0, 1, 2]]), corners.new_tensor([spacing]))
         asked = height / 2 / spacing**2
-        assert 0.9 * asked < len(subdivision.points) < 2.3 * asked  # 2, and the rim
+        assert 0.9 * asked < len(subdivision.points) < 2.3 * asked  # 2, plus the boundary
 
 
 def test_an_edge_follows_the_finer_of_its_facets():
@@ -115,13 +115,13 @@ def test_an_edge_follows_the_finer_of_its_facets():
     assert within.sum() == 1  # the coarser facet is fine along that edge alone
 
 
-def test_every_vertex_lies_where_its_facet_and_coordinates_say():
+def test_every_vertex_is_at_its_barycentric_coordinates():
     vertices, facets = ragged_fan()
     subdivision = subdivide(vertices, facets, all_spacings(facets, 0.05))
     assert_close(subdivision.interpolate(vertices, facets), subdivision.points)
     assert_close(subdivision.barycentric.sum(dim=1), torch.ones(len(subdivision.points)).double())
     assert (subdivision.barycentric >= 0).all()
-    for corner in range(3):  # a face's corners lie in the closed triangle of its facet
+    for corner in range(3):  # corners of a face are in the closed triangle of its facet
         points = subdivision.points[subdivision.faces[:, corner]]
         a, b, c = vertices[facets[subdivision.face_facet]].unbind(dim=1)
         normal = torch.linalg.cross(b - a, c - a)
@@ -131,7 +131,7 @@ def test_every_vertex_lies_where_its_facet_and_coordinates_say():
             assert side.min() > -1e-12
 
 
-def test_vertices_the_coarse_mesh_does_not_use_are_left_out():
+def test_unused_vertices_of_the_coarse_mesh_are_dropped():
     vertices, facets = icosphere(0)
     more = torch.cat([torch.full((2, 3), 9.0, dtype=torch.float64), vertices])
     subdivision = subdivide(more, facets + 2, all_spacings(facets, 0.3))
@@ -139,7 +139,7 @@ def test_vertices_the_coarse_mesh_does_not_use_are_left_out():
     assert isinstance(subdivision, Subdivision)
 
 
-def test_what_is_smooth_is_transferred_from_a_coarser_subdivided_mesh_over_the_same_facets():
+def test_smooth_values_are_transferred_from_a_coarser_subdivision():
     fine, rough = map(subdivided_square, (0.02, 0.04))
 
     def wave(subdivision):

@@ -53,7 +53,7 @@ def test_a_plane_with_few_of_the_points_supports_nothing(generator):
         assert (found is not None) is is_found
 
 
-def test_cameras_look_where_they_are_aimed():
+def test_look_at_aims_cameras_at_the_target():
     found = fixation(cameras().cam_from_world)
     assert_close(found.fixation_world, torch.tensor([0.1, 0.4, -0.2]).double(), atol=0.01, rtol=0)
     assert_close(found.distance, torch.tensor(3.0).double(), atol=0.01, rtol=0)

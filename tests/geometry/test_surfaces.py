@@ -13,7 +13,7 @@ from pimper_torch.ground.geometry.surfaces import (
     vertex_normals,
 )
 
-# Two triangles that share the edge 0-2, and a third on its own.
+# Two triangles that share the edge 0-2, and a separate third one.
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
 
 
@@ -21,7 +21,7 @@ def as_tensors(mesh):
     return torch.tensor(mesh.vertices, dtype=torch.float64), torch.tensor(mesh.faces)
 
 
-def test_slopes_and_normals_undo_each_other(generator):
+def test_slopes_and_normals_are_inverse(generator):
     slopes = 3 * torch.randn(50, 2, generator=generator, dtype=torch.float64)
     normals = normals_from_slopes(slopes)
     assert (normals[:, 2] < 0).all()
@@ -31,7 +31,7 @@ def test_slopes_and_normals_undo_each_other(generator):
 
 def test_slopes_are_the_derivatives_of_the_depth_of_a_sphere(generator):
     xy = (torch.rand(50, 2, generator=generator, dtype=torch.float64) - 0.5).requires_grad_()
-    depth = -(1 - xy.square().sum(dim=1)).sqrt()  # the near half: z grows away from the viewer
+    depth = -(1 - xy.square().sum(dim=1)).sqrt()  # the near half: z increases away from the viewer
     (slopes,) = torch.autograd.grad(depth.sum(), xy)
     normals = torch.cat([xy, depth[:, None]], dim=1).detach()  # outward, so n_z < 0
     assert_close(slopes_from_normals(normals), slopes)
@@ -73,7 +73,7 @@ def test_normals_do_not_depend_on_the_unit_of_length(unit):
     assert torch.equal(unit_face_normals(flat, torch.tensor([[0, 1, 2]])), torch.zeros(1, 3))
 
 
-def test_barycentric_coordinates_rebuild_the_point_and_tell_the_side(generator):
+def test_barycentric_coordinates_rebuild_the_point_and_are_signed(generator):
     corners = torch.randn(20, 3, 2, generator=generator, dtype=torch.float64)
     points = torch.randn(20, 2, generator=generator, dtype=torch.float64)
     found = barycentric_2d(points, corners)

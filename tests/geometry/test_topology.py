@@ -14,7 +14,7 @@ from pimper_torch.ground.geometry.topology import (
     vertex_fans,
 )
 
-# Two triangles that share the edge 0-2, and a third on its own.
+# Two triangles that share the edge 0-2, and a separate third one.
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
 
 
@@ -35,7 +35,7 @@ def test_neighbours_agree_with_trimesh_on_a_closed_mesh():
     assert found == expected
 
 
-def test_every_edge_is_listed_once_and_lies_opposite_to_its_corners():
+def test_every_edge_is_listed_once_and_is_opposite_to_its_corners():
     mesh = trimesh.creation.icosphere(subdivisions=2)
     faces = torch.from_numpy(mesh.faces)
     edges, opposite = face_edges(faces)
@@ -45,8 +45,8 @@ def test_every_edge_is_listed_once_and_lies_opposite_to_its_corners():
     assert (everything.sort().values == faces.sort().values[:, None]).all()
 
 
-def test_the_boundary_is_where_an_edge_has_not_two_faces():
-    hexagon = torch.tensor([[0, k, k % 6 + 1] for k in range(1, 7)])  # a fan round vertex 0
+def test_boundary_edges_do_not_have_two_faces():
+    hexagon = torch.tensor([[0, k, k % 6 + 1] for k in range(1, 7)])  # a fan around vertex 0
     marked = boundary_vertices(hexagon, 8)
     assert marked.tolist() == [False, *[True] * 6, False]
     closed = torch.tensor(trimesh.creation.icosphere(subdivisions=1).faces)
@@ -77,7 +77,7 @@ def test_a_vertex_between_two_fans_becomes_two():
     assert not set(renamed[:2].flatten().tolist()) & set(renamed[2:].flatten().tolist())
 
 
-def test_a_closed_fan_keeps_its_centre_and_unused_vertices_go():
+def test_a_closed_fan_keeps_its_centre_and_unused_vertices_are_dropped():
     faces = torch.tensor([[9, 1, 2], [9, 2, 3], [9, 3, 1]])
     source, renamed = vertex_fans(faces)
     assert source.tolist() == [1, 2, 3, 9]
@@ -91,7 +91,7 @@ def test_three_faces_at_an_edge_are_separated():
     assert torch.equal(source[renamed], faces)
 
 
-def test_vertices_are_grouped_through_their_kind_only():
+def test_vertices_are_connected_through_selected_ones_only():
     faces = torch.tensor([[0, 1, 2], [1, 3, 2], [3, 4, 5]])
     among = torch.tensor([True, False, False, True, True, False])
     label = vertex_components(faces, among).tolist()
@@ -99,7 +99,7 @@ def test_vertices_are_grouped_through_their_kind_only():
     assert len(set(label)) == 5
 
 
-def test_the_border_is_followed_loop_by_loop():
+def test_boundary_loops_are_traced():
     tube = torch.tensor([[a, b, 3 + a] for a, b in ((0, 1), (1, 2), (2, 0))])
     tube = torch.cat([tube, torch.tensor([[1, 4, 3], [2, 5, 4], [0, 3, 5]])])
     ends, loop = boundary_loops(tube)
@@ -110,7 +110,7 @@ def test_the_border_is_followed_loop_by_loop():
     assert len(boundary_loops(capped)[0]) == 0
 
 
-def test_an_edge_of_three_faces_is_border_of_each():
+def test_an_edge_of_three_faces_is_a_boundary_of_each():
     ends, loop = boundary_loops(torch.tensor([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
     assert len(ends) == 9
     assert torch.bincount(loop).tolist() == [3, 3, 3]

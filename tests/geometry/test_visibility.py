@@ -9,7 +9,7 @@ from pimper_torch.records import Mesh
 
 
 def brute_force(origin, directions, vertices, faces):
-    """Moller and Trumbore for all pairs of rays and faces."""
+    """Intersect all pairs of rays and faces by Möller-Trumbore."""
     a, b, c = vertices[faces].unbind(dim=1)
     ab, ac = b - a, c - a
     across = torch.linalg.cross(directions[:, None], ac[None].expand(len(directions), -1, -1))
@@ -52,7 +52,7 @@ def test_points_behind_the_ball_are_hidden_and_the_surface_does_not_hide_itself(
     assert caster.occluded(points, center, per_point).tolist() == [False] * 4
 
 
-def test_a_view_of_a_ball_shows_its_depth_along_the_camera_axis():
+def test_depth_of_a_ball_is_along_the_camera_axis():
     cameras = arc_cameras(2, width=24, height=18, focal_px=40.0, distance=4.0)
     vertices, faces = icosphere(5)
     hits = cast_view(Mesh(vertices_world=vertices, faces=faces), cameras, 1)
@@ -62,7 +62,7 @@ def test_a_view_of_a_ball_shows_its_depth_along_the_camera_axis():
     hit = hits.face >= 0
     assert 0.2 < hit.float().mean() < 0.9
     assert_close(hits.distance[hit], depth[hit], atol=1e-5, rtol=0)
-    # The ray through the centre of the image goes to the ball's centre.
+    # The ray through the image centre passes through the centre of the ball.
     around = hits.distance[8:10, 11:13]
     assert_close(around, torch.full_like(around, 3.0), atol=2e-3, rtol=0)
     origin = cameras.centers_world[1].expand(1, 3)
@@ -82,7 +82,7 @@ def test_dtype_and_shape_follow_the_rays():
     assert one.face.shape == ()
 
 
-def test_a_ray_is_blocked_where_its_first_hit_is_within_reach(generator):
+def test_a_ray_is_blocked_if_its_first_hit_is_within_reach(generator):
     vertices, faces = icosphere(2)
     caster = RayCaster(vertices, faces)
     origins = 0.7 * torch.randn(500, 3, generator=generator, dtype=torch.float64)
@@ -95,7 +95,7 @@ def test_a_ray_is_blocked_where_its_first_hit_is_within_reach(generator):
     assert (found == (first < reach))[(first - reach).abs() > 1e-5].all()
 
 
-def test_rays_meet_a_mesh_far_from_the_origin_as_one_near_it(generator):
+def test_hits_of_a_mesh_do_not_depend_on_its_distance_to_the_origin(generator):
     vertices, faces = icosphere(3)
     directions = torch.randn(500, 3, generator=generator, dtype=torch.float64)
     starts = 3 * torch.randn(500, 3, generator=generator, dtype=torch.float64)
@@ -104,7 +104,7 @@ def test_rays_meet_a_mesh_far_from_the_origin_as_one_near_it(generator):
     shift = torch.tensor([448231.0, 5411923.0, 312.0], dtype=torch.float64)
     far = RayCaster(vertices + shift, faces)
     one, other = near.cast(starts, directions), far.cast(starts + shift, directions)
-    assert float((one.face == other.face).double().mean()) > 0.99  # but for rays along edges
+    assert float((one.face == other.face).double().mean()) > 0.99  # except rays along edges
     assert_close(one.distance, other.distance, rtol=0, atol=1e-5)
     outside = starts.norm(dim=1) > 1.1
     args = directions, torch.full((500,), torch.inf, dtype=torch.float64)

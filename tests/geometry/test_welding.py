@@ -7,7 +7,7 @@ from pimper_torch.ground.geometry.welding import TOLERANCE, welded
 
 
 def soup(vertices, faces):
-    """Give every face corners of its own, as STL has them."""
+    """Give every face its own vertices, as in STL."""
     return vertices[faces].reshape(-1, 3), torch.arange(3 * len(faces)).reshape(-1, 3)
 
 
@@ -16,7 +16,7 @@ def triangles(vertices, faces):
 
 
 @pytest.mark.parametrize("offset", [0.0, 5e6])
-def test_a_soup_of_triangles_becomes_the_surface_that_it_was(offset):
+def test_welding_a_triangle_soup_restores_the_surface(offset):
     vertices, faces = icosphere(3)
     vertices = vertices + offset
     found, joined = welded(*soup(vertices, faces))
@@ -27,7 +27,7 @@ def test_a_soup_of_triangles_becomes_the_surface_that_it_was(offset):
 
 @pytest.mark.parametrize(("gap", "seams"), [(0.4 * TOLERANCE, False), (10 * TOLERANCE, True)])
 def test_rounding_is_welded_and_narrow_gaps_are_not(gap, seams):
-    """The seam runs through cells of any grid: wherever it cuts, both of its sides are one."""
+    """The seam crosses cells of any grid: its sides are merged in every position."""
     vertices, faces = icosphere(3)
     vertices = vertices.float().double()
     apart, single = soup(vertices, faces)
@@ -39,14 +39,14 @@ def test_rounding_is_welded_and_narrow_gaps_are_not(gap, seams):
     assert (len(boundary_loops(joined)[0]) > 0) == seams
 
 
-def test_a_mesh_with_nothing_to_merge_stays_as_it_is_but_for_loose_vertices():
+def test_a_welded_mesh_only_loses_unused_vertices():
     vertices, faces = icosphere(2)
     found, joined = welded(torch.cat([vertices, vertices[:1] + 9]), faces)
     assert torch.equal(found, vertices)
     assert torch.equal(joined, faces)
 
 
-def test_surfaces_that_touch_in_a_vertex_share_it():
+def test_surfaces_touching_in_a_vertex_share_it():
     vertices, faces = icosphere(1)
     top = vertices[:, 2].argmax()
     other = -vertices + 2 * vertices[top]
@@ -54,7 +54,7 @@ def test_surfaces_that_touch_in_a_vertex_share_it():
     assert len(found) == 2 * len(vertices) - 1
 
 
-def test_a_mesh_that_is_a_point_has_one_vertex():
+def test_a_mesh_collapsed_to_a_point_has_one_vertex():
     found, joined = welded(torch.ones(6, 3), torch.arange(6).reshape(2, 3))
     assert len(found) == 1
     assert (joined == 0).all()
