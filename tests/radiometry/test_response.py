@@ -24,11 +24,11 @@ RESPONSES = {
 
 
 @pytest.mark.parametrize("name", RESPONSES)
-def test_encoding_undoes_decoding(name):
+def test_encoding_inverts_decoding(name):
     encoded = torch.linspace(0, 1, 3 * 7 * 11, dtype=torch.float64).reshape(3, 7, 11)
     response = RESPONSES[name]
     radiance = response.linear_from_encoded(encoded)
-    # sRGB's two pieces miss each other by 3e-8 at the joint.
+    # The two pieces of sRGB differ by 3e-8 where they join.
     assert_close(response.encoded_from_linear(radiance), encoded, rtol=0, atol=1e-7)
     assert_close(float(radiance[..., -1, -1].max()), 1.0)
     assert (name == "linear") == bool((radiance - encoded).abs().max() < 1e-3)
@@ -48,10 +48,10 @@ def test_a_gamma_of_one_is_linear_and_the_srgb_curve_is_near_a_gamma_of_two_poin
     encoded = torch.linspace(0, 1, 101, dtype=torch.float64)
     assert_close(Gamma(exponent=1.0).linear_from_encoded(encoded), encoded)
     off = Gamma(exponent=2.2).linear_from_encoded(encoded) - Srgb().linear_from_encoded(encoded)
-    assert 1e-3 < off.abs().max() < 0.01  # as IEC 61966-2-1 intends, and not the same
+    assert 1e-3 < off.abs().max() < 0.01  # close, as IEC 61966-2-1 intends, but not equal
 
 
-def test_a_table_is_met_at_its_entries_and_straight_between():
+def test_a_table_is_interpolated_linearly():
     curve = RESPONSES["curve"]
     wanted = (3 + 50 * (LEVELS / 255) ** 2) / 53
     assert_close(curve.linear_from_encoded(LEVELS / 255), wanted)
@@ -70,7 +70,7 @@ def test_each_colour_has_its_own_curve():
         RESPONSES["curves"].linear_from_encoded(encoded[:, :1])
 
 
-def test_data_of_fourteen_bits_saturate_where_the_table_ends():
+def test_fourteen_bit_data_saturate_at_the_end_of_the_table():
     levels = torch.linspace(0, 16383, 100, dtype=torch.float64)
     curve = curve_from_table(levels, (levels[None] + 1) ** 1.5)
     assert curve.bits == 16
@@ -86,7 +86,7 @@ def broken(change):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda x, y: (x[:16], y[:, :16]), "16 entries; needed: at least 17"),
         (lambda x, y: (x, y.expand(2, -1)), "2 colours; needed: 1 or 3"),
@@ -99,19 +99,19 @@ def broken(change):
         (lambda x, y: (x * 1000, y), "last level is 255000"),
     ],
 )
-def test_tables_that_are_no_curves_are_refused(change, told):
-    with pytest.raises(InputError, match=told):
+def test_tables_that_are_not_curves_are_rejected(change, message):
+    with pytest.raises(InputError, match=message):
         curve_from_table(*broken(change))
 
 
 @pytest.mark.parametrize("exponent", [0.0, -2.2, float("nan"), float("inf")])
-def test_an_impossible_exponent_is_refused(exponent):
+def test_an_impossible_exponent_is_rejected(exponent):
     with pytest.raises(InputError, match="exponent of a gamma curve"):
         Gamma(exponent=exponent)
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         ({"response": 22.0}, "response is 22.0"),
         ({"black": -1.0}, "black is -1.0"),
@@ -120,6 +120,6 @@ def test_an_impossible_exponent_is_refused(exponent):
         ({"saturation": (15000, 15000, float("nan"))}, "saturation"),
     ],
 )
-def test_impossible_settings_are_refused(settings, told):
-    with pytest.raises(ConfigError, match=told):
+def test_impossible_settings_are_rejected(settings, message):
+    with pytest.raises(ConfigError, match=message):
         Encoding(**settings)
