@@ -1,4 +1,4 @@
-"""Patches over closed-form surfaces seen from -z, and changes of the height fields on them."""
+"""Patches over closed-form surfaces seen from -z, and changes of their height fields."""
 
 import torch
 from torch.nn.functional import normalize
@@ -29,7 +29,7 @@ def grid(generator, side=5):
 
 
 def rings(count=2, radius=0.6):
-    """Hexagons round the origin."""
+    """Hexagons around the origin."""
     places = [torch.zeros(1, 2, dtype=torch.float64)]
     for ring in range(1, count + 1):
         angle = torch.arange(6 * ring, dtype=torch.float64) * (torch.pi / (3 * ring)) + 0.3
@@ -38,7 +38,7 @@ def rings(count=2, radius=0.6):
 
 
 def facets_over(height, xy, sample=0.02, overlap=6.0, dtype=torch.float64):
-    """Decompose facets between points of a surface z(x, y), a camera 10 before it."""
+    """Decompose facets between points of a surface z(x, y), seen by a camera at z = -10."""
     vertices = torch.cat([xy, height(xy[:, 0], xy[:, 1])[:, None]], dim=1).to(dtype)
     faces = delaunay(xy)
     edges = xy[faces[:, 1:]] - xy[faces[:, :1]]
@@ -85,7 +85,7 @@ def height_fields(patches, height_field):
 
 
 def level(points, _):
-    """The height field of a plane's own facets."""
+    """The zero height field of coplanar facets."""
     return 0 * points[..., 0]
 
 
@@ -126,7 +126,7 @@ def spoiled(depths, transforms):
 
 
 def waves(depths, amplitude, generator):
-    """Add waves of its own, a quarter of an edge long, to every patch."""
+    """Add individual waves, a quarter of an edge long, to every patch."""
 
     def change(templates, field):
         x, y, _ = templates.points_patch.unbind(dim=-1)

@@ -44,7 +44,7 @@ def statuses(depths):
 
 
 def along_world_z(height):
-    """Height fields on coplanar facets, whose patch frames have the world's z."""
+    """Return height fields on coplanar facets with patch frames along the world's z."""
 
     def height_field(points, patch_from_world):
         away = points - patch_from_world[:, None, None, :3, 3]
@@ -59,12 +59,12 @@ def bumps(x, y):
 
 
 @pytest.mark.parametrize(("prior", "left"), [(1e-6, 0.001), (3e-4, 0.03)])
-def test_alignment_undoes_random_bas_height_field_transforms(sphere, generator, prior, left):
+def test_alignment_inverts_random_bas_relief_transforms(sphere, generator, prior, left):
     put_on = random_transforms(sphere.patches.num_patches, generator)
     bad = spoiled(sphere, put_on)
     found = Align(AlignConfig(prior=prior, iterations=4))(bad)
     assert error(found, sphere) < left * error(bad, sphere)
-    # Scales too, which no anchor determines: only neighbours and the folds between them do.
+    # Scales as well: anchors do not determine them, but neighbours and folds do.
     scales = by_facet(found)[:, 2] * put_on[:, 2]
     assert (scales - 1).abs().mean() < 2 * left
     assert (by_facet(found)[:, 3] == 0).all()  # patches do not move along their normals
@@ -72,7 +72,7 @@ def test_alignment_undoes_random_bas_height_field_transforms(sphere, generator, 
     assert found.mismatch[-1] < 0.02 * found.mismatch[0]
 
 
-def test_depths_are_the_reported_transform_of_the_old_depths(sphere, generator):
+def test_depths_are_transformed_as_reported(sphere, generator):
     bad = spoiled(sphere, random_transforms(sphere.patches.num_patches, generator))
     once = Align()(bad)
     assert error(spoiled(bad, by_facet(once)), once) < 1e-12
@@ -82,7 +82,7 @@ def test_depths_are_the_reported_transform_of_the_old_depths(sphere, generator):
 
 @pytest.mark.parametrize(("noise", "least"), [(0.0, 0.995), (0.002, 0.97), (0.005, 0.9)])
 def test_scales_do_not_shrink_after_random_transforms_and_noise(sphere, generator, noise, least):
-    """Noise is up to a quarter of the height field's own root mean square."""
+    """Noise is up to a quarter of the root mean square of the height field."""
     put_on = random_transforms(sphere.patches.num_patches, generator)
     bad = waves(spoiled(sphere, put_on), noise, generator)
     found = Align(AlignConfig(prior=1e-6, iterations=4))(bad)
@@ -91,8 +91,8 @@ def test_scales_do_not_shrink_after_random_transforms_and_noise(sphere, generato
     assert scales.min() > 0.3
 
 
-def test_flattening_costs_nothing_on_coplanar_facets_and_is_not_chosen(flat, generator):
-    """All seams agree at h = 0 too: nothing but the gauge tells the two apart."""
+def test_coplanar_facets_are_not_flattened(flat, generator):
+    """All seams also agree at h = 0: only the gauge excludes it."""
     fields = height_fields(flat, along_world_z(bumps))
     put_on = random_transforms(flat.num_patches, generator)
     config = AlignConfig(prior=1e-5, anchor=0.0, iterations=4)
@@ -102,7 +102,7 @@ def test_flattening_costs_nothing_on_coplanar_facets_and_is_not_chosen(flat, gen
     assert 0.25 <= noise.min() <= noise.max() <= 4
 
 
-def test_rigid_motion_and_scale_of_the_world_change_nothing(sphere, generator):
+def test_alignment_is_invariant_to_similarities_of_the_world(sphere, generator):
     bad = spoiled(sphere, random_transforms(sphere.patches.num_patches, generator))
     q, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
     q = q * torch.linalg.det(q)
@@ -129,7 +129,7 @@ def test_rigid_motion_and_scale_of_the_world_change_nothing(sphere, generator):
     assert_close(there.mismatch, size * here.mismatch)
 
 
-def test_a_patch_without_data_stays_as_it_is_and_drags_nobody(sphere, generator):
+def test_a_patch_without_data_is_unchanged_and_does_not_affect_others(sphere, generator):
     bad = spoiled(sphere, random_transforms(sphere.patches.num_patches, generator))
 
     def blinded(templates, field):
@@ -143,7 +143,7 @@ def test_a_patch_without_data_stays_as_it_is_and_drags_nobody(sphere, generator)
     assert error(found, sphere) < 0.002
 
 
-def test_what_meets_nobody_is_handed_back(sphere):
+def test_patches_without_overlap_are_returned_unchanged(sphere):
     alone = changed(sphere, lambda _, field: {"valid": field.valid & False})
     assert Align()(alone) is alone
     corner = torch.tensor([[0.0, 0], [1, 0], [0, 1]], dtype=torch.float64)
@@ -151,7 +151,7 @@ def test_what_meets_nobody_is_handed_back(sphere):
     assert Align()(facet) is facet
 
 
-def test_before_alignment_nobody_is_aligned_and_after_it_all_are(sphere):
+def test_the_status_records_alignment(sphere):
     assert all(height_field.status is None for height_field in sphere.buckets)
     assert not any(height_field.aligned.any() for height_field in sphere.buckets)
     found = Align()(sphere)
@@ -162,7 +162,7 @@ def test_before_alignment_nobody_is_aligned_and_after_it_all_are(sphere):
     assert figures(found)["mismatch"] == float(found.mismatch[-1])
 
 
-def test_a_patch_with_height_field_in_its_centre_only_is_alone(generator):
+def test_a_patch_without_heights_at_its_border_is_alone(generator):
     height, height_field = ball(2.0)
     patches = facets_over(height, grid(generator, side=4))
     lone = patches.buckets[0].facet[0]
@@ -177,14 +177,14 @@ def test_a_patch_with_height_field_in_its_centre_only_is_alone(generator):
     assert (found == ALONE).sum() <= 2
 
 
-def test_a_patch_is_aligned_where_enough_of_a_seam_is_met():
+def test_a_patch_is_aligned_if_enough_of_a_seam_overlaps():
     met = torch.ones(3, 8, dtype=torch.bool)
-    met[1, 1:] = False  # hardly met
+    met[1, 1:] = False  # hardly any overlap
     facets = torch.tensor([[0, 1], [2, 3], [1, 4]])
     assert patch_status(facets, met, 6).tolist() == [ALIGNED, ALIGNED, ALONE, ALONE, ALIGNED, ALONE]
 
 
-def test_anchors_know_the_height_field_over_them_and_their_spread_along_the_normal(flat):
+def test_anchors_have_heights_and_variances_along_the_normal(flat):
     depths = height_fields(flat, along_world_z(lambda x, y: bumps(x, y) + 0.2))
     coarse, count = flat.coarse, len(flat.coarse.mesh.vertices_world)
     long = torch.diag(torch.tensor([1.0, 1.0, 9.0], dtype=torch.float64))
@@ -198,8 +198,8 @@ def test_anchors_know_the_height_field_over_them_and_their_spread_along_the_norm
 
 
 @pytest.mark.parametrize("prior", [(0.1, 0.2, 0.3, 0.4), (0.1, 0.2, torch.inf, 0.4)])
-def test_the_solution_is_where_the_published_energys_gradient_vanishes(generator, prior):
-    """Components whose prior is infinite are held, and the others answer to them."""
+def test_the_gradient_of_the_published_energy_vanishes_at_the_solution(generator, prior):
+    """Components with an infinite prior are fixed; the others adapt to them."""
 
     def random(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -233,7 +233,7 @@ def test_the_solution_is_where_the_published_energys_gradient_vanishes(generator
     assert_close(gradient[:, free], 0 * gradient[:, free], atol=1e-10, rtol=0)
 
 
-def test_uplift_is_minus_half_the_energys_derivative_through_k(generator):
+def test_uplift_is_minus_half_the_derivative_of_the_energy_by_k(generator):
     draw = torch.rand(3, 5, generator=generator, dtype=torch.float64)
     curvature, scales, apart = draw[:, :2], draw[:, 2:4].clone().requires_grad_(), draw[:, 4]
     stiffness, uplift = seam_stiffness(curvature, scales, apart)
@@ -241,10 +241,10 @@ def test_uplift_is_minus_half_the_energys_derivative_through_k(generator):
     assert_close(uplift, -derivative / 2)
 
 
-def test_curvature_of_an_arc_is_that_of_its_parabola_and_has_no_unit():
+def test_curvature_of_a_parabolic_arc_is_dimensionless():
     columns, length = 12, 3.0
     along = (torch.arange(columns, dtype=torch.float64) + 0.5) / columns
-    arc = 4 * 0.1 * length * along * (1 - along) + 5 * along  # tenth of the edge, and a tilt
+    arc = 4 * 0.1 * length * along * (1 - along) + 5 * along  # a tenth of the edge, plus a tilt
     heights = arc.expand(1, 2, 4, columns) * torch.tensor([1.0, 0.5])[:, None, None]
     met = torch.ones(1, 4, columns, dtype=torch.bool)
     met[0, 0, :5] = False
@@ -255,7 +255,7 @@ def test_curvature_of_an_arc_is_that_of_its_parabola_and_has_no_unit():
     assert (curvature_along(heights, met & False, edge) == 0).all()
 
 
-def test_seams_name_each_inner_edge_once_with_rays_about_it(generator):
+def test_each_inner_edge_has_one_seam_with_rays_around_it(generator):
     patches = facets_over(lambda x, y: 0.2 * x * x - 0.1 * y * x, grid(generator))
     seams = find_seams(patches, rows=3, columns=4, reach_samples=5.0)
     mesh = patches.coarse.mesh
@@ -272,7 +272,7 @@ def test_seams_name_each_inner_edge_once_with_rays_about_it(generator):
     assert_close(spread, torch.full_like(spread, 10 * float(patches.buckets[0].spacing[0])))
 
 
-def test_two_height_fields_of_one_sphere_are_met_in_the_same_points(sphere):
+def test_overlapping_height_fields_of_a_sphere_meet_in_the_same_points(sphere):
     patches = sphere.patches
     seams = find_seams(patches, rows=5, columns=8, reach_samples=4.0)
     identity = IDENTITY.expand(patches.num_patches, 4)
@@ -282,6 +282,6 @@ def test_two_height_fields_of_one_sphere_are_met_in_the_same_points(sphere):
     apart = (points[:, 0] - points[:, 1]).norm(dim=-1)[met]
     from_center = (points - points.new_tensor([0, 0, 2])).norm(dim=-1)
     from_center = from_center[met[:, None].expand(-1, 2, -1, -1)]
-    # Bilinear samples 0.02 apart on a curvature of 0.5: h^2/8 times twice that.
+    # Bilinear samples at a spacing h of 0.02 on a curvature of 0.5: h^2/8 times twice that.
     assert apart.max() < 2e-4
     assert_close(from_center, torch.full_like(from_center, 2.0), atol=1e-4, rtol=0)

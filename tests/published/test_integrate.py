@@ -18,7 +18,7 @@ from tests.published.scenes import IDENTITY, facets_over
 
 
 def two_facets(sample, dtype=torch.float64):
-    """A square of two facets of unlike tilt."""
+    """Return a square of two facets of different tilt."""
     corners = torch.tensor([[0.0, 0], [1, 0], [1.1, 1], [0, 0.9]], dtype=torch.float64)
     return facets_over(lambda x, y: 0.1 * (x - y).abs(), corners, sample, 3.0, dtype)
 
@@ -47,7 +47,7 @@ def random(generator, *shape):
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
-def test_closed_form_surfaces_return_with_an_error_that_falls_with_the_square_of_the_spacing():
+def test_the_error_of_closed_form_surfaces_is_of_second_order():
     def misfit(count):
         axis = torch.linspace(-0.5, 0.5, count, dtype=torch.float64)
         y, x = torch.meshgrid(axis, axis, indexing="ij")
@@ -73,7 +73,7 @@ def test_a_tilted_plane_stays_a_plane_to_float32_rounding():
         assert rest.abs().max() < 4 * torch.finfo(torch.float32).eps * plane.abs().max()
 
 
-def test_holes_are_bridged_in_keeping_with_their_rim():
+def test_holes_are_bridged_smoothly():
     patches = two_facets(0.025)
     seen = photographed(patches, slopes_of_bumps, keep=lambda x, y: x**2 + y**2 > 0.1**2)
     for templates, height_field in zip(patches.buckets, Integrate()(seen).buckets, strict=True):
@@ -81,18 +81,18 @@ def test_holes_are_bridged_in_keeping_with_their_rim():
         for patch, points in enumerate(templates.points_patch):
             x, y, _ = points.unbind(dim=-1)
             misfit = (height_field.depth[patch] - bumps(x, y))[x**2 + y**2 <= 0.1**2]
-            # Over a hole 0.2 wide, the bumps leave a plane by 0.01; the bridge does better.
+            # Over a hole 0.2 wide, the bumps deviate from a plane by 0.01; the bridge is closer.
             assert (misfit - misfit.mean()).abs().max() < 0.005
 
 
-def test_a_patch_without_normals_stays_its_facet_and_says_so():
+def test_a_patch_without_normals_stays_flat_and_is_marked():
     seen = photographed(two_facets(0.05), slopes_of_bumps, lambda x, y: torch.zeros_like(x) > 0)
     for height_field in Integrate()(seen).buckets:
         assert_close(height_field.depth, torch.zeros_like(height_field.depth))
         assert not height_field.valid.any()
 
 
-def test_the_height_field_passes_on_average_through_the_corners():
+def test_the_height_field_has_mean_zero_at_the_corners():
     depths = Integrate()(photographed(two_facets(0.05), slopes_of_bumps))
     mesh = depths.patches.coarse.mesh
     for templates, field in zip(depths.patches.buckets, depths.buckets, strict=True):
@@ -100,13 +100,13 @@ def test_the_height_field_passes_on_average_through_the_corners():
         corners = transform(templates.patch_from_world, vertices)[..., :2]
         grid = templates.origin, templates.spacing
         found = sample_raster(field.depth[:, None], corners, *grid)[:, 0]
-        assert found.abs().max() > 1e-3  # so that only the mean can be zero
+        assert found.abs().max() > 1e-3  # only the mean is zero
         assert_close(found.mean(dim=1), torch.zeros_like(found[:, 0]))
         assert_close(field.transform, IDENTITY.expand(len(found), 4))
 
 
-def test_the_solution_is_that_of_the_dense_least_squares_on_steps(generator):
-    """Its steps come nearest to those given, whose source is any, but for its mean."""
+def test_the_solution_equals_dense_least_squares_on_steps(generator):
+    """Steps of the solution are closest to the given ones, for any source of zero mean."""
     right, down = random(generator, 5, 5), random(generator, 4, 6)
     unit = torch.eye(30, dtype=torch.float64).reshape(-1, 5, 6)
     steps = torch.cat([part.flatten(1) for part in differences(unit)], dim=1).T
@@ -117,7 +117,7 @@ def test_the_solution_is_that_of_the_dense_least_squares_on_steps(generator):
     assert_close(solve_poisson(source + 3), dense - dense.mean())
 
 
-def test_what_is_known_is_kept_and_what_is_not_is_never_looked_at(generator):
+def test_filling_keeps_known_values_and_ignores_unknown_ones(generator):
     weight = (torch.rand(2, 9, 14, generator=generator) < 0.3).double()
     values = random(generator, 2, 3, 9, 14)
     filled = fill_smoothly(torch.where(weight[:, None] > 0, values, torch.nan), weight)
@@ -127,14 +127,14 @@ def test_what_is_known_is_kept_and_what_is_not_is_never_looked_at(generator):
 
 
 @pytest.mark.parametrize(("seen", "value"), [(1, 0.7), (0, 0.0)])
-def test_a_single_sample_spreads_everywhere_and_none_is_zero(seen, value):
+def test_filling_spreads_a_single_sample_and_is_zero_without_one(seen, value):
     weight = torch.zeros(1, 11, 6)
     weight[0, 7, 1] = seen
     values = torch.where(weight[:, None] > 0, 0.7, torch.nan).expand(1, 2, 11, 6)
     assert_close(fill_smoothly(values, weight), torch.full((1, 2, 11, 6), value))
 
 
-def test_fillings_stay_between_their_neighbours_and_follow_the_near_side():
+def test_filled_values_are_between_their_neighbours():
     values, weight = torch.zeros(1, 1, 16, 16), torch.ones(1, 16, 16)
     values[..., 12:] = 1
     weight[:, :, 4:12] = 0

@@ -15,7 +15,7 @@ SPACING = 0.02
 
 @pytest.fixture(scope="module")
 def cap():
-    """A cap of the unit sphere round (0, 0, 1), 40 degrees to each side, exact height field."""
+    """A cap of the unit sphere around (0, 0, 1), 40 degrees to each side, exact height field."""
     height, height_field = ball(1.0)
     return height_fields(facets_over(height, rings()), height_field)
 
@@ -25,7 +25,7 @@ def plane(x, y):
 
 
 def lifted(step, facets, overlap=6.0):
-    """Six coplanar facets, some lifted along their z."""
+    """Return six coplanar facets, some of which are lifted along their z."""
     depths = height_fields(facets_over(plane, rings(count=1), overlap=overlap), level)
 
     def change(templates, field):
@@ -51,7 +51,7 @@ def off_sphere(points):
     return (points - points.new_tensor([0, 0, 1])).norm(dim=-1) - 1
 
 
-def test_exact_height_field_on_a_cap_gives_the_sphere_back(cap):
+def test_an_exact_height_field_on_a_cap_reproduces_the_sphere(cap):
     subdivision, blend, points = united(cap)
     assert blend.supported.all()
     flat = off_sphere(subdivision.points).abs().mean()
@@ -78,7 +78,7 @@ def test_the_union_is_continuous_across_a_step_between_patches():
     heights = points[:, 2] - plane(points[:, 0], points[:, 1])
     jump = (heights[edges[:, 0]] - heights[edges[:, 1]]).abs()
     assert heights.abs().max() > 0.9 * step
-    # The blend spans nine samples with smoothstep's steepest slope, 1.5; and a diagonal.
+    # The blend spans nine samples; smoothstep's steepest slope is 1.5, along a diagonal.
     assert jump.max() < 0.3 * step
 
 
@@ -113,17 +113,17 @@ def test_a_hole_in_the_height_field_is_filled_and_marked(cap):
     assert 20 < empty.sum() < 120
     for part in (surface.vertices_world, surface.normals_world, surface.albedo):
         assert part.isfinite().all()
-    # A soap film over a hole of radius 0.1, a sample wider than ours, sags by 0.1^2 / 2.
+    # A soap film over a hole of radius 0.1, one sample wider than this one, sags by 0.1^2 / 2.
     assert off_sphere(surface.vertices_world)[empty].abs().max() < 0.008
     assert_close(surface.normals_world.norm(dim=-1), torch.ones(len(empty)).double())
 
 
-def test_height_field_that_is_valid_nowhere_leaves_the_facets_without_confidence(cap):
+def test_invalid_height_fields_leave_facets_with_zero_confidence(cap):
     nowhere = changed(cap, lambda _, field: {"valid": torch.zeros_like(field.valid)})
     surface, (flat, _, _) = Refine()(nowhere), united(nowhere)
     mesh = nowhere.patches.coarse.mesh
     away = surface.vertices_world - flat.points
-    assert away.norm(dim=1).max() < 3 * SPACING  # seams are smoothed, nothing else
+    assert away.norm(dim=1).max() < 3 * SPACING  # only seams are smoothed
     off_facet = (away * unit_face_normals(mesh.vertices_world, mesh.faces)[flat.facet]).sum(dim=1)
     assert off_facet.abs().median() < 0.2 * SPACING
     assert (surface.confidence == 0).all()
@@ -135,7 +135,7 @@ def spaced(spacing):
 
 @pytest.fixture
 def folded():
-    """Four facets round a centre, lifted like a tent, edges of unlike length."""
+    """Four facets around a centre, lifted like a tent, with edges of different lengths."""
     vertices = [[0.0, 0, 0.4], [1.1, 0, 0], [0.1, 0.9, 0.1], [-0.7, 0.1, 0], [0, -1.3, 0]]
     facets = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
     return subdivide(torch.tensor(vertices, dtype=torch.float64), facets, spaced(0.1))
@@ -150,7 +150,7 @@ def folded():
         ([0.5, 0.25, 0.25], 0.5 * 0.5**0.5),
     ],
 )
-def test_the_seam_weight_has_the_published_values_whatever_the_corner(place, value):
+def test_the_seam_weight_has_the_published_values_at_every_corner(place, value):
     for shift in range(3):
         found = seam_weight(torch.tensor(place, dtype=torch.float64).roll(shift))
         assert float(found) == pytest.approx(value, abs=1e-7)
@@ -164,7 +164,7 @@ def test_the_solution_minimises_the_published_energy(folded):
     radius, spacing = 2.0, 0.1
     found = smooth_seams(folded, union, supported, spaced(spacing), radius).requires_grad_()
 
-    # The energy face by face, written out: gradients of linear functions from edge vectors.
+    # The energy per face: gradients of linear functions from edge vectors.
     weights = seam_weight(folded.barycentric)
     corners, values = folded.points[folded.faces], found[folded.faces]
     frame = (corners[:, 1:] - corners[:, :1]).mT
@@ -177,7 +177,7 @@ def test_the_solution_minimises_the_published_energy(folded):
     assert gradient.abs().max() < 1e-7 * (radius * spacing) ** -2 * float(area.max())
 
 
-def test_vertices_without_support_continue_the_plane_round_them(folded):
+def test_vertices_without_support_continue_the_surrounding_plane(folded):
     plane = folded.points * folded.points.new_tensor([1, 1, 0]) + folded.points.new_tensor(
         [0, 0, 2]
     )
@@ -188,8 +188,8 @@ def test_vertices_without_support_continue_the_plane_round_them(folded):
     assert (found[:, 2] - 2).abs().max() < 1e-6
 
 
-def test_the_centre_of_a_facet_is_kept_and_seams_are_smoothed_the_more_the_larger_g():
-    """White noise keeps what G leaves of it: all at G = 0, least at the vertices."""
+def test_smoothing_increases_with_g_from_centres_to_seams():
+    """White noise is kept entirely at G = 0 and least at the vertices."""
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
     facets, spacing = torch.tensor([[0, 1, 2], [0, 2, 3]]), spaced(0.05)[:2]
     square = subdivide(vertices, facets, spacing)
@@ -203,7 +203,7 @@ def test_the_centre_of_a_facet_is_kept_and_seams_are_smoothed_the_more_the_large
     inside = (square.barycentric > 0.02).all(dim=1)
     g = seam_weight(square.barycentric)
     centre = (square.barycentric - 1 / 3).abs().amax(dim=1) < 0.04
-    assert kept[centre].mean() > 0.7  # a vertex's neighbours lie where G is 0.1 already
+    assert kept[centre].mean() > 0.7  # neighbours of a vertex already have G = 0.1
     steps = [(0.0, 0.25), (0.25, 0.35), (0.35, 0.45), (0.45, 0.6)]
     fractions = [float(kept[inside & (g >= low) & (g < high)].mean()) for low, high in steps]
     assert fractions == sorted(fractions, reverse=True)
@@ -213,8 +213,8 @@ def test_the_centre_of_a_facet_is_kept_and_seams_are_smoothed_the_more_the_large
     assert float(kept[corner].mean()) < float(kept[edge].mean()) < 0.45
 
 
-def test_smoothing_at_a_seam_has_the_width_that_the_docstring_gives():
-    """Where G is 1/2 throughout, a wave keeps 1 / (1 + (2 pi r / w)^2) of its height."""
+def test_smoothing_at_a_seam_has_the_documented_width():
+    """With G = 1/2 everywhere, a wave keeps 1 / (1 + (2 pi r / w)^2) of its height."""
     spacing, radius, wave = 0.05, 3.0, 32
     columns = torch.arange(160, dtype=torch.float64) * spacing
     x, y = torch.meshgrid(columns, columns[:5], indexing="ij")

@@ -24,7 +24,7 @@ def uniform(generator, *shape):
     return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
 
-def test_the_mesh_of_a_ball_faces_out_is_a_disc_and_lies_on_the_ball(dome_cloud):
+def test_the_mesh_of_a_ball_is_an_outward_disc_on_the_ball(dome_cloud):
     coarse = Triangulate(TriangulateConfig(num_points=120))(dome_cloud)
     vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
     assert 80 <= len(vertices) <= 140
@@ -40,13 +40,13 @@ def test_the_mesh_of_a_ball_faces_out_is_a_disc_and_lies_on_the_ball(dome_cloud)
     assert len(vertices) - len(unique) + len(faces) == 1
 
 
-def test_the_coarse_mesh_carries_what_is_known_of_its_points(dome_cloud):
+def test_the_coarse_mesh_keeps_attributes_of_its_points(dome_cloud):
     coarse = Triangulate(TriangulateConfig(num_points=60))(dome_cloud)
     vertices, points = coarse.mesh.vertices_world, coarse.points
     assert coarse.is_point.all()
     assert coarse.covariance_world.shape == (len(vertices), 3, 3)
     assert len(points.facet) > 100
-    # No vertex among them, and each lies on its facet: near its plane on so round a mesh.
+    # They exclude vertices, and each is on its facet: close to its plane on a mesh so smooth.
     assert torch.cdist(points.points_world, vertices).min() > 0
     corners = vertices[coarse.mesh.faces[points.facet]]
     away = (points.points_world[:, None] - corners).norm(dim=-1).amax(dim=1)
@@ -62,7 +62,7 @@ def test_outliers_do_not_become_vertices(dome_cloud):
     assert (coarse.mesh.vertices_world.norm(dim=-1) - 1).abs().max() < 0.05
 
 
-def test_what_shows_no_object_is_peeled_off_the_rim(dome_cloud):
+def test_facets_outside_the_masks_are_peeled_from_the_boundary(dome_cloud):
     masks = dome_cloud.views.inside.clone()
     masks[..., :80] = False  # the left half of every photograph
     peeled = Triangulate()(dome_cloud.replace(views=dome_cloud.views.replace(masks=masks)))
@@ -83,7 +83,7 @@ def test_bridges_over_a_depth_discontinuity_are_dropped(dome_cloud):
     assert (levels.amax(dim=1) - levels.amin(dim=1) < 0.5).all()
 
 
-def test_a_cloud_without_reliable_points_is_refused_with_counts(dome_cloud):
+def test_a_cloud_without_reliable_points_is_rejected_with_counts(dome_cloud):
     bad = dome_cloud.replace(reprojection_errors_px=100 + 0 * dome_cloud.reprojection_errors_px)
     with pytest.raises(ReconstructionError, match=r"0 of \d+ sparse points are reliable and seen"):
         Triangulate()(bad)
@@ -101,7 +101,7 @@ def test_peeling_opens_no_hole():
 
 @pytest.mark.parametrize(("sharp", "left"), [(2, 2), (0, 3)])
 def test_spikes_are_dropped_and_blunt_ears_stay(sharp, left):
-    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [2, 1, 4]])  # a square, and an ear: 4 is its tip
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [2, 1, 4]])  # a square, and an ear with tip 4
     corners = torch.zeros_like(faces, dtype=torch.bool)
     corners[2, sharp] = True
     found = peel(faces, torch.zeros(3, dtype=torch.bool), corners)
@@ -118,7 +118,7 @@ def test_points_of_another_layer_and_stray_points_disagree_with_their_neighbours
     lateral = uniform(generator, 300, 2)
     depth = 5 + 0.3 * lateral[:, :1]
     depth[:10] += 2.0  # another layer
-    depth[10:20] += 0.12  # badly triangulated: several radii of a neighbourhood
+    depth[10:20] += 0.12  # badly triangulated, by several radii of a neighbourhood
     points_cam = torch.cat([lateral, depth], dim=1)
     agree = consistent_points(lateral * 500, points_cam, max_slope=3.0)
     assert not agree[:20].any()
@@ -133,8 +133,8 @@ def test_neighbours_across_a_depth_edge_agree_each_with_its_own_side():
     assert agree.float().mean() > 0.95
 
 
-def test_points_behind_a_layer_are_hidden_and_those_beside_its_contour_are_not(generator):
-    # A disc of radius 1 at depth 4 in front of a wall at depth 7 that ran through behind it.
+def test_points_behind_a_layer_are_hidden_but_not_outside_its_contour(generator):
+    # A disc of radius 1 at depth 4 in front of a wall at depth 7 that continues behind it.
     lateral = 4 * uniform(generator, 1500, 2) - 2
     radius = lateral.norm(dim=1)
     on_wall = (radius > 1) | (uniform(generator, 1500) < 0.3)
@@ -144,7 +144,7 @@ def test_points_behind_a_layer_are_hidden_and_those_beside_its_contour_are_not(g
     assert found[on_wall & (radius < 0.85)].float().mean() > 0.95
     assert not found[~on_wall].any()
     assert not found[on_wall & (radius > 1.02)].any()
-    # Just inside the contour they have the disc on one side only; unseen, they are doubted.
+    # Just inside the contour, the disc is on one side only; unseen points are suspect.
     unseen = occluded_points(lateral, points_cam, ~on_wall)
     edge = on_wall & (radius > 0.85) & (radius < 0.99)
     assert found[edge].float().mean() < 0.8 < 0.98 < unseen[edge].float().mean()
@@ -167,18 +167,18 @@ def test_spread_points_keep_their_distance_and_the_best_are_chosen_first(generat
     chosen = spread(pixels, quality, 9.0)
     assert torch.cdist(pixels[chosen], pixels[chosen]).fill_diagonal_(torch.inf).min() > 9.0
     assert quality.argmax() in chosen
-    # Nothing else would fit: every point is close to a chosen one that is at least as good.
+    # The choice is maximal: every point is close to a chosen one that is at least as good.
     near = torch.cdist(pixels, pixels[chosen]) <= 9.0
     better = quality[chosen] >= quality[:, None]
     assert (near & better).any(dim=1).all()
     assert abs(len(spread_to_count(pixels, torch.ones(400).double(), 60)) - 60) <= 6
 
 
-def test_the_hull_holds_every_other_point(generator):
+def test_the_hull_contains_every_other_point(generator):
     pixels = uniform(generator, 200, 2)
     corners = pixels[on_hull(pixels)]
     assert 3 <= len(corners) < 60
-    # Nothing lies further out than the hull's corners, whatever the direction.
+    # No point is further out than the corners of the hull, in any direction.
     angle = torch.linspace(0, 6.28, 100, dtype=torch.float64)
     directions = torch.stack([angle.cos(), angle.sin()])
     assert_close((corners @ directions).amax(dim=0), (pixels @ directions).amax(dim=0))
@@ -187,7 +187,7 @@ def test_the_hull_holds_every_other_point(generator):
 def test_lonely_corners_of_the_hull_are_dropped_shell_by_shell_and_no_inner_point(generator):
     pixels = uniform(generator, 300, 2)
     pixels[0] = torch.tensor([3.0, 3.0])
-    pixels[1] = torch.tensor([2.0, 2.5])  # in the first one's shadow until that is gone
+    pixels[1] = torch.tensor([2.0, 2.5])  # shielded by the first one until that is removed
     kept = without_isolated_corners(pixels)
     assert not kept[:2].any()
     assert kept[2:].float().mean() > 0.97
