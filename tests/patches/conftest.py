@@ -9,7 +9,7 @@ TILTED = EndlessPlane(point=(0.0, 0.0, 0.0), normal=(0.2, -0.1, 1.0))
 
 
 def ramp(points: torch.Tensor) -> torch.Tensor:
-    """An albedo that is an affine function of the place, so interpolation is exact."""
+    """Return albedo as an affine function of position, so that interpolation is exact."""
     x, y = points[..., 0], points[..., 1]
     return torch.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 - 0.1 * x + 0.1 * y], dim=-1)
 
@@ -24,7 +24,7 @@ def plane_scene() -> RenderedScene:
 
 @pytest.fixture(scope="session")
 def plane_mesh() -> CoarseMesh:
-    """Two facets of unlike size on the tilted plane, frontal in the centre view."""
+    """Two facets of different sizes on the tilted plane, frontal in the centre view."""
     xy = torch.tensor([[-0.8, -0.6], [0.7, -0.5], [0.5, 0.6], [-0.3, 0.5]], dtype=torch.float64)
     z = -(0.2 * xy[:, :1] - 0.1 * xy[:, 1:])
     mesh = Mesh(

@@ -9,7 +9,7 @@ from pimper_torch.method.patches.patches_config import DecomposeConfig
 from pimper_torch.runtime.errors import ReconstructionError
 
 
-def test_the_facet_lies_in_the_plane_z_0_and_the_camera_sees_its_front(plane_scene, plane_mesh):
+def test_the_facet_is_in_the_plane_z_0_and_faces_the_camera(plane_scene, plane_mesh):
     patches = Decompose()(plane_mesh, plane_scene.cameras)
     vertices, faces = plane_mesh.mesh.vertices_world, plane_mesh.mesh.faces
     for bucket in patches.buckets:
@@ -23,7 +23,7 @@ def test_the_facet_lies_in_the_plane_z_0_and_the_camera_sees_its_front(plane_sce
         assert (in_patch[..., 2] < 0).all()  # z points into the surface
 
 
-def test_barycentric_coordinates_give_back_every_sample(plane_scene, plane_mesh):
+def test_barycentric_coordinates_reproduce_every_sample(plane_scene, plane_mesh):
     patches = Decompose()(plane_mesh, plane_scene.cameras)
     vertices, faces = plane_mesh.mesh.vertices_world, plane_mesh.mesh.faces
     for bucket in patches.buckets:
@@ -49,7 +49,7 @@ def test_every_point_near_a_facet_has_a_sample_and_samples_are_a_pixel_apart(
         enlarged = enlarge(corners, 5.0 * bucket.spacing[0])
         ab, ac = enlarged[:, 1] - enlarged[:, 0], enlarged[:, 2] - enlarged[:, 0]
         wanted = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs() / 2
-        # Whole samples along the contour, and corners clipped at twice the overlap: 3 %.
+        # Discrete samples along the contour, and corners clipped at twice the overlap: 3 %.
         assert ((area - wanted).abs() / wanted < 0.03).all()
         reference = plane_mesh.reference
         pixels, _ = project(
@@ -78,7 +78,7 @@ def test_enlarged_edges_are_parallel_and_moved_by_the_distance():
     assert_close(-inward * shift, torch.full((20, 3), 0.3, dtype=torch.float64))
 
 
-def test_buckets_hold_every_facet_once_and_fit_their_rasters():
+def test_buckets_contain_every_facet_once_and_fit_their_rasters():
     generator = torch.Generator().manual_seed(1)
     sides = torch.randint(5, 90, (300, 2), generator=generator)
     buckets = group_by_size(sides, bucket_samples=20_000)
@@ -92,7 +92,7 @@ def test_buckets_hold_every_facet_once_and_fit_their_rasters():
     assert padded < 1.6 * sides.prod(dim=1).sum()
 
 
-def test_a_mesh_without_facets_is_refused(plane_scene, plane_mesh):
+def test_a_mesh_without_facets_is_rejected(plane_scene, plane_mesh):
     empty = plane_mesh.replace(
         mesh=plane_mesh.mesh.replace(faces=torch.zeros(0, 3, dtype=torch.long))
     )
@@ -101,15 +101,13 @@ def test_a_mesh_without_facets_is_refused(plane_scene, plane_mesh):
 
 
 @pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_samples_lie_as_far_apart_as_the_scale_of_the_photographs_says(
-    plane_scene, plane_mesh, scale
-):
+def test_sample_spacing_follows_the_scale_of_the_photographs(plane_scene, plane_mesh, scale):
     one = Decompose()(plane_mesh, plane_scene.cameras).buckets[0].spacing[0]
     scaled = Decompose()(plane_mesh, plane_scene.cameras, None, scale).buckets[0].spacing[0]
     assert_close(scaled, one / scale)
 
 
-def test_no_more_samples_are_laid_than_asked_for(plane_scene, plane_mesh):
+def test_the_number_of_samples_is_limited(plane_scene, plane_mesh):
     def on_facets(**settings: float) -> int:
         patches = Decompose(DecomposeConfig(**settings))(plane_mesh, plane_scene.cameras)
         return sum(int((b.barycentric >= 0).all(dim=-1).sum()) for b in patches.buckets)
@@ -122,13 +120,13 @@ def test_no_more_samples_are_laid_than_asked_for(plane_scene, plane_mesh):
     assert on_facets(max_samples=2.0 * free * views) == free
 
 
-def test_views_that_a_facet_turns_away_from_cost_no_samples(plane_scene, plane_mesh):
+def test_averted_views_do_not_affect_the_sample_spacing(plane_scene, plane_mesh):
     away = plane_mesh.mesh.faces.flip(1)
     views = plane_scene.cameras.num_views
     there = plane_mesh.mesh.vertices_world
     both = torch.cat([plane_mesh.mesh.faces, away])
     assert views_facing(there, both, plane_scene.cameras).tolist() == [views, views, 0, 0]
-    aside = there + there.new_tensor([50.0, 0.0, 0.0])  # in no frame
+    aside = there + there.new_tensor([50.0, 0.0, 0.0])  # outside all frames
     assert views_facing(aside, plane_mesh.mesh.faces, plane_scene.cameras).tolist() == [0, 0]
 
     def spacing(faces: torch.Tensor) -> torch.Tensor:

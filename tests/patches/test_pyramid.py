@@ -7,7 +7,7 @@ from pimper_torch.ground.geometry.pyramids import halve, look_up
 
 
 @pytest.mark.parametrize("size", [(12, 20), (13, 7)])
-def test_halving_is_the_gaussian_pyramids(generator, size):
+def test_halving_equals_that_of_gaussian_pyramids(generator, size):
     images = torch.rand(2, 3, *size, generator=generator, dtype=torch.float64)
     assert_close(halve(images), pyrdown(images))
 

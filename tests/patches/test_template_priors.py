@@ -34,7 +34,7 @@ def normal_prior(scene, frame="camera", variance=0.01) -> NormalPrior:
 
 
 def depth_prior(scene, raised: float = 0.0) -> DepthPrior:
-    """The plane's depth along each camera's axis, raised along its normal."""
+    """Return the plane's depth along each camera axis, raised along the plane's normal."""
     views, cameras = scene.views, scene.cameras
     height, width = views.images.shape[2:]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -59,9 +59,7 @@ def guessed(scene, patches, *priors, warp=None):
 
 
 @pytest.mark.parametrize("frame", ["camera", "world"])
-def test_normals_come_to_lie_in_the_patch_frame_and_information_adds_up(
-    plane_scene, patches, frame
-):
+def test_prior_normals_are_in_the_patch_frame_and_information_adds_up(plane_scene, patches, frame):
     seen, found = guessed(plane_scene, patches, normal_prior(plane_scene, frame))
     for bucket, templates, own in zip(seen.buckets, patches.buckets, found, strict=True):
         views = bucket.valid.sum(dim=1)
@@ -73,7 +71,7 @@ def test_normals_come_to_lie_in_the_patch_frame_and_information_adds_up(
         assert not own.offset_information.any()
 
 
-def test_maps_of_some_photographs_at_half_the_size_tell_the_same(plane_scene, patches):
+def test_maps_at_half_size_give_the_same_offsets(plane_scene, patches):
     prior = depth_prior(plane_scene, 0.03).take([0, 3])
     small = interpolate(prior.depth[:, None], scale_factor=0.5, mode="area")[:, 0]
     half = prior.replace(
@@ -87,16 +85,16 @@ def test_maps_of_some_photographs_at_half_the_size_tell_the_same(plane_scene, pa
         assert_close(one.offset[both], other.offset[both], rtol=0, atol=1e-4)
 
 
-def test_depth_is_an_offset_along_the_normal(plane_scene, patches):
+def test_depth_priors_become_offsets_along_the_normal(plane_scene, patches):
     _, found = guessed(plane_scene, patches, depth_prior(plane_scene, 0.03))
     for own in found:
         some = own.offset_information > 0
         assert_close(own.offset[some], torch.full_like(own.offset[some], 0.03), rtol=0, atol=1e-4)
-        # Five views, which err by 0.01 along their axes, and about as much along the normal.
+        # Five views with errors of 0.01 along their axes, and about as much along the normal.
         assert 5e4 < own.offset_information[some].max() < 7e4
 
 
-def test_views_that_disagree_count_by_their_scatter(plane_scene, patches):
+def test_disagreeing_views_are_weighted_by_their_scatter(plane_scene, patches):
     tilted = normal_prior(plane_scene, variance=1e-4)
     lean = math.radians(10) * torch.tensor([1.0, -1, 0, 1, -1]).double()
     axis = torch.tensor([1.0, 0, 0]).double()
@@ -111,7 +109,7 @@ def test_views_that_disagree_count_by_their_scatter(plane_scene, patches):
         assert_close(own.normal_information[some], expected, rtol=0.1, atol=0)
 
 
-def test_kernels_and_torch_look_up_the_same(plane_scene, patches):
+def test_kernels_and_torch_sample_the_same_priors(plane_scene, patches):
     priors = normal_prior(plane_scene), depth_prior(plane_scene, 0.02)
     scene = plane_scene.to(torch.float32)
     single = [prior.to(torch.float32) for prior in priors]
@@ -124,7 +122,7 @@ def test_kernels_and_torch_look_up_the_same(plane_scene, patches):
         assert_close(one.offset[both].double(), other.offset[both], rtol=0, atol=1e-4)
 
 
-def test_pixels_without_a_guess_and_photographs_that_are_left_out_say_nothing(plane_scene, patches):
+def test_unknown_pixels_and_other_photographs_give_no_information(plane_scene, patches):
     prior = normal_prior(plane_scene)
     unknown = prior.replace(variance=torch.full_like(prior.variance, math.inf))
     strange = prior.replace(names=tuple(f"other {name}" for name in prior.names))
@@ -137,7 +135,7 @@ def test_pixels_without_a_guess_and_photographs_that_are_left_out_say_nothing(pl
             assert torch.equal(one.valid, other.valid)
 
 
-def test_inliers_are_probabilities_of_their_view_and_1_elsewhere(plane_scene, patches):
+def test_inlier_priors_apply_to_their_view_and_are_1_elsewhere(plane_scene, patches):
     views = plane_scene.views
     half = InlierPrior(
         names=views.names[1:2],
@@ -153,7 +151,7 @@ def test_inliers_are_probabilities_of_their_view_and_1_elsewhere(plane_scene, pa
         assert bool((own.inlier[:, [0, 2, 3, 4]] == 1).all())
 
 
-def test_gradients_by_the_maps(plane_scene, patches):
+def test_gradients_with_respect_to_the_maps_match_differences(plane_scene, patches):
     depth, normals = depth_prior(plane_scene, 0.02), normal_prior(plane_scene)
     part = patches.replace(buckets=(patches.buckets[0],))
     noise = torch.randn(normals.normals.shape, generator=torch.Generator().manual_seed(1)).double()
@@ -179,14 +177,14 @@ def test_gradients_by_the_maps(plane_scene, patches):
         assert abs(checks[by, name].ratio - 1) < 1e-5, name
 
 
-def test_depth_in_no_unit_of_the_scene_is_refused(plane_scene, patches):
+def test_depth_in_other_than_scene_units_is_rejected(plane_scene, patches):
     loose = replace(depth_prior(plane_scene), gauge="affine")
     with pytest.raises(InputError, match="scene units"):
         guessed(plane_scene, patches, loose)
 
 
 @pytest.mark.parametrize("frame", ["camera", "world"])
-def test_lights_shade_the_same_in_the_patch_frame(plane_scene, patches, frame):
+def test_prior_lights_shade_the_same_in_the_patch_frame(plane_scene, patches, frame):
     views, cameras = plane_scene.views, plane_scene.cameras
     lights = torch.randn(5, 4, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     own = lights

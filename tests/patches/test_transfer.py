@@ -37,18 +37,18 @@ def places(templates):
     return transform(invert_rigid(templates.patch_from_world), flat).view_as(templates.points_patch)
 
 
-def test_samples_lie_on_the_surface_above_their_positions_on_the_facet(flat):
+def test_samples_are_on_the_surface_above_their_facet_positions(flat):
     transferred = transfer(flat, surface())
     for before, after in zip(flat.buckets, transferred.buckets, strict=True):
         assert torch.equal(before.inside, after.inside)
         there, here = places(after)[after.inside], places(before)[before.inside]
         assert_close(there[:, :2], here[:, :2])
-        # Faces are chords: a sixth of a thousandth below the dome, at most.
+        # Faces are chords: at most a sixth of a thousandth below the dome.
         assert_close(there[:, 2], bump(there[:, :2]), rtol=0, atol=2e-4)
         assert after.depth.abs().max() > 0.05
 
 
-def test_the_surfaces_normals_are_transferred_along(flat):
+def test_normals_of_the_surface_are_transferred(flat):
     transferred = transfer(flat, surface())
     for templates in transferred.buckets:
         world = rotate(
@@ -65,7 +65,7 @@ def test_the_surfaces_normals_are_transferred_along(flat):
     assert_close(flat_ones, coarse_normals(flat.coarse, flat.buckets[0]))
 
 
-def test_where_there_is_no_surface_there_is_no_sample(flat):
+def test_samples_without_surface_are_invalid(flat):
     whole = surface()
     left = whole.vertices_world[whole.faces][..., 0].amax(dim=1) < 0
     transferred = transfer(flat, whole.replace(faces=whole.faces[left]))
@@ -81,7 +81,7 @@ def test_a_surface_seen_from_behind_is_not_transferred(flat):
     assert not any(bucket.inside.any() for bucket in rotated.buckets)
 
 
-def test_the_nearer_of_two_sheets_is_transferred(flat):
+def test_the_nearest_of_two_sheets_is_transferred(flat):
     near, far = surface(), surface()
     lifted = far.vertices_world + far.vertices_world.new_tensor([0, 0, 0.4])
     both = Mesh(
@@ -92,8 +92,8 @@ def test_the_nearer_of_two_sheets_is_transferred(flat):
         assert_close(one.depth[one.inside], other.depth[one.inside])
 
 
-def test_views_are_registered_on_what_is_transferred(plane_scene, flat):
-    """On the true plane every view shows each sample's own albedo; on the facets none does."""
+def test_views_are_warped_onto_the_transferred_surface(plane_scene, flat):
+    """On the true plane, views show the albedo of each sample; on the facets they do not."""
     normal = torch.tensor([0.2, -0.1, 1.0], dtype=torch.float64)
     whole = surface()
     xy = whole.vertices_world[:, :2]

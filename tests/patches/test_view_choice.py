@@ -26,7 +26,7 @@ def cameras_at(eyes) -> Cameras:
 
 
 def square(z: float = 0.0, half: float = 0.1) -> Mesh:
-    """Two facets across z, facing it."""
+    """Return two facets perpendicular to z that face it."""
     corners = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half
     vertices = corners.double() + torch.tensor([0, 0, z]).double()
     return Mesh(vertices_world=vertices, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
@@ -46,23 +46,23 @@ def weights(mesh: Mesh, cameras: Cameras, hiding: Mesh | None = None) -> torch.T
 
 @pytest.fixture(scope="module")
 def ball() -> tuple[Mesh, Cameras]:
-    """A ball, and 90 cameras at three heights round about."""
+    """A ball, and 90 cameras around it at three elevations."""
     vertices, faces = icosphere(3)
     mesh = Mesh(vertices_world=vertices.double(), faces=faces)
     directions = [turntable_directions(30, elevation_deg=each) for each in (-35.0, 5.0, 45.0)]
     return mesh, cameras_at(DISTANCE * torch.cat(directions))
 
 
-def test_a_sample_has_the_pixels_of_its_projected_area_and_one_at_most():
+def test_the_weight_of_a_view_is_the_projected_area_up_to_one_pixel():
     tilt = math.radians(50)
     eyes = [[0, 0, DISTANCE], [DISTANCE * math.sin(tilt), 0, DISTANCE * math.cos(tilt)], [0, 0, 1]]
     found = weights(square(half=1e-4), cameras_at(eyes))
     pixels = (SPACING * FOCAL / DISTANCE) ** 2
     expected = torch.tensor([pixels, pixels * math.cos(tilt), 1.0]).double()
-    assert_close(found[0], expected, rtol=1e-4, atol=0)  # the centre is as far off the axis
+    assert_close(found[0], expected, rtol=1e-4, atol=0)  # facet centres are off the axis by as much
 
 
-def test_views_that_do_not_see_a_facet_have_no_pixels_of_it():
+def test_views_that_do_not_see_a_facet_have_weight_zero():
     hiding = square(z=1.0, half=0.5)
     away = cameras_at([[0, 0, -DISTANCE], [0, 0, DISTANCE], [DISTANCE, 0, DISTANCE]])
     shifted = away.intrinsics.clone()
@@ -79,15 +79,15 @@ def some_weights(generator, facets=12, views=30):
     return weight * (weight > 0.4), normalize(directions, dim=1)
 
 
-def test_few_views_are_all_chosen_but_those_that_see_nothing(generator):
+def test_few_views_are_all_chosen_unless_they_see_no_facet(generator):
     weight, directions = some_weights(generator)
     weight[:, 7] = 0
     assert best_views(weight, directions, 40).logical_not().nonzero().tolist() == [[7]]
     assert best_views(weight, directions, 5).sum() == 5
-    assert best_views(torch.zeros(3, 4), torch.eye(4)[:, :3], 2).sum() == 1  # never none
+    assert best_views(torch.zeros(3, 4), torch.eye(4)[:, :3], 2).sum() == 1  # at least one
 
 
-def test_views_that_see_nothing_change_no_choice(generator):
+def test_views_that_see_no_facet_do_not_affect_the_choice(generator):
     weight, directions = some_weights(generator)
     more = torch.cat([weight, torch.zeros(12, 9)], dim=1), torch.cat([directions, directions[:9]])
     found = best_views(*more, 10)
@@ -95,7 +95,7 @@ def test_views_that_see_nothing_change_no_choice(generator):
     assert not found[30:].any()
 
 
-def test_the_order_of_views_is_that_of_the_choice(generator):
+def test_the_choice_does_not_depend_on_the_order_of_views(generator):
     weight, directions = some_weights(generator)
     order = torch.randperm(30, generator=generator)
     found = best_views(weight[:, order], directions[order], 10)
@@ -112,19 +112,19 @@ def test_facets_share_the_views_evenly():
     assert seen.min() >= 3  # by weight alone, the second had none
 
 
-def test_chosen_views_spread_and_those_of_one_pose_are_taken_in_turn():
+def test_chosen_views_spread_and_alternate_among_poses():
     steps = torch.deg2rad(torch.linspace(-40, 40, 41, dtype=torch.float64))
     arc = torch.stack([steps.sin(), 0 * steps, -steps.cos()], dim=1)
     chosen = best_views(steps.cos()[None], arc, 9)
     picked = torch.rad2deg(steps[chosen])
-    assert picked.diff().min() >= 6  # of 10 if they were even, and 2 by weight alone
-    poses = arc[::8].repeat_interleave(5, dim=0)  # six, each with five lights
+    assert picked.diff().min() >= 6  # 10 if evenly spaced, and 2 by weight alone
+    poses = arc[::8].repeat_interleave(5, dim=0)  # six poses, each with five lights
     chosen = best_views(torch.ones(1, 30), poses.float(), 12).reshape(6, 5)
     assert (chosen.sum(dim=1) == 2).all()
     assert chosen.any(dim=0).sum() >= 4  # not the first two lights of each
 
 
-def test_blocks_hold_every_facet_once_and_show_each_in_most_views_that_it_may_have(ball):
+def test_blocks_contain_every_facet_once_with_most_of_its_views(ball):
     mesh, cameras = ball
     count = 12
     seen = weights(mesh, cameras) > 0
@@ -140,14 +140,14 @@ def test_blocks_hold_every_facet_once_and_show_each_in_most_views_that_it_may_ha
     assert len(blocks) < 100
 
 
-def test_the_number_of_threads_changes_no_block(ball):
+def test_blocks_do_not_depend_on_the_number_of_threads(ball):
     found = on_threads(lambda: view_blocks(*ball, torch.tensor(SPACING).double(), 12), 1, 2)
     for one, other in zip(*found, strict=True):
         assert torch.equal(one[0], other[0])
         assert torch.equal(one[1], other[1])
 
 
-def test_views_are_chosen_only_where_more_face_a_facet_than_it_may_have(ball):
+def test_views_are_chosen_only_if_more_than_num_views_face_a_facet(ball):
     mesh, cameras = ball
     coarse = CoarseMesh(mesh=mesh, reference=0, is_point=torch.ones(len(mesh.vertices_world)) > 0)
     most = int(views_facing(mesh.vertices_world, mesh.faces, cameras).max())
@@ -164,7 +164,7 @@ def test_views_are_chosen_only_where_more_face_a_facet_than_it_may_have(ball):
     assert torch.equal(*inside)
 
 
-def test_more_photographs_than_a_facet_may_have_make_no_coarser_surface(ball):
+def test_photographs_beyond_num_views_do_not_coarsen_the_surface(ball):
     mesh, cameras = ball
     coarse = CoarseMesh(mesh=mesh, reference=0, is_point=torch.ones(len(mesh.vertices_world)) > 0)
     twice = Cameras.cat([cameras, cameras])

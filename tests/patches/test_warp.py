@@ -19,7 +19,7 @@ def registered(plane_scene, plane_mesh):
     return Warp()(plane_scene.views, plane_scene.cameras, patches)
 
 
-def test_every_view_gives_the_albedo_at_each_samples_own_point(registered):
+def test_every_view_gives_the_albedo_at_each_sample_point(registered):
     for templates, seen in zip(registered.patches.buckets, registered.buckets, strict=True):
         points = places(templates)
         x, y = points[..., 0], points[..., 1]
@@ -38,7 +38,7 @@ def test_missing_samples_are_zero(registered):
     assert 0 <= counts["missing_samples"] < 0.2 * counts["samples"]
 
 
-def test_viewers_are_the_directions_to_the_cameras(registered, plane_scene):
+def test_viewers_are_directions_to_the_cameras(registered, plane_scene):
     for templates, seen in zip(registered.patches.buckets, registered.buckets, strict=True):
         world_from_patch = invert_rigid(templates.patch_from_world)
         toward = plane_scene.cameras.centers_world - world_from_patch[:, None, :3, 3]
@@ -55,7 +55,7 @@ def test_saturated_dark_masked_and_outside_samples_are_missing(plane_scene, plan
     masks[2] = False
     views = plane_scene.views.replace(images=images, masks=masks)
     shifted = plane_scene.cameras.intrinsics.clone()
-    shifted[3, 0, 2] += 1000  # everything of view 3 falls outside its frame
+    shifted[3, 0, 2] += 1000  # view 3 has the object outside its frame
     cameras = plane_scene.cameras.replace(intrinsics=shifted)
     for seen in Warp()(views, cameras, patches).buckets:
         valid = seen.valid.sum(dim=(0, 2, 3))
@@ -63,7 +63,7 @@ def test_saturated_dark_masked_and_outside_samples_are_missing(plane_scene, plan
         assert valid[4] > 0
 
 
-def test_a_facet_turned_away_is_not_seen(plane_scene, plane_mesh):
+def test_an_averted_facet_is_not_seen(plane_scene, plane_mesh):
     flipped = plane_mesh.replace(mesh=plane_mesh.mesh.replace(faces=plane_mesh.mesh.faces.flip(1)))
     patches = Decompose()(flipped, plane_scene.cameras)
     for seen in Warp()(plane_scene.views, plane_scene.cameras, patches).buckets:
@@ -83,7 +83,7 @@ def test_a_facet_in_front_hides_the_one_behind(plane_scene, plane_mesh):
     center = plane_scene.cameras.centers_world[2]
     for templates, bucket in zip(patches.buckets, seen.buckets, strict=True):
         points = places(templates)
-        # Where the ray to the centre of view 2 passes the cover's plane, in the cover's corners.
+        # Intersections of rays to the centre of view 2 with the cover, in its barycentrics.
         normal = torch.linalg.cross(cover[1] - cover[0], cover[2] - cover[0])
         ray = center - points
         reach = ((cover[0] - points) @ normal) / (ray @ normal)
@@ -109,7 +109,7 @@ def test_pyramid_level_is_the_logarithm_of_the_footprint():
         assert_close(pyramid_level(pixels), torch.full((1, 6, 8), level))
 
 
-def test_a_fine_stripe_pattern_seen_from_afar_averages_out():
+def test_a_fine_stripe_pattern_seen_from_far_averages_out():
     stripes = (torch.arange(64) % 2).float().expand(1, 64, 64)
     coarse = torch.nn.functional.avg_pool2d(stripes[None], 4)[0]
     level_2 = coarse.expand(1, 16, 16)
@@ -121,14 +121,14 @@ def test_a_fine_stripe_pattern_seen_from_afar_averages_out():
     assert_close(sampled, torch.full_like(sampled, 0.5))
 
 
-def test_impossible_settings_are_refused():
+def test_impossible_settings_are_rejected():
     with pytest.raises(ConfigError, match="saturation_level"):
         WarpConfig(dark_level=0.5, saturation_level=0.4)
     with pytest.raises(ConfigError, match="max_tilt_deg"):
         WarpConfig(max_tilt_deg=90.0)
 
 
-def test_pixels_that_are_no_numbers_are_missing_and_spoil_no_others(plane_scene, plane_mesh):
+def test_nan_pixels_are_missing_and_do_not_affect_others(plane_scene, plane_mesh):
     patches = Decompose()(plane_mesh, plane_scene.cameras)
     images = plane_scene.views.images.clone()
     rows, columns = images.shape[-2] // 2, images.shape[-1] // 2
@@ -143,5 +143,5 @@ def test_pixels_that_are_no_numbers_are_missing_and_spoil_no_others(plane_scene,
         lost += int((wanted.valid & ~found.valid).sum())
         same = found.valid & wanted.valid
         off = (found.radiance - wanted.radiance).abs().amax(dim=2)[same]
-        assert off.max() < 0.1  # of a pixel's share that may be missing in a sample
+        assert off.max() < 0.1  # of the fraction of a pixel that a sample may lack
     assert 0 < lost < 60
