@@ -16,7 +16,7 @@ def all_seen() -> torch.Tensor:
     return torch.ones(5, VIEWS, dtype=torch.bool)
 
 
-def test_without_robustness_the_albedo_is_the_best_there_is(generator, shading):
+def test_without_robustness_the_albedo_is_that_of_least_squares(generator, shading):
     radiance = torch.rand(5, VIEWS, 2, generator=generator, dtype=torch.float64)
     scale = torch.full((5,), 1e4, dtype=torch.float64)  # Cauchy's loss is the square
     cost = inconsistency(radiance, shading, all_seen(), scale) * 2e8  # 2 c^2
@@ -25,19 +25,19 @@ def test_without_robustness_the_albedo_is_the_best_there_is(generator, shading):
     assert_close(cost, apart.square().sum(dim=1).amin(dim=-1), rtol=1e-4, atol=1e-4)
 
 
-def test_one_view_in_shadow_hardly_shifts_the_others_cost(shading):
+def test_one_shadowed_view_hardly_shifts_the_cost(shading):
     scale = torch.full((5,), 0.02, dtype=torch.float64)
     radiance = 0.5 * shading[..., None].repeat(1, 1, 1)
     radiance[:, 0] = 0
     robust = inconsistency(radiance, shading, all_seen(), scale, iterations=8)
     alone = inconsistency(radiance[:, :1], shading[:, :1], all_seen()[:, :1], scale)
-    assert (robust > 1).all()  # the shadow itself costs
-    assert (alone < 1e-9).all()  # a view alone always agrees with itself
+    assert (robust > 1).all()  # the shadow itself has a cost
+    assert (alone < 1e-9).all()  # a single view is always consistent
     right = 0.5 * torch.log1p((0.5 * shading[:, :1] / 0.02).square())
-    assert_close(robust, right, rtol=0.01, atol=0)  # and the others as good as nothing
+    assert_close(robust, right, rtol=0.01, atol=0)  # the others have almost none
 
 
-def test_views_that_disagree_are_outvoted_whatever_their_number_under_a_half(shading):
+def test_any_minority_of_disagreeing_views_is_outvoted(shading):
     scale = torch.full((5,), 0.01, dtype=torch.float64)
     radiance = 0.5 * shading[..., None]
     radiance[:, :3] *= 1.6
@@ -46,8 +46,8 @@ def test_views_that_disagree_are_outvoted_whatever_their_number_under_a_half(sha
     assert_close(cost, right, rtol=0.02, atol=0)
 
 
-def test_every_sample_has_a_cost_of_its_own_scale(generator, shading):
-    """Against the formula, at the albedo that minimizes it on a grid; the median starts there."""
+def test_the_cost_of_every_sample_is_scaled_by_its_noise(generator, shading):
+    """Compare with the formula at the albedo that minimizes it on a grid, near the median."""
     albedo = 0.3 + torch.rand(5, 1, 1, generator=generator, dtype=torch.float64)
     scale = torch.tensor([0.01, 0.02, 0.05, 0.1, 0.2], dtype=torch.float64)
     noise = torch.randn(5, VIEWS, 2, generator=generator, dtype=torch.float64)

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 from pimper_torch.method.sweep.costs import best_views, poses_first, view_scores
 
 
-def test_the_best_usable_views_are_chosen_and_no_others():
+def test_only_the_best_usable_views_are_chosen():
     generator = torch.Generator().manual_seed(63)
     score = torch.rand(50, 9, generator=generator)
     usable = torch.rand(50, 9, generator=generator) > 0.5
@@ -20,14 +20,14 @@ def test_the_best_usable_views_are_chosen_and_no_others():
 
 def test_the_score_is_the_cosine_times_the_resolution_times_the_relative_light():
     facing = torch.tensor([[0.5, 1.0, 0.8, 1.0]])
-    footprint = torch.tensor([[3.0, 0.5, 1.0, 2.0]])  # more than a pixel is no better than one
-    shading = torch.tensor([[2.0, 4.0, 1.0, -1.0]])  # of a mean of 7/4 with -1 taken for 0
+    footprint = torch.tensor([[3.0, 0.5, 1.0, 2.0]])  # more than a pixel counts as one
+    shading = torch.tensor([[2.0, 4.0, 1.0, -1.0]])  # the mean is 7/4, with -1 counted as 0
     expected = torch.tensor([[0.5 * 1.0, 0.5 * 1.0, 0.8 / 1.75, 0.0]])
     assert_close(view_scores(facing, footprint, shading), expected)
-    assert (view_scores(facing, footprint, 0 * shading) == 0).all()  # no light at all
+    assert (view_scores(facing, footprint, 0 * shading) == 0).all()  # no light
 
 
-def test_the_best_view_of_every_pose_goes_before_the_second_of_any():
+def test_the_best_view_of_each_pose_ranks_before_second_views():
     generator = torch.Generator().manual_seed(64)
     score = torch.rand(40, 9, generator=generator)
     usable = torch.rand(40, 9, generator=generator) > 0.3

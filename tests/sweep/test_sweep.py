@@ -14,8 +14,8 @@ def sweep(lifted, config: SweepConfig | None = None) -> SweptPatches:
     return Sweep(config)(scene.views, scene.cameras, lifted.seen, lifted.photometric)
 
 
-def told(swept: SweptPatches) -> tuple[torch.Tensor, torch.Tensor]:
-    """Offsets in samples, and their standard deviations, where the sweep says anything."""
+def determined(swept: SweptPatches) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return determined offsets and their standard deviations, in samples."""
     offsets, deviations = [], []
     for templates, found in zip(swept.patches.buckets, swept.buckets, strict=True):
         known = found.information > 0
@@ -26,9 +26,9 @@ def told(swept: SweptPatches) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("height", [-1.7, 0.0, 1.2])
-def test_the_sweep_finds_how_far_the_facets_lie_off(lift, height):
+def test_the_sweep_recovers_the_offset_of_facets(lift, height):
     lifted = lift(height)
-    offsets, _ = told(sweep(lifted))
+    offsets, _ = determined(sweep(lifted))
     inside = sum(int(bucket.inside.sum()) for bucket in lifted.seen.patches.buckets)
     assert len(offsets) > 0.8 * inside
     off = (offsets + lifted.height).abs()
@@ -36,28 +36,28 @@ def test_the_sweep_finds_how_far_the_facets_lie_off(lift, height):
     assert off.quantile(0.9) < 0.2
 
 
-def test_what_lies_beyond_the_range_is_not_told(lift):
+def test_offsets_beyond_the_range_are_not_reported(lift):
     lifted = lift(6.0)
-    offsets, _ = told(sweep(lifted, SweepConfig(steps=2)))
+    offsets, _ = determined(sweep(lifted, SweepConfig(steps=2)))
     inside = sum(int(bucket.inside.sum()) for bucket in lifted.seen.patches.buckets)
     assert len(offsets) < 0.5 * inside
 
 
-def test_without_texture_the_sweep_says_that_it_does_not_know(lift):
-    bare, textured = told(sweep(lift(0.5, textured=False))), told(sweep(lift(0.5)))
-    # All heights look alike but for the shading of a plane, which says nothing of height.
-    heard = [float((1 / deviation.square()).sum()) for _, deviation in (bare, textured)]
-    assert heard[0] < 0.01 * heard[1]
+def test_without_texture_the_sweep_has_little_information(lift):
+    bare, textured = (determined(sweep(lift(0.5, textured=each))) for each in (False, True))
+    # All heights are equally consistent: a plane's shading does not depend on height.
+    total = [float((1 / deviation.square()).sum()) for _, deviation in (bare, textured)]
+    assert total[0] < 0.01 * total[1]
 
 
-def test_views_of_another_light_than_fitted_spoil_the_height_less_than_a_step(lift):
+def test_wrong_lights_bias_heights_by_less_than_a_step(lift):
     lifted = lift(1.2)
     gain = torch.where(torch.arange(9) % 4 == 0, 1.6, 1.0)[:, None]  # three of nine are wrong
     wrong = each_bucket(
         lifted.photometric, lambda found: found.replace(lights_patch=gain * found.lights_patch)
     )
     scene = lifted.scene
-    offsets, _ = told(Sweep()(scene.views, scene.cameras, lifted.seen, wrong))
+    offsets, _ = determined(Sweep()(scene.views, scene.cameras, lifted.seen, wrong))
     assert (offsets + lifted.height).abs().median() < 0.3
 
 
@@ -77,9 +77,9 @@ def test_samples_without_photometric_normals_are_swept_alike(lift):
     assert all((bucket.information == 0).all() for bucket in unseen.buckets)
 
 
-def test_fewer_views_suffice_and_too_few_are_none(lift):
+def test_fewer_views_suffice_down_to_min_views(lift):
     lifted = lift(-1.0)
-    offsets, _ = told(sweep(lifted, SweepConfig(num_views=5)))
+    offsets, _ = determined(sweep(lifted, SweepConfig(num_views=5)))
     assert (offsets + lifted.height).abs().median() < 0.1
     none = sweep(lifted, SweepConfig(min_views=10, num_views=10))
     assert all((bucket.information == 0).all() for bucket in none.buckets)
@@ -88,7 +88,7 @@ def test_fewer_views_suffice_and_too_few_are_none(lift):
 
 @pytest.mark.parametrize("height", [0.4, -1.1])
 @pytest.mark.parametrize("noise", [0.005, 0.01, 0.02, 0.04])
-def test_the_claimed_deviation_is_that_of_the_error(lift, noise, height):
+def test_the_stated_deviation_is_that_of_the_error(lift, noise, height):
     lifted = lift(height)
     views, cameras, fitted = lifted.scene.views, lifted.scene.cameras, lifted.photometric
     drawn = torch.randn(views.images.shape, generator=torch.Generator().manual_seed(0))
@@ -96,21 +96,21 @@ def test_the_claimed_deviation_is_that_of_the_error(lift, noise, height):
     seen = Warp()(noisy, cameras, fitted.patches)
     buckets = []
     for rough, smooth, found in zip(seen.buckets, lifted.seen.buckets, fitted.buckets, strict=True):
-        # What a factorization of these photographs would leave.
+        # The residual that a factorization of these photographs would have.
         spread = (rough.gray - smooth.gray)[rough.valid & smooth.valid].std()
         ended = found.convergence
         ended = ended.replace(residual=torch.full_like(ended.residual, float(spread)))
         buckets.append(found.replace(convergence=ended))
     swept = Sweep()(noisy, cameras, seen, fitted.replace(buckets=tuple(buckets)))
-    offsets, deviations = told(swept)
+    offsets, deviations = determined(swept)
     error = (offsets + lifted.height) / (deviations / swept.averaged**0.5)
-    # 0.6745: the median of a standard normal's absolute values. Measured 0.82 to 1.21: how many
-    # samples share pixels, and so their noise, varies with the view.
+    # 0.6745: the median of a standard normal's absolute values. Measured 0.82 to 1.21: the
+    # number of samples that share pixels, and thus noise, varies with the view.
     assert 0.8 < float(error.abs().median()) / 0.6745 < 1.25
 
 
 def copied(lifted, copies):
-    """The same photographs several times, with the pose of each, or as if each had its own."""
+    """Return repeated photographs, with poses that identify the repetitions."""
     scene = lifted.scene
     views = scene.views.take(copies)
     views = views.replace(names=tuple(map(str, range(len(copies)))), poses=torch.tensor(copies))
@@ -123,15 +123,15 @@ def copied(lifted, copies):
     return views, scene.cameras.take(copies), seen, photometric
 
 
-@pytest.mark.parametrize("kind", [torch.float32, torch.float64])  # compiled, and torch
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])  # compiled and torch
 def test_photographs_of_one_pose_are_compared_over_poses_first(lift, kind):
     lifted = lift(0.4)
     five = [record.to(kind) for record in copied(lifted, [0, 2, 4, 6, 8])]
     many = [record.to(kind) for record in copied(lifted, [0, 2, 2, 2, 2, 4, 4, 6, 8, 8, 8, 8])]
     config = SweepConfig(num_views=5)
-    alone, again = (told(Sweep(config)(*records))[0] for records in (five, many))
+    alone, again = (determined(Sweep(config)(*records))[0] for records in (five, many))
     assert_close(alone, again)
     unknown = many[0].replace(poses=None), *many[1:]
-    assert len(told(Sweep(config)(*unknown))[0]) != len(alone)
+    assert len(determined(Sweep(config)(*unknown))[0]) != len(alone)
     two = [record.to(kind) for record in copied(lifted, [0, 0, 0, 8, 8, 8])]
-    assert len(told(Sweep(config)(*two))[0]) == 0  # three poses are needed
+    assert len(determined(Sweep(config)(*two))[0]) == 0  # three poses are needed
