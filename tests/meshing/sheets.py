@@ -5,7 +5,7 @@ from torch import Tensor
 
 
 def sheet_of(side: int, bend: float) -> tuple[Tensor, Tensor]:
-    """Give vertices and faces of a sheet of unit steps, bent along x, that faces -z."""
+    """Return vertices and faces of a sheet of unit spacing, bent along x, that faces -z."""
     row, column = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
     x, y = column.flatten().double(), row.flatten().double()
     vertices = torch.stack([x, y, bend * x * x], dim=1)

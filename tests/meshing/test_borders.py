@@ -12,18 +12,18 @@ LENGTH = 3.0
 
 
 def protruding(vertices, faces, length, unsure=None):
-    """Mark what sticks out, where nothing is determined unless it is said."""
+    """Mark protruding faces; by default no face is determined."""
     unsure = torch.ones(len(faces), dtype=torch.bool) if unsure is None else unsure
     return borders.protruding(vertices, faces, length, unsure, face_edges(faces))
 
 
 def sheet(side=61):
-    """Vertices and faces of a square sheet of unit steps, bent a little, and the faces' middles."""
+    """Return vertices, faces and face centres of a slightly bent square sheet of unit spacing."""
     vertices, faces = sheet_of(side, 0.003)
     return vertices, faces, vertices[faces].mean(dim=1)[:, :2]
 
 
-def test_straight_borders_stay_and_right_angles_are_rounded():
+def test_straight_borders_are_kept_and_right_angles_rounded():
     vertices, faces, middle = sheet()
     found = protruding(vertices, faces, LENGTH)
     corner = torch.tensor([[0.0, 0.0], [0.0, 60.0], [60.0, 0.0], [60.0, 60.0]]).double()
@@ -32,14 +32,14 @@ def test_straight_borders_stay_and_right_angles_are_rounded():
     assert not found[away > 3.5 * LENGTH].any()
 
 
-def test_a_round_border_of_a_few_lengths_stays():
+def test_a_round_border_of_a_few_lengths_is_kept():
     vertices, faces, middle = sheet()
     disc = (middle - 30).norm(dim=1) < 6.0 * LENGTH
     found = protruding(vertices, faces[disc], LENGTH)
     assert not found[(middle[disc] - 30).norm(dim=1) < 6.0 * LENGTH - 2].any()
 
 
-def test_teeth_of_a_length_are_cut_off_and_the_notches_between_them_stay():
+def test_teeth_are_cut_off_and_notches_kept():
     vertices, faces, middle = sheet()
     x, y = middle.unbind(dim=1)
     height = 5 * (1 - ((y / 3) % 2 - 1).abs())  # teeth 6 wide and 5 high
@@ -51,7 +51,7 @@ def test_teeth_of_a_length_are_cut_off_and_the_notches_between_them_stay():
     assert not found[inside & (x > 12) & (x < 29)].any()
 
 
-def test_flaps_and_shreds_go_as_far_as_they_are_narrow():
+def test_narrow_flaps_are_removed():
     vertices, faces, middle = sheet()
     x, y = middle.unbind(dim=1)
     body, flap = x < 30, (y - 30).abs() < 0.7 * LENGTH
@@ -62,7 +62,7 @@ def test_flaps_and_shreds_go_as_far_as_they_are_narrow():
     assert not found[inside[kept]].any()
 
 
-def test_what_is_determined_stays_and_so_does_what_it_holds():
+def test_determined_faces_and_those_they_support_are_kept():
     vertices, faces, middle = sheet()
     x, y = middle.unbind(dim=1)
     kept = (x < 30) | ((y - 30).abs() < 0.7 * LENGTH)
@@ -73,7 +73,7 @@ def test_what_is_determined_stays_and_so_does_what_it_holds():
     assert not protruding(vertices, faces[kept], LENGTH, torch.zeros_like(unsure)).any()
 
 
-def test_small_holes_are_no_borders_and_neither_is_a_closed_surface():
+def test_small_holes_and_closed_surfaces_have_no_protrusions():
     vertices, faces, middle = sheet()
     round_hole = (middle - 30).norm(dim=1) < 0.9 * LENGTH
     kept = faces[~round_hole]
@@ -83,7 +83,7 @@ def test_small_holes_are_no_borders_and_neither_is_a_closed_surface():
     assert not protruding(ball, closed, 0.2).any()
 
 
-def test_scale_and_place_change_nothing():
+def test_protrusions_are_invariant_to_similarities():
     vertices, faces, middle = sheet()
     kept = faces[(middle[:, 0] < 30) | ((middle[:, 1] - 30).abs() < 2)]
     turn = torch.tensor(trimesh.transformations.rotation_matrix(math.pi / 5, [1, 2, 3])[:3, :3])

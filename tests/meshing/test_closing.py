@@ -11,7 +11,7 @@ from pimper_torch.runtime.errors import InputError
 
 
 def ball(*, above: float, level: int = 4) -> Mesh:
-    """Give a ball whose part above a height, and below its negative, is missing."""
+    """Return a ball without its parts above a height and below the negative height."""
     vertices, faces = icosphere(level)
     vertices = vertices.double()
     left = (vertices[faces].mean(dim=1)[:, 2].abs() < above).nonzero()[:, 0]
@@ -31,14 +31,14 @@ def solid(mesh: Mesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices_world.numpy(), mesh.faces.numpy(), process=False)
 
 
-def test_a_ball_without_its_poles_gets_two_flat_caps():
+def test_a_ball_without_poles_is_closed_by_two_flat_caps():
     mesh = ball(above=0.7)
     found = closed(mesh)
     whole = solid(found.mesh)
     assert whole.is_watertight
     assert whole.is_winding_consistent
     assert found.borders == 2
-    # A ball's slice between planes at 0.7 has the volume 2 pi (h - h^3 / 3), borders are ragged.
+    # A slice of a ball between planes at ±h has volume 2 pi (h - h^3 / 3); borders are ragged.
     assert whole.volume == pytest.approx(2 * torch.pi * (0.7 - 0.7**3 / 3), rel=0.03)
     caps = found.mesh.faces[~found.measured]
     assert_close(
@@ -50,7 +50,7 @@ def test_a_ball_without_its_poles_gets_two_flat_caps():
     assert bool(((found.mesh.normals_world[len(mesh.vertices_world) :, 2]).abs() > 0.9).all())
 
 
-def test_what_was_measured_stays_and_caps_say_that_they_are_not():
+def test_measured_surface_is_kept_and_caps_are_marked():
     mesh = ball(above=0.7)
     found = closed(mesh)
     count = len(mesh.vertices_world)
@@ -65,7 +65,7 @@ def test_what_was_measured_stays_and_caps_say_that_they_are_not():
     assert_close(found.mesh.albedo[count:], torch.full_like(found.mesh.albedo[count:], 0.4))
 
 
-def test_a_border_whose_albedo_no_photograph_tells_is_closed_too():
+def test_a_border_without_albedo_is_closed():
     mesh = ball(above=0.7)
     unknown = torch.tensor(border_cycles(mesh.faces)[0][:5])
     albedo = mesh.albedo.clone()
@@ -77,7 +77,7 @@ def test_a_border_whose_albedo_no_photograph_tells_is_closed_too():
     assert torch.equal(found.vertices_world, closed(mesh).mesh.vertices_world)
 
 
-def test_a_closed_mesh_comes_back():
+def test_a_closed_mesh_is_unchanged():
     vertices, faces = icosphere(2)
     found = closed(Mesh(vertices_world=vertices, faces=faces))
     assert found.borders == 0
@@ -85,7 +85,7 @@ def test_a_closed_mesh_comes_back():
     assert torch.equal(found.mesh.faces, faces)
 
 
-def test_holes_that_meet_in_a_vertex_and_pieces_are_closed_one_by_one():
+def test_touching_holes_and_separate_components_are_closed():
     vertices, faces = icosphere(2)
     fan = (faces == 20).any(dim=1).nonzero()[:, 0].tolist()
     others = {index: {*faces[index].tolist()} - {20} for index in fan}
@@ -97,10 +97,10 @@ def test_holes_that_meet_in_a_vertex_and_pieces_are_closed_one_by_one():
     found = closed(Mesh(vertices_world=both, faces=two))
     assert solid(found.mesh).is_watertight
     assert len(face_components(found.mesh.faces).unique()) == 2
-    assert found.borders == 2  # holes that meet are one
+    assert found.borders == 2  # touching holes count as one
 
 
-def test_a_strip_that_is_twisted_once_has_no_inside():
+def test_a_moebius_strip_is_rejected():
     count = 12
     turn = torch.arange(count)
     upper, lower = turn, turn + count
@@ -116,11 +116,11 @@ def test_a_strip_that_is_twisted_once_has_no_inside():
         closed(Mesh(vertices_world=torch.rand(2 * count, 3), faces=faces))
 
 
-def test_caps_follow_their_border_to_autograd():
+def test_caps_propagate_gradients_to_their_border():
     mesh = ball(above=0.5, level=2)
     vertices = mesh.vertices_world.clone().requires_grad_()
     found = closed(mesh.replace(vertices_world=vertices))
-    # Where the border is moved, its cap goes along.
+    # Caps move with their border.
     found.mesh.vertices_world[len(vertices) :].sum().backward()
     borders = torch.cat([torch.tensor(cycle) for cycle in border_cycles(mesh.faces)])
     assert set(vertices.grad.abs().sum(dim=1).nonzero()[:, 0].tolist()) == set(borders.tolist())

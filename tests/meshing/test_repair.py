@@ -22,7 +22,7 @@ from pimper_torch.records import Mesh
 
 
 def supported(vertices, faces, facet=None):
-    """A surface with support everywhere; facets are octants unless they are given."""
+    """Return a fully supported surface; facets default to octants."""
     if facet is None:
         facet = ((vertices > 0).long() * torch.tensor([1, 2, 4])).sum(dim=1)
     certain = torch.full_like(vertices[:, 0], 1e30)
@@ -30,7 +30,7 @@ def supported(vertices, faces, facet=None):
 
 
 def folded_sphere(subdivisions=4):
-    """A unit sphere, and the same with vertices pushed in and over others in three places."""
+    """Return a unit sphere, and one folded in three places."""
     vertices, faces = icosphere(subdivisions)
     dragged = vertices.clone()
     step = 2.5 * float(sides(vertices, faces).median())
@@ -55,7 +55,7 @@ def volume(mesh):
     return trimesh.Trimesh(mesh.vertices_world.numpy(), mesh.faces.numpy(), process=False).volume
 
 
-def test_a_folded_sphere_was_slit_and_comes_out_closed():
+def test_a_folded_sphere_stays_closed():
     sphere, surface = folded_sphere()
     slit = closedness(Extract()(surface))
     assert len(slit.loops) >= 3
@@ -67,9 +67,9 @@ def test_a_folded_sphere_was_slit_and_comes_out_closed():
     assert torch.equal(mesh.faces, surface.faces)
     assert not overturned(mesh, surface.facet).any()
     true = volume(surface.replace(vertices_world=sphere))
-    assert abs(volume(mesh) / true - 1) < 3e-5  # what the plates cut off
+    assert abs(volume(mesh) / true - 1) < 3e-5  # plates cut off a little
     assert abs(volume(surface) / true - 1) > 3e-4
-    # A plate over three rings of the sphere is off by a thousandth; vertices were by 50.
+    # A plate over three rings of the sphere is off by a thousandth; vertices were off by 50.
     assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 2e-3
 
 
@@ -87,7 +87,7 @@ def test_only_repaired_vertices_change_and_their_confidence_is_zero():
     assert_close(mesh.normals_world[beside], own[beside])
 
 
-def test_without_repair_exactly_the_overturned_faces_go():
+def test_without_repair_exactly_the_flipped_faces_are_removed():
     _, surface = folded_sphere()
     gone = overturned(surface, surface.facet)
     mesh = Extract()(surface)
@@ -101,7 +101,7 @@ def test_without_repair_exactly_the_overturned_faces_go():
     assert set(mesh.confidence.tolist()) == {1.0}
 
 
-def test_looking_only_round_the_folds_changes_nothing():
+def test_restricting_the_search_to_folds_does_not_change_the_result():
     _, surface = folded_sphere(5)
     vertices = surface.vertices_world
     found = faults(vertices, surface.faces, surface.facet, 10.0)
@@ -113,7 +113,7 @@ def test_looking_only_round_the_folds_changes_nothing():
     assert_close(Repair()(surface).vertices_world, whole)
 
 
-def test_a_genuine_opening_stays_as_it_is():
+def test_a_real_opening_is_kept():
     _, surface = folded_sphere()
     below = (surface.vertices_world[:, 2] > -0.3) & (surface.vertices_world[:, 0] > -0.9)
     bowl = surface.replace(faces=surface.faces[below[surface.faces].all(dim=1)])
@@ -128,7 +128,7 @@ def test_a_genuine_opening_stays_as_it_is():
     assert closedness(mesh).folds == 0
 
 
-def test_a_fold_at_the_border_goes_as_before():
+def test_a_fold_at_the_border_is_removed():
     _, surface = folded_sphere()
     fold = faults(surface.vertices_world, surface.faces, surface.facet, torch.inf).broken(
         surface.vertices_world
@@ -147,7 +147,7 @@ def test_a_fold_at_the_border_goes_as_before():
     assert_close(mesh.vertices_world[mesh.faces], cut.vertices_world[cut.faces[~gone]])
 
 
-def test_a_fold_that_extends_too_far_is_left(monkeypatch):
+def test_a_fold_that_extends_too_far_is_not_repaired(monkeypatch):
     monkeypatch.setattr(repairing, "_MAX_EXTENT", 0.01)
     _, surface = folded_sphere()
     left = Repair()(surface)
@@ -155,7 +155,7 @@ def test_a_fold_that_extends_too_far_is_left(monkeypatch):
     assert torch.equal(left.confidence, surface.confidence)
 
 
-def test_a_spike_is_drawn_in():
+def test_a_spike_is_flattened():
     vertices, faces = icosphere(4)
     spiked = vertices.clone()
     spiked[100] *= 3
@@ -166,7 +166,7 @@ def test_a_spike_is_drawn_in():
 
 
 def test_a_facet_that_bends_far_has_no_fold():
-    """A whole sphere that is one facet: half of it looks away from any mean."""
+    """A sphere that is a single facet: half of it is averted from any mean normal."""
     vertices, faces = icosphere(3)
     bulge = vertices.clone()
     bulge[:, 2] = torch.where(bulge[:, 2] > 0, 4 * bulge[:, 2], bulge[:, 2])
@@ -194,7 +194,7 @@ def test_gradients_reach_fixed_vertices_and_no_repaired_ones():
     assert torch.autograd.gradcheck(lambda places: minimize_bending(places, coarse, free), clone)
 
 
-def test_the_least_bent_positions_are_those_of_a_dense_solve(generator):
+def test_positions_of_least_bending_equal_a_dense_solve(generator):
     vertices, faces = icosphere(2)
     vertices = vertices + 0.1 * torch.randn(vertices.shape, generator=generator).double()
     free = torch.rand(len(vertices), generator=generator) < 0.3
@@ -210,7 +210,7 @@ def test_the_least_bent_positions_are_those_of_a_dense_solve(generator):
     assert torch.equal(placed[~free], vertices[~free])
 
 
-def test_defects_that_no_position_repairs_are_left_where_they_were():
+def test_irreparable_defects_are_not_moved():
     vertices, faces = icosphere(3)
 
     def never(places):
@@ -221,7 +221,7 @@ def test_defects_that_no_position_repairs_are_left_where_they_were():
     assert not moved.any()
 
 
-def test_a_component_of_defects_alone_is_left_where_it_was():
+def test_a_component_without_sound_vertices_is_not_moved():
     vertices, faces = icosphere(1)
     both = torch.cat([vertices, vertices + 5])
     faces = torch.cat([faces, faces + len(vertices)])
@@ -239,7 +239,7 @@ def test_the_border_is_never_moved():
     upper = surface.faces[(surface.vertices_world[surface.faces][..., 2] > -0.2).all(dim=1)]
     contour = boundary_vertices(upper, len(surface.vertices_world))
 
-    def growing(places):  # content only when much has moved
+    def growing(places):  # accepts only large moves
         marked = torch.zeros(len(upper), dtype=torch.bool)
         marked[upper.eq(int(upper[0, 0])).any(dim=1).nonzero()[0]] = True
         return marked & ((places != surface.vertices_world).any(dim=1).sum() < 60)
@@ -249,8 +249,8 @@ def test_the_border_is_never_moved():
     assert torch.equal(places[contour], surface.vertices_world[contour])
 
 
-def test_a_closed_piece_does_not_shrink_to_its_only_sound_vertex():
-    """All but one vertex of a small sphere beside a large one are on defective faces."""
+def test_a_closed_component_does_not_shrink_to_its_only_sound_vertex():
+    """All but one vertex of a small sphere next to a large one are on defective faces."""
     vertices, faces = icosphere(2)
     count = len(vertices)
     vertices = torch.cat([5 * vertices, vertices + 9])

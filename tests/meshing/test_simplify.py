@@ -35,7 +35,7 @@ def waves(x, y):
 
 
 def deviations(mesh, found, values):
-    """Distance, angle and worst channel of removed vertices against their faces."""
+    """Return distance, angle and largest channel difference of removed vertices and their faces."""
     gone = (found.face >= 0).nonzero()[:, 0]
     corners = found.mesh.faces[found.face[gone]]
     place = closest_on_triangles(mesh.vertices_world[gone], found.mesh.vertices_world[corners])
@@ -51,7 +51,7 @@ def deviations(mesh, found, values):
     )
 
 
-def test_every_former_vertex_stays_within_the_bounds():
+def test_removed_vertices_are_within_the_bounds():
     mesh = square(60, waves)
     mesh = mesh.replace(vertices_world=mesh.vertices_world + torch.tensor([3.0, -4.0, 5.0]))
     values = 10 * mesh.albedo
@@ -59,7 +59,7 @@ def test_every_former_vertex_stays_within_the_bounds():
     assert len(found.kept) < 0.5 * len(mesh.vertices_world)
     assert len(found.kept) + int((found.face >= 0).sum()) == len(mesh.vertices_world)
     distance, angle, off = deviations(mesh, found, values)
-    # The kernel's places are float32.
+    # Positions in the kernel are float32.
     assert distance.max() <= 0.1 * found.spacing * (1 + 1e-3)
     assert angle.max() <= 3.0 + 1e-2
     assert off.max() <= 1 + 1e-3
@@ -81,7 +81,7 @@ def test_each_bound_alone_keeps_vertices(spacings, angle_deg, channel):
     assert len(found.kept) > 0.9 * len(mesh.vertices_world) > 5 * len(loose.kept)
 
 
-def test_what_is_kept_is_what_it_was():
+def test_kept_vertices_are_unchanged():
     mesh = square(40, waves)
     found = simplify(mesh)
     for name in ("vertices_world", "normals_world", "albedo", "confidence"):
@@ -91,7 +91,7 @@ def test_what_is_kept_is_what_it_was():
     assert found.mesh.expected_error is None
 
 
-def test_a_plane_keeps_its_border_and_little_more():
+def test_a_plane_keeps_little_more_than_its_border():
     mesh = square(40, lambda x, _: 0.0 * x)
     found = simplify(mesh)
     assert len(found.kept) < 4 * 39 + 40
@@ -102,7 +102,7 @@ def test_a_plane_keeps_its_border_and_little_more():
             for k in (1, 2)
         )
     )
-    assert (area[:, 2] > 0).all()  # no face is turned over
+    assert (area[:, 2] > 0).all()  # no face is flipped
     assert_close(area[:, 2].sum() / 2, torch.tensor(1.0, dtype=torch.float64))
 
 
@@ -113,19 +113,19 @@ def test_a_closed_surface_stays_closed_and_oriented():
     count = len(found.vertices_world)
     assert count < len(vertices) / 4
     edges = torch.cat([found.faces[:, [0, 1]], found.faces[:, [1, 2]], found.faces[:, [2, 0]]])
-    assert len(torch.unique(edges, dim=0)) == len(edges)  # each once in each direction
+    assert len(torch.unique(edges, dim=0)) == len(edges)  # each once per direction
     assert set(map(tuple, edges.tolist())) == set(map(tuple, edges.flip(1).tolist()))
     assert count - len(edges) // 2 + len(found.faces) == 2
     volume = torch.linalg.det(found.vertices_world[found.faces]).sum() / 6
     assert 0.97 * 4.18879 < volume < 4.18879
 
 
-def test_the_number_of_threads_changes_nothing():
+def test_the_result_does_not_depend_on_the_number_of_threads():
     mesh = square(50, waves)
     assert torch.equal(*on_threads(lambda: simplify(mesh).mesh.faces, 1, 3))
 
 
-def test_the_values_of_what_is_kept_carry_gradients():
+def test_values_of_kept_vertices_have_gradients():
     mesh = square(20, waves)
     vertices = mesh.vertices_world.clone().requires_grad_()
     found = simplify(mesh.replace(vertices_world=vertices))
@@ -133,10 +133,10 @@ def test_the_values_of_what_is_kept_carry_gradients():
     assert set(vertices.grad.sum(dim=1).tolist()) == {0.0, 3.0}
 
 
-def test_meshes_that_nothing_can_be_taken_from_come_back():
+def test_meshes_that_cannot_be_simplified_are_unchanged():
     corners = torch.eye(4, 3, dtype=torch.float64)
     tetrahedron = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
-    crowded = torch.cat([tetrahedron[:1], tetrahedron[:1], tetrahedron[:1]])  # no manifold
+    crowded = torch.cat([tetrahedron[:1], tetrahedron[:1], tetrahedron[:1]])  # not a manifold
     for faces in (tetrahedron, crowded):
         mesh = Mesh(vertices_world=corners, faces=faces)
         found = simplify(mesh, spacings=100.0, angle_deg=180.0)
