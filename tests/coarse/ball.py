@@ -15,7 +15,7 @@ SETTINGS = CoarseSurfaceConfig(num_facets=600, levels=1)
 
 
 def mottled(points):
-    """Waves in many directions, fine enough to be matched, none of them twice."""
+    """Return waves in many directions, fine enough for matching and not repetitive."""
     generator = torch.Generator().manual_seed(3)
     waves = 14 * torch.randn(24, 3, generator=generator, dtype=torch.float64).to(points)
     phases = torch.arange(24).to(points)
@@ -26,7 +26,7 @@ def mottled(points):
 def photographed(cameras, texture=mottled):
     generator = torch.Generator().manual_seed(0)
     count = cameras.num_views
-    # The point light goes with the camera and is never quite the same.
+    # The point light moves with the camera and always differs slightly.
     towards = normalize(cameras.centers_world, dim=-1)
     aside = 0.4 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
     lights = torch.cat(
@@ -41,7 +41,7 @@ def photographed(cameras, texture=mottled):
 
 
 def all_round():
-    """Twelve cameras, everywhere round the ball."""
+    """Return twelve cameras on all sides of the ball."""
     place = torch.arange(12, dtype=torch.float64)
     height = 1 - (2 * place + 1) / 12
     azimuth = place * torch.pi * (3 - 5**0.5)
@@ -52,7 +52,7 @@ def all_round():
 
 
 def silhouettes_of(cameras):
-    """Silhouettes of the ball, by its rays."""
+    """Return silhouettes of the ball from its rays."""
     width, height = cameras.sizes_px[0].tolist()
     pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
     rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)

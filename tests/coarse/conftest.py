@@ -10,7 +10,7 @@ from tests.coarse.ball import all_round, photographed
 
 @pytest.fixture(scope="session")
 def dome_cloud() -> SparseScene:
-    """A ball seen by five views on an arc of 50 degrees, with a thousand exact points."""
+    """A ball seen from five views on an arc of 50 degrees, with a thousand exact points."""
     cameras = arc_cameras(5, width=160, height=120, focal_px=200.0, distance=4.0, sway_deg=0.0)
     lights = torch.tensor([[0.4, 0.0, 0.0, 0.4]], dtype=torch.float64).expand(5, 4)
     scene = render_shape(Sphere(), cameras, lights, lambda points: torch.ones_like(points))
@@ -19,5 +19,5 @@ def dome_cloud() -> SparseScene:
 
 @pytest.fixture(scope="session")
 def round_about() -> SparseScene:
-    """A ball seen from 12 places all round."""
+    """A ball seen from 12 positions on all sides."""
     return photographed(all_round())

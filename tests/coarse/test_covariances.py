@@ -17,7 +17,7 @@ def noisy_cloud(noise_px, seed, span_deg=50.0):
     return sparse_scene(scene, 1500, generator, noise_px=noise_px, dtype=torch.float64)
 
 
-def test_covariances_are_as_large_as_the_errors_of_triangulated_points():
+def test_covariances_match_the_errors_of_triangulated_points():
     noise = 0.3
     cloud = noisy_cloud(noise, 0)
     everyone = torch.arange(len(cloud.points_world))

@@ -45,7 +45,7 @@ def ball(num_views=5):
     return scene, sparse_scene(scene, 300, torch.Generator().manual_seed(0))
 
 
-def test_holes_are_filled_from_around_and_the_rest_stays():
+def test_holes_are_filled_and_the_rest_is_kept():
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(13, 18, generator=generator) + 1
     known = torch.rand(13, 18, generator=generator) > 0.7
@@ -57,7 +57,7 @@ def test_holes_are_filled_from_around_and_the_rest_stays():
     assert_close(even, torch.full_like(values, 3.0))
 
 
-def test_noisy_points_share_larger_cells_and_sides_stay_apart():
+def test_noisy_points_share_larger_cells_but_sides_are_separate():
     points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0))
     points[:, 2] = 0.5
     up = torch.tensor([0.0, 0, 1]).expand(4000, 3)
@@ -73,7 +73,7 @@ def test_noisy_points_share_larger_cells_and_sides_stay_apart():
     assert 1.8 * count(exact, up) < count(exact, both) <= 2 * count(exact, up)
 
 
-def test_small_holes_are_closed_and_large_ones_and_small_components_are_not():
+def test_only_small_holes_of_large_components_are_closed():
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
     kept = (centre[:, 2] < 0.6) & ~(centre[:, 0] > 0.95)
@@ -87,10 +87,10 @@ def test_small_holes_are_closed_and_large_ones_and_small_components_are_not():
     assert (pieces == (centre[crumbs][:, 2] < 0)).all()
 
 
-def test_surface_over_a_gap_stays_beside_surface_in_the_air_that_is_joined_to_it():
+def test_surface_near_points_is_kept_next_to_unsupported_surface():
     flat = table(half_side=72.0, cells=48)
     centre = flat.vertices_world[flat.faces].mean(dim=1)
-    # Points all over, but in two discs and in a strip that joins them; a pixel is 1.
+    # Points everywhere except in two discs and a strip that joins them; a pixel is 1.
     wide = (centre[:, :2] - centre.new_tensor([-20.0, 0.0])).norm(dim=-1)
     narrow = (centre[:, :2] - centre.new_tensor([50.0, 0.0])).norm(dim=-1)
     strip = (centre[:, 0].abs() < 50) & (centre[:, 1].abs() < 6)
@@ -113,7 +113,7 @@ def test_surface_over_a_gap_stays_beside_surface_in_the_air_that_is_joined_to_it
     assert (near_points(flat.faces, centre, cloud, support, dark, 1.0) == ~empty).all()
 
 
-def test_a_view_agrees_with_those_that_see_the_same_surface_and_with_none_that_sees_another():
+def test_a_view_agrees_only_with_views_of_the_same_surface():
     truth, scene = ball()
     level = level_of(scene, 1)
     depth = truth.depth.float()
@@ -129,7 +129,7 @@ def test_a_view_agrees_with_those_that_see_the_same_surface_and_with_none_that_s
     assert float((count[inner] == 1).double().mean()) > 0.98
 
 
-def test_a_poisson_surface_is_the_same_whatever_was_made_before_it():
+def test_poisson_surfaces_do_not_depend_on_previous_calls():
     vertices, _ = icosphere(4)
     vertices = vertices.float()
 
@@ -143,12 +143,12 @@ def test_a_poisson_surface_is_the_same_whatever_was_made_before_it():
 
 
 def test_sources_are_the_views_at_angles_that_match_well():
-    _, scene = ball(9)  # 50 degrees in all: 6 between neighbours
+    _, scene = ball(9)  # 50 degrees in total: 6 between neighbours
     everyone = torch.arange(len(scene.points_world))
     found = choose_sources(scene, everyone, 4)
     rays = normalize(scene.cameras.centers_world, dim=1)
     angle = torch.rad2deg((rays @ rays[4]).clamp(-1, 1).acos())
-    assert set(found[:2].tolist()) == {2, 6}  # 12 degrees, the best there is
+    assert set(found[:2].tolist()) == {2, 6}  # 12 degrees, the best available angle
     assert bool((angle[found] < 20).all())
     assert 4 not in found.tolist()
     # Without shared points no view is a source.
@@ -175,9 +175,9 @@ def test_a_step_of_inverse_depth_moves_points_by_a_pixel():
 
 
 def sheets(generator, gap=0.055):
-    """Two sheets that face away from each other, with noisy normals.
+    """Return two sheets that face away from each other, with noisy normals.
 
-    Of 24 neighbours some 21 lie on the same sheet, fewer at its border.
+    About 21 of 24 neighbours are on the same sheet, fewer at its border.
     """
     points = torch.rand(4000, 3, generator=generator, dtype=torch.float64)
     up = torch.arange(4000)[:, None] % 2 == 0
@@ -188,10 +188,10 @@ def sheets(generator, gap=0.055):
     return true, OrientedPoints(points_world=points, normals_world=normals, noise=noise)
 
 
-def test_normals_follow_the_neighbours_positions_on_either_side_of_a_thin_wall():
+def test_normals_follow_neighbours_on_each_side_of_a_thin_wall():
     true, cloud = sheets(torch.Generator().manual_seed(4))
     found = refit_normals(cloud)
-    # Where more neighbours than usual are on the other sheet, normals disagree: points are dropped.
+    # If more neighbours are on the other sheet, normals disagree and points are dropped.
     assert len(found.points_world) > 0.8 * len(cloud.points_world)
     truth = torch.where(found.points_world[:, 2:] > 0.02, 1.0, -1.0) * true[:1]
     cosine = (found.normals_world * truth).sum(dim=1)
@@ -200,14 +200,14 @@ def test_normals_follow_the_neighbours_positions_on_either_side_of_a_thin_wall()
     assert float((given > 0.999).double().mean()) < 0.05
 
 
-def test_points_whose_neighbours_face_anywhere_are_dropped():
+def test_points_with_inconsistent_neighbour_normals_are_dropped():
     generator = torch.Generator().manual_seed(5)
     _, cloud = sheets(generator)
     random = normalize(torch.randn(4000, 3, generator=generator, dtype=torch.float64), dim=1)
     assert len(refit_normals(cloud.replace(normals_world=random)).noise) < 0.2 * 4000
 
 
-def test_sparse_points_far_from_dense_ones_get_normals_to_the_cameras():
+def test_sparse_points_far_from_dense_ones_face_the_cameras():
     _, scene = ball()
     everyone = torch.arange(len(scene.points_world))
     found = sparse_oriented(scene, everyone, no_points(scene.points_world), 0.05)

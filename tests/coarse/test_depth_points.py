@@ -1,4 +1,4 @@
-"""Points of depth maps, of a ball whose light changes and whose surface is known."""
+"""Points from depth maps of a known ball under changing light."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ def scene() -> SparseScene:
     return scene_of(images, K, cameras.cam_from_world)
 
 
-def test_points_lie_on_the_surface_before_the_views_that_show_them_beside_those_there_are(scene):
+def test_depth_points_on_the_surface_are_added_to_existing_ones(scene):
     own = torch.tensor([[0.0, 0.0, -1.0], [0.1, 0.0, -0.99]])
     given = scene_of(
         scene.views.images, scene.cameras.intrinsics, scene.cameras.cam_from_world, points_world=own
@@ -43,7 +43,7 @@ def test_points_lie_on_the_surface_before_the_views_that_show_them_beside_those_
     assert 0 < float(found.reprojection_errors_px.median()) < 0.5
 
 
-def test_masks_confine_them(scene):
+def test_depth_points_are_inside_the_masks(scene):
     height, width = scene.views.images.shape[-2:]
     column = torch.arange(width).expand(height, width)
     masks = (column > 0.4 * width).expand(scene.cameras.num_views, -1, -1)
@@ -52,7 +52,7 @@ def test_masks_confine_them(scene):
     assert float(found.observation_pixels[:, 0].min()) > 0.39 * width
 
 
-def test_cameras_of_other_photographs_give_none(scene):
+def test_cameras_of_other_photographs_give_no_points(scene):
     order = [3, 0, 5, 1, 4, 2]
     cameras = scene.cameras.replace(cam_from_world=scene.cameras.cam_from_world[order])
     wrong = scene.replace(cameras=cameras)

@@ -21,7 +21,7 @@ from tests.coarse.ball import SETTINGS, mottled, photographed, silhouettes_of
 
 @pytest.fixture
 def small_holes(monkeypatch):
-    """They are closed up to an area of 0.3 with pixels of 1."""
+    """Close holes up to an area of 0.3 with pixels of 1."""
     monkeypatch.setattr(trim, "HOLE_PX", 0.3**0.5)
 
 
@@ -30,12 +30,12 @@ def white(points):
 
 
 def half_mottled(points):
-    """Waves above the equator, one colour below."""
+    """Return waves above the equator and a constant colour below."""
     return torch.where(points[..., 2:] > 0, mottled(points), 0.7)
 
 
 def built(scene, some=lambda points: points[:, 2] > -2):
-    """The coarse mesh of a ball with its silhouettes, on some points of its cloud."""
+    """Return the coarse mesh of a ball with silhouettes, from part of its cloud."""
     errors = torch.where(some(scene.points_world), 0.5, 100.0)
     scene = scene.replace(reprojection_errors_px=errors.to(scene.reprojection_errors_px))
     return CoarseSurface(SETTINGS)(
@@ -48,7 +48,7 @@ def is_closed(mesh):
     return 2 * len(pairs) == 3 * len(mesh.faces) and int(face_components(mesh.faces).max()) == 0
 
 
-def test_a_ball_textured_on_one_half_is_closed_and_its_support_recorded(round_about):
+def test_a_half_textured_ball_is_closed_and_its_support_recorded(round_about):
     scene = photographed(round_about.cameras.to(torch.float64), half_mottled)
     coarse = built(scene, lambda points: points[:, 2] > 0)
     mesh = coarse.mesh
@@ -59,14 +59,14 @@ def test_a_ball_textured_on_one_half_is_closed_and_its_support_recorded(round_ab
     assert off.mean() < 0.02
     assert off.max() < 0.1
     above, below = centre[:, 2] > 0.2, centre[:, 2] < -0.2
-    # Views 40 degrees apart match some of it.
+    # Views 40 degrees apart match part of it.
     assert (coarse.support[above] == Support.POINTS).float().mean() > 0.15
     assert (coarse.support[below] == Support.POINTS).float().mean() < 0.02
     assert (coarse.support[below] == Support.CONTOUR).float().mean() > 0.3
     assert (coarse.support >= Support.LIGHT).float().mean() > 0.8
 
 
-def test_a_ball_of_one_colour_follows_from_its_silhouettes_alone(round_about):
+def test_an_untextured_ball_follows_from_its_silhouettes(round_about):
     scene = photographed(round_about.cameras.to(torch.float64), white)
     coarse = built(scene, lambda points: points[:, 2] > 2)
     assert is_closed(coarse.mesh)
@@ -78,18 +78,18 @@ def test_a_ball_of_one_colour_follows_from_its_silhouettes_alone(round_about):
     assert ((outward * towards).sum(dim=-1) > 0.6).float().mean() > 0.98
 
 
-def test_what_no_view_sees_is_left_out():
+def test_unseen_surface_is_excluded():
     cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
     mesh = built(photographed(cameras)).mesh
-    # The hull reaches to -2.2; views 25 degrees off the centre see to -0.2, and Poisson runs on
-    # along the last contours for a few facets.
+    # The hull extends to -2.2; views 25 degrees off the centre see to -0.2, and Poisson
+    # extrapolates beyond the last contours by a few facets.
     assert -0.75 < float(mesh.vertices_world[:, 2].min()) < 0.1
     off = (mesh.vertices_world.norm(dim=1) - 1).abs()
     assert off.max() < 0.2
     assert off[mesh.vertices_world[:, 2] > 0].mean() < 0.02
 
 
-def test_a_surface_that_views_see_through_is_dropped_and_small_dents_stay(small_holes):
+def test_surface_that_views_see_through_is_dropped_except_small_dents(small_holes):
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
     cover, speck = centre[:, 2] > 0.8, centre[:, 2] < -0.97
@@ -100,12 +100,12 @@ def test_a_surface_that_views_see_through_is_dropped_and_small_dents_stay(small_
     everywhere = torch.ones_like(cover)
     kept = seen_surface(vertices, faces, support, counts, everywhere, 1.0, 0.01)
     assert bool((kept == ~cover).all())  # the cover's area is 1.2, the speck's 0.2
-    # Nothing is dropped where points are.
+    # Surface with points is never dropped.
     support[cover] = Support.POINTS
     assert bool(seen_surface(vertices, faces, support, counts, everywhere, 1.0, 0.01).all())
 
 
-def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes(monkeypatch):
+def test_the_unseen_bottom_of_a_concavity_is_kept_and_the_back_dropped(monkeypatch):
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
     bottom, back, cover = centre[:, 2] > 0.97, centre[:, 2] < -0.5, centre[:, 0] > 0.97
@@ -121,13 +121,13 @@ def test_the_unseen_bottom_of_a_concavity_stays_and_the_unseen_back_goes(monkeyp
         return seen_surface(vertices, faces, support, counts, inside, 1.0, 0.01)
 
     assert bool((kept() == ~(back | cover)).all())
-    # One face of it behind which something is seen, or outside the hull, opens all of it.
+    # One face that is seen through or is outside the hull removes the entire bottom.
     assert bool((kept(inside=everywhere & (centre[:, 2] < centre[:, 2].max())) == (seen > 0)).all())
     monkeypatch.setattr(trim, "MAX_UNSEEN", 0.0)
     assert bool((kept() == (seen > 0)).all())
 
 
-def test_pieces_that_neither_points_nor_contours_support_go():
+def test_components_without_points_and_contours_are_dropped():
     vertices, faces = icosphere(2)
     two = torch.cat([vertices, 0.3 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
     first = torch.arange(len(two[1])) < len(faces)
@@ -143,9 +143,7 @@ def test_pieces_that_neither_points_nor_contours_support_go():
 
 
 @pytest.mark.parametrize(("share", "stays"), [(0.3, False), (0.2, True)])
-def test_a_piece_in_the_air_goes_whole_where_views_see_through_enough_of_it(
-    small_holes, share, stays
-):
+def test_a_floating_component_is_dropped_if_views_see_through_enough(small_holes, share, stays):
     vertices, faces = icosphere(2)
     two = torch.cat([vertices, 0.9 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
     index = torch.arange(len(two[1]))
@@ -161,7 +159,7 @@ def test_a_piece_in_the_air_goes_whole_where_views_see_through_enough_of_it(
     assert bool(kept(first).all())  # depth maps behind points are wrong
 
 
-def test_the_crop_shows_the_same_at_the_same_places(round_about):
+def test_cropped_views_show_the_same_pixels_at_projected_points(round_about):
     silhouettes = silhouettes_of(round_about.cameras)
     part = cropped(round_about, silhouettes)
     assert part.views.images.shape[-1] < round_about.views.images.shape[-1]
@@ -185,7 +183,7 @@ def test_the_crop_shows_the_same_at_the_same_places(round_about):
         assert_close(parts[:, y[shown], x[shown]], images[:, v[shown], u[shown]])
 
 
-def test_a_view_without_silhouette_is_masked_whole(round_about):
+def test_a_view_without_silhouette_is_masked_entirely(round_about):
     silhouettes = silhouettes_of(round_about.cameras)
     inside = silhouettes.inside.clone()
     inside[3] = 0
@@ -194,7 +192,7 @@ def test_a_view_without_silhouette_is_masked_whole(round_about):
     assert bool(part.views.masks[2].any())
 
 
-def test_too_few_points_and_contours_are_refused(round_about):
+def test_too_few_points_and_contours_are_rejected(round_about):
     contours = TraceContours()(silhouettes_of(round_about.cameras), round_about.cameras)
     contours = contours.replace(rays=contours.rays.take(torch.arange(5)))
     with pytest.raises(ReconstructionError, match="0 points were matched inside the silhouettes"):

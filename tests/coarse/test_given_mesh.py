@@ -18,7 +18,7 @@ from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.coarse.ball import all_round, silhouettes_of
 
 
-def test_every_component_faces_out_however_its_faces_were_wound():
+def test_every_component_faces_outward_for_any_winding():
     ball, faces = icosphere(2)
     vertices = torch.cat([0.4 * ball - 0.6, 0.4 * ball + 0.6])
     both = torch.cat([faces, faces.flip(1) + len(ball)])
@@ -33,7 +33,7 @@ def test_every_component_faces_out_however_its_faces_were_wound():
     assert_close(found, vertices)
 
 
-def test_an_open_sheet_faces_the_cameras_and_keeps_neither_slivers_nor_loose_vertices():
+def test_an_open_sheet_faces_the_cameras_without_slivers_and_unused_vertices():
     vertices = torch.tensor(
         [[9.0, 9, 9], [-1, -1, 0], [1, -1, 0], [0, 1, 0], [0.5, 0, 0]], dtype=torch.float64
     )
@@ -46,19 +46,19 @@ def test_an_open_sheet_faces_the_cameras_and_keeps_neither_slivers_nor_loose_ver
     assert float(face_normals(found, wound)[0, 2]) > 0
 
 
-def test_a_mesh_that_no_camera_sees_is_refused():
+def test_a_mesh_that_no_camera_sees_is_rejected():
     vertices, faces = icosphere(0)
     with pytest.raises(InputError, match="no photograph shows"):
         oriented_outward(Mesh(vertices_world=vertices + 1e4, faces=faces), all_round())
 
 
-PLACE = torch.tensor([0.6, 1.1, 1.9], dtype=torch.float64)  # none of its axes may be exchanged
+PLACE = torch.tensor([0.6, 1.1, 1.9], dtype=torch.float64)  # no two axes may be interchanged
 AWAY = (448231.0, 5411923.0, 312.0)
 
 
 @pytest.fixture(scope="module")
 def scene(dome_cloud):
-    """The ball beside the origin, with exact points of the side that five views see."""
+    """A ball off the origin, with exact points of the side that five views see."""
     poses = dome_cloud.cameras.cam_from_world.double()
     moved = poses.clone()
     moved[:, :3, 3] -= poses[:, :3, :3] @ PLACE
@@ -92,7 +92,7 @@ def exchanged(mesh, *axes):
     return mesh.replace(vertices_world=mesh.vertices_world[:, list(axes)])
 
 
-def test_the_true_mesh_is_taken_as_it_is_and_said_to_fit(scene, unknown, masks, true_mesh):
+def test_the_true_mesh_is_unchanged_and_fits(scene, unknown, masks, true_mesh):
     for silhouettes in (unknown, masks):
         found, figures = prepared(true_mesh, scene, silhouettes)
         assert torch.equal(found.faces, true_mesh.faces)
@@ -105,7 +105,7 @@ def test_the_true_mesh_is_taken_as_it_is_and_said_to_fit(scene, unknown, masks, 
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".glb"])
-def test_a_mesh_whose_faces_share_no_vertex_gives_the_surface_of_the_welded_one(
+def test_a_triangle_soup_gives_the_surface_of_the_welded_mesh(
     scene, unknown, true_mesh, suffix, tmp_path
 ):
     corners = true_mesh.vertices_world[true_mesh.faces].reshape(-1, 3)
@@ -121,7 +121,7 @@ def test_a_mesh_whose_faces_share_no_vertex_gives_the_surface_of_the_welded_one(
     assert_close(*surface, rtol=0, atol=1e-6)
 
 
-def test_faces_that_are_none_are_dropped_and_counted(scene, unknown, true_mesh):
+def test_degenerate_faces_are_dropped_and_counted(scene, unknown, true_mesh):
     faces = true_mesh.faces
     middle = true_mesh.vertices_world[faces[0, :2]].mean(dim=0, keepdim=True)
     vertices = torch.cat([true_mesh.vertices_world, middle])
@@ -133,7 +133,7 @@ def test_faces_that_are_none_are_dropped_and_counted(scene, unknown, true_mesh):
     assert sorted(map(sorted, found.faces.tolist())) == sorted(map(sorted, faces.tolist()))
 
 
-def test_a_mesh_without_any_area_is_refused(scene, unknown, true_mesh):
+def test_a_mesh_without_area_is_rejected(scene, unknown, true_mesh):
     flat = true_mesh.replace(faces=true_mesh.faces[:9, [0, 1, 1]])
     with pytest.raises(InputError, match="none of the given mesh's 9 faces has an area"):
         prepared(flat, scene, unknown)
@@ -155,14 +155,14 @@ def test_a_mesh_without_any_area_is_refused(scene, unknown, true_mesh):
         lambda mesh: mesh.replace(vertices_world=mesh.vertices_world / 25.4),
     ],
 )
-def test_a_mesh_in_another_frame_is_refused_or_where_no_ray_meets_it_warned_of(
+def test_a_mesh_in_a_different_frame_is_rejected_or_warned_of(
     scene, unknown, masks, true_mesh, change, with_masks
 ):
     with pytest.raises((InputError, PimperWarning), match=r"wh(ere|at) the photographs show"):
         prepared(change(true_mesh), scene, masks if with_masks else unknown)
 
 
-def test_masks_alone_warn_of_another_frame_where_there_are_no_points(scene, masks, true_mesh):
+def test_without_points_masks_warn_of_a_different_frame(scene, masks, true_mesh):
     bare = without_points(scene)
     _, figures = prepared(true_mesh, bare, masks)
     assert set(figures) == {"faces", "overlap", "observations"}
@@ -170,9 +170,7 @@ def test_masks_alone_warn_of_another_frame_where_there_are_no_points(scene, mask
         prepared(exchanged(true_mesh, 0, 2, 1), bare, masks)
 
 
-def test_a_mesh_of_something_else_is_refused_and_a_rough_one_is_said_to_be_off(
-    scene, unknown, true_mesh
-):
+def test_a_wrong_mesh_is_rejected_and_a_rough_one_warned_of(scene, unknown, true_mesh):
     def scaled(factor):
         about = true_mesh.vertices_world - PLACE
         return true_mesh.replace(vertices_world=PLACE + factor * about)
@@ -182,15 +180,15 @@ def test_a_mesh_of_something_else_is_refused_and_a_rough_one_is_said_to_be_off(
     with pytest.warns(PimperWarning, match=r"median distance is 2\.\d% of the diagonal \(0.08"):
         _, figures = prepared(scaled(0.92), scene, unknown)
     assert abs(figures["distance_percent"] - 100 * 0.08 / (0.92 * 12**0.5)) < 0.05
-    prepared(scaled(0.97), scene, unknown)  # nothing is said
+    prepared(scaled(0.97), scene, unknown)  # no warning
     box = trimesh.creation.box(bounds=[(PLACE - 1).tolist(), (PLACE + 1).tolist()])
     rough = Mesh(vertices_world=torch.tensor(box.vertices), faces=torch.tensor(box.faces).long())
     with pytest.warns(PimperWarning, match="is off what the photographs show"):
         prepared(rough, scene, unknown)
 
 
-def test_points_of_the_background_say_nothing_against_a_mesh(scene, unknown, true_mesh):
-    """Nor are they explained by a mesh: half the cloud is a wall behind the ball."""
+def test_background_points_do_not_count_against_a_mesh(scene, unknown, true_mesh):
+    """They are not on the mesh: half the cloud is a wall behind the ball."""
     generator = torch.Generator().manual_seed(3)
     wall = 4 * torch.rand(3000, 3, generator=generator) - 2 + PLACE.float()
     wall[:, 2] = float(PLACE[2]) - 1.5
@@ -213,8 +211,8 @@ def test_points_of_the_background_say_nothing_against_a_mesh(scene, unknown, tru
         prepared(exchanged(true_mesh, 0, 2, 1), both, unknown)
 
 
-def test_a_mesh_goes_along_with_cameras_far_from_their_origin(scene, unknown, true_mesh):
-    """With photographs, it is in the frame of their model; with a scene, in that of the scene."""
+def test_a_mesh_is_transformed_with_cameras_far_from_the_origin(scene, unknown, true_mesh):
+    """Given photographs, it is in the frame of their model; given a scene, in that of the scene."""
     chain = load_chain("default")
     far = scene.replace(offset_world=AWAY)
     brought = true_mesh.replace(

@@ -11,7 +11,7 @@ from pimper_torch.records import Mesh
 
 
 def square():
-    """Two facets, and the same with all edges halved."""
+    """Return two facets, and their subdivision with halved edges."""
     edges, _ = face_edges(FACETS)
     split = split_edges(CORNERS, FACETS, torch.ones(len(edges), dtype=torch.bool))
     fine = torch.cat([CORNERS, CORNERS[edges[split.halved]].mean(dim=1)])
@@ -19,7 +19,7 @@ def square():
 
 
 def on_facets(vertices, faces, count, generator, normal):
-    """A surface of loose points on facets, whose normals are a function of the position."""
+    """Return a surface of points on facets, with normals as a function of position."""
     facet = torch.randint(len(faces), (count,), generator=generator)
     barycentric = torch.rand(count, 3, generator=generator, dtype=torch.float64)
     barycentric = barycentric / barycentric.sum(dim=1, keepdim=True)
@@ -34,7 +34,7 @@ def on_facets(vertices, faces, count, generator, normal):
     )
 
 
-def test_normals_are_the_weighted_least_squares_fit_of_their_blend(generator):
+def test_inherited_normals_are_a_weighted_least_squares_fit(generator):
     vertices, faces, split, fine = square()
 
     def bent(points):
@@ -45,7 +45,7 @@ def test_normals_are_the_weighted_least_squares_fit_of_their_blend(generator):
     index = torch.arange(len(split.faces))
     mesh = Mesh(vertices_world=fine, faces=split.faces)
     found = fitted_normals(mesh, surface, split, index)
-    # A dense solve; where each point lies among the children, in the plane of the square.
+    # A dense solve; coordinates of each point in the children, in the plane of the square.
     flat = fine[split.faces][..., :2]
     inside = barycentric_2d(surface.vertices_world[:, None, :2], flat[None])
     child = inside.amin(dim=-1).argmax(dim=1)
@@ -53,16 +53,18 @@ def test_normals_are_the_weighted_least_squares_fit_of_their_blend(generator):
     weights = inside[torch.arange(len(child)), child]
     blend.scatter_(1, split.faces[child], weights)
     own = vertex_normals(fine, split.faces)
-    weight = (surface.confidence + 0.05)[:, None]  # of people's confidence, and a twentieth
+    weight = (surface.confidence + 0.05)[:, None]  # confidence plus a twentieth
     matrix = blend.mT @ (weight * blend)
-    damping = 0.01 * matrix.diagonal().mean()  # the facets' own normals, a hundredth of the data
+    damping = (
+        0.01 * matrix.diagonal().mean()
+    )  # normals of the facets, with a hundredth of the data's weight
     damped = matrix + damping * torch.eye(len(fine)).double()
     right = blend.mT @ (weight * surface.normals_world) + damping * own
     assert_close(found, normalize(torch.linalg.solve(damped, right), dim=1))
     assert float(torch.rad2deg((found * own).sum(dim=1).clamp(-1, 1).acos()).max()) > 10
 
 
-def test_where_the_surface_has_no_vertex_normals_are_the_facets_own(generator):
+def test_facets_without_surface_vertices_keep_their_own_normals(generator):
     vertices, faces, split, fine = square()
     surface = on_facets(
         vertices,
@@ -73,7 +75,7 @@ def test_where_the_surface_has_no_vertex_normals_are_the_facets_own(generator):
     )
     kept = split.parent == 0
     index = torch.where(kept, kept.cumsum(dim=0) - 1, -1)
-    surface = surface.take(surface.facet == 1)  # on the dropped facet alone
+    surface = surface.take(surface.facet == 1)  # only on the dropped facet
     mesh = Mesh(vertices_world=fine, faces=split.faces[kept])
     found = fitted_normals(mesh, surface, split, index)
     used = torch.unique(mesh.faces)

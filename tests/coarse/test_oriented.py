@@ -9,7 +9,7 @@ from pimper_torch.method.coarse.window_matching import MatchingLevel
 
 
 def plane_round(depth, valid, row, column, step):
-    """Fit the plane of one pixel's window by iterated weighted least squares."""
+    """Fit the plane of a pixel's window by iteratively reweighted least squares."""
     window = depth[row - 2 : row + 3, column - 2 : column + 3].double()
     v, u = torch.meshgrid(*(torch.arange(-2.0, 3.0, dtype=torch.double),) * 2, indexing="ij")
     basis = torch.stack([torch.ones(25).double(), u.flatten(), v.flatten()], dim=1)
@@ -24,13 +24,13 @@ def plane_round(depth, valid, row, column, step):
     return fit, (weight * square).sum() / weight.sum(), weight.mean()
 
 
-def test_planes_are_robust_least_squares():
+def test_planes_are_robust_least_squares_fits():
     generator = torch.Generator().manual_seed(0)
     rough = 0.001 * torch.randn(40, 53, generator=generator)
     depth = 0.3 + rough.cumsum(dim=0) / 4 + 0.05 * (torch.arange(53) > 30)
     valid = torch.rand(40, 53, generator=generator) > 0.2
     inverse_depth, slope, spread, fine = fitted_planes(depth, valid, 0.001)
-    assert 0.1 < float(fine.double().mean()) < 0.8  # some fine, some not
+    assert 0.1 < float(fine.double().mean()) < 0.8  # both cases occur
     pixels = (valid.nonzero() - torch.tensor([20, 26])).abs()
     inner = valid.nonzero()[(pixels < torch.tensor([18, 24])).all(dim=1)][::7]
     for row, column in inner.tolist():
@@ -44,7 +44,7 @@ def test_planes_are_robust_least_squares():
             assert bool(fine[row, column]) == bool(fraction > 0.7 and abs(fit[0]) < 1)
 
 
-def test_nothing_valid_gets_no_plane():
+def test_invalid_pixels_have_no_plane():
     depth = torch.full((6, 7), 0.5)
     inverse_depth, slope, _, fine = fitted_planes(depth, torch.zeros_like(depth) > 0, 0.001)
     assert_close(inverse_depth, depth)
@@ -52,7 +52,7 @@ def test_nothing_valid_gets_no_plane():
     assert not bool(fine.any())
 
 
-def test_points_are_denied_by_the_views_that_look_through_them():
+def test_points_are_contradicted_by_views_that_see_through_them():
     generator = torch.Generator().manual_seed(0)
     cameras = arc_cameras(5, width=40, height=30, focal_px=45.0, distance=4.0, sway_deg=10.0).to(
         torch.float32
@@ -67,7 +67,7 @@ def test_points_are_denied_by_the_views_that_look_through_them():
         step=torch.linspace(0.001, 0.01, 5),
         sources=torch.zeros(5, 2, dtype=torch.long),
     )
-    # Some outside every picture, some behind cameras.
+    # Some are outside every image, some behind cameras.
     points = 3 * torch.randn(5000, 3, generator=generator)
     found = count_contradictions(maps, 1, points)
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
@@ -79,4 +79,4 @@ def test_points_are_denied_by_the_views_that_look_through_them():
                 expected[point] += bool(1 / z > shown + 3 * maps.step[view])
     assert int(expected.max()) >= 3
     assert int((expected == 0).sum()) > 500
-    assert float((found != expected).double().mean()) < 1e-3  # pixels met within rounding
+    assert float((found != expected).double().mean()) < 1e-3  # pixels within rounding

@@ -7,7 +7,7 @@ def test_the_frontal_view_is_the_centre_of_the_arc(dome_cloud):
     assert reference_view(dome_cloud) == 2
 
 
-def test_many_partners_weigh_more_than_one_close_twin(dome_cloud):
+def test_many_neighbours_outweigh_one_close_view(dome_cloud):
     # Views 0 and 1 share 60 points; view 2 shares 20 with each of three others.
     pairs = {(0, 1): 60, (2, 3): 20, (2, 4): 20, (2, 0): 20}
     ends = [(view, pair) for pair, count in pairs.items() for _ in range(count) for view in pair]

@@ -42,7 +42,7 @@ def coarse_of(vertices, faces):
 
 
 def surface_on(coarse, place, spacing=SPACING, normals=None, information=None):
-    """The subdivided mesh of a mesh, its vertices moved by ``place``."""
+    """Return the subdivision of a mesh with vertices moved by ``place``."""
     mesh = coarse.mesh
     count = len(mesh.faces)
     subdivision = subdivide(mesh.vertices_world, mesh.faces, torch.full((count,), spacing).double())
@@ -59,7 +59,7 @@ def surface_on(coarse, place, spacing=SPACING, normals=None, information=None):
 
 
 def dome(points):
-    """A plane, and half a ball of radius 0.5 round (0.5, 0) on it."""
+    """Place points on a plane with half a ball of radius 0.5 around (0.5, 0)."""
     offset = points[:, :2] - points.new_tensor([0.5, 0])
     height = (0.25 - offset.square().sum(dim=1)).clamp_min(0).sqrt()
     return torch.cat([points[:, :2], height[:, None]], dim=1)
@@ -70,7 +70,7 @@ def wavy(points):
     return torch.cat([points[:, :2], points[:, 2:] + lift[:, None]], dim=1)
 
 
-def test_parts_of_a_facet_have_its_support(generator):
+def test_children_of_a_facet_inherit_its_support(generator):
     coarse = sheet(generator)
     coarse = coarse.replace(support=torch.arange(len(coarse.mesh.faces)) % 4)
     found = remesh(coarse, surface_on(coarse, wavy), SPACING)
@@ -82,7 +82,7 @@ def test_parts_of_a_facet_have_its_support(generator):
     assert bool((found.support == coarse.support[parent]).all())
 
 
-def test_a_surface_that_fits_changes_nothing(generator):
+def test_a_mesh_that_fits_the_surface_is_unchanged(generator):
     coarse = sheet(generator, lift=lambda xy: 0.1 * xy[:, 0] * xy[:, 1])
     surface = surface_on(coarse, lambda points: points)
     found = remesh(coarse, surface, SPACING)
@@ -92,7 +92,7 @@ def test_a_surface_that_fits_changes_nothing(generator):
     assert_close(again.mesh.vertices_world, found.mesh.vertices_world)
 
 
-def test_a_mesh_gets_finer_on_a_ball_and_not_on_the_plane_beside_it(generator):
+def test_a_mesh_is_refined_on_a_ball_but_not_on_a_plane(generator):
     coarse = sheet(generator, side=9)
     found = remesh(coarse, surface_on(coarse, dome), SPACING, RemeshConfig(min_samples=5.0))
     centres = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
@@ -107,14 +107,14 @@ def test_a_mesh_gets_finer_on_a_ball_and_not_on_the_plane_beside_it(generator):
     assert int(on_dome.sum()) > 2 * int(was_dome.sum())
 
 
-def test_new_and_old_vertices_lie_on_the_surface(generator):
+def test_all_vertices_are_on_the_surface(generator):
     coarse = sheet(generator, side=9)
     found = remesh(coarse, surface_on(coarse, dome), SPACING, RemeshConfig(min_samples=5.0))
     vertices = found.mesh.vertices_world
     assert len(vertices) > len(coarse.mesh.vertices_world)
     off = (vertices[:, 2] - dome(vertices)[:, 2]).abs()
     smooth = (vertices[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.42
-    # Between two cuts of an edge a chord, 0.02 long, leaves the ball by 0.02^2 / (8 * 0.5).
+    # Between two points of an edge, a chord of length 0.02 is off by 0.02^2 / (8 * 0.5).
     assert off[smooth].max() < 1e-3
     truth = normalize(vertices - torch.tensor([0.5, 0, 0]), dim=1)
     inner = (vertices[:, :2] - torch.tensor([0.5, 0])).norm(dim=1) < 0.25
@@ -123,7 +123,7 @@ def test_new_and_old_vertices_lie_on_the_surface(generator):
     assert torch.rad2deg(angle).max() < 3
 
 
-def test_a_closed_mesh_stays_closed_and_nears_the_ball(generator):
+def test_a_closed_mesh_stays_closed_and_approaches_the_ball(generator):
     vertices, faces = icosphere(1)
     coarse = coarse_of(vertices, faces)
     volume = (vertices[faces].det() / 6).sum()
@@ -136,7 +136,7 @@ def test_a_closed_mesh_stays_closed_and_nears_the_ball(generator):
         assert volume < grown < 4 / 3 * torch.pi
         volume = grown
     assert len(coarse.mesh.faces) > 80
-    # Fine enough, nothing happens any more.
+    # A mesh that is fine enough is not changed further.
     surface = surface_on(coarse, lambda points: normalize(points, dim=1))
     coarse = remesh(coarse, surface, SPACING, config)
     count = len(coarse.mesh.faces)
@@ -144,14 +144,14 @@ def test_a_closed_mesh_stays_closed_and_nears_the_ball(generator):
     assert len(remesh(coarse, surface, SPACING, config).mesh.faces) == count
 
 
-def test_only_where_the_residual_is_high_if_nothing_else_is(generator):
+def test_facets_with_a_high_residual_are_refined(generator):
     coarse = sheet(generator)
     residual = torch.full((len(coarse.mesh.faces),), 0.01).double()
     residual[0], residual[1] = 0.05, torch.nan
     surface = surface_on(coarse, lambda points: points)
     found = remesh(coarse, surface, SPACING, RemeshConfig(min_samples=4.0), residual=residual)
     added = len(found.mesh.faces) - len(coarse.mesh.faces)
-    assert 3 <= added <= 12  # four of one, and the neighbours' cuts
+    assert 3 <= added <= 12  # four of one, plus splits of neighbours
     corners = coarse.mesh.vertices_world[coarse.mesh.faces[0]]
     size = face_normals(found.mesh.vertices_world, found.mesh.faces).norm(dim=1)
     inside = found.mesh.vertices_world[found.mesh.faces].mean(dim=1) - corners.mean(dim=0)
@@ -159,7 +159,7 @@ def test_only_where_the_residual_is_high_if_nothing_else_is(generator):
     assert_close(nearest, torch.linalg.cross(*(corners[1:] - corners[0])).norm() / 4)
 
 
-def test_small_facets_are_never_split_and_the_limit_holds(generator):
+def test_small_facets_are_never_split_and_the_number_is_limited(generator):
     coarse = sheet(generator, side=9)
     surface = surface_on(coarse, dome)
     alone = remesh(coarse, surface, SPACING, RemeshConfig(min_samples=500.0))
@@ -171,7 +171,7 @@ def test_small_facets_are_never_split_and_the_limit_holds(generator):
     assert limit - 12 <= limited <= limit
 
 
-def test_facets_without_data_go_except_holes_inside(generator):
+def test_facets_without_data_are_dropped_except_in_small_holes(generator):
     coarse = sheet(generator, side=9)
     centres = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
     hole = centres[:, :2].norm(dim=1).argsort()[:2]
@@ -194,7 +194,7 @@ def test_facets_without_data_go_except_holes_inside(generator):
     assert boundary_vertices(found.mesh.faces, len(found.mesh.vertices_world)).any()
 
 
-def test_points_stay_with_their_facets_and_moved_vertices_leave_theirs(generator):
+def test_points_are_reassigned_and_moved_vertices_are_no_points(generator):
     coarse = sheet(generator, side=9)
     count = 300
     facet = torch.randint(len(coarse.mesh.faces), (count,), generator=generator)
@@ -222,7 +222,7 @@ def test_points_stay_with_their_facets_and_moved_vertices_leave_theirs(generator
     assert (side > -1e-6).all()  # inside its facet, as seen from above
     assert_close(found.points.points_world[:count], places)
     assert_close(found.points.covariance_world[:count, 0, 0], spread)
-    # What was a vertex and a point is one of the two still.
+    # A vertex that was a point is still either of them.
     moved = len(found.points.facet) - count
     assert moved > 0
     assert moved + int(found.is_point.sum()) == int(is_point.sum())
@@ -234,7 +234,7 @@ def test_points_stay_with_their_facets_and_moved_vertices_leave_theirs(generator
 
 
 @pytest.mark.parametrize(("axes", "far"), [([0, 1], 0.7), ([2], 20.0)])
-def test_a_vertex_that_ran_away_folds_nothing_and_draws_no_needle(generator, axes, far):
+def test_an_outlying_vertex_makes_no_folds_and_needles(generator, axes, far):
     coarse = sheet(generator)
     surface = surface_on(coarse, lambda points: points)
     corner = (surface.barycentric > 0.999).any(dim=1).nonzero()[20, 0]
@@ -245,7 +245,7 @@ def test_a_vertex_that_ran_away_folds_nothing_and_draws_no_needle(generator, axe
     assert found.mesh.vertices_world[:, 2].abs().max() < 1e-9
 
 
-def test_a_surface_of_another_mesh_is_refused(generator):
+def test_a_surface_of_a_different_mesh_is_rejected(generator):
     coarse, other = sheet(generator), sheet(generator, side=9)
     with pytest.raises(InputError, match="facets"):
         remesh(coarse, surface_on(other, lambda points: points), SPACING)

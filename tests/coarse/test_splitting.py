@@ -28,7 +28,7 @@ def halved(vertices, faces, marked):
 
 
 @pytest.mark.parametrize("fraction", [0.1, 1.0])
-def test_any_marks_leave_a_closed_mesh_closed_with_its_area_volume_and_sides(generator, fraction):
+def test_splitting_keeps_a_closed_mesh_closed_with_its_area_and_volume(generator, fraction):
     vertices, faces = icosphere(2)
     edges, _ = face_edges(faces)
     marked = torch.rand(len(edges), generator=generator) < fraction
@@ -38,12 +38,12 @@ def test_any_marks_leave_a_closed_mesh_closed_with_its_area_volume_and_sides(gen
     assert len(places) == len(vertices) + int(marked.sum())
     ours, theirs = face_normals(places, split.faces), face_normals(vertices, faces)
     assert_close(torch.zeros_like(theirs).index_add(0, split.parent, ours), theirs)
-    assert ((ours * theirs[split.parent]).sum(dim=1) > 0).all()  # none is turned or flat
+    assert ((ours * theirs[split.parent]).sum(dim=1) > 0).all()  # none is flipped or degenerate
     volume = (places[split.faces].det() / 6).sum()
     assert_close(volume, (vertices[faces].det() / 6).sum())
 
 
-def test_parts_know_where_they_lie_in_their_parents(generator):
+def test_children_have_barycentric_coordinates_in_their_parents(generator):
     vertices, faces = icosphere(1)
     marked = torch.rand(len(face_edges(faces)[0]), generator=generator) < 0.5
     split, places = halved(vertices, faces, marked)
@@ -51,7 +51,7 @@ def test_parts_know_where_they_lie_in_their_parents(generator):
     assert_close(places[split.faces], expected)
 
 
-def test_points_are_found_again_in_the_part_that_holds_them(generator):
+def test_points_are_located_in_the_child_that_contains_them(generator):
     vertices, faces = icosphere(1)
     marked = torch.rand(len(face_edges(faces)[0]), generator=generator) < 0.5
     split, places = halved(vertices, faces, marked)
@@ -65,7 +65,7 @@ def test_points_are_found_again_in_the_part_that_holds_them(generator):
     assert_close(after, before)
 
 
-def test_angles_stay_away_from_zero_however_often_one_corner_is_split():
+def test_repeated_splits_of_a_corner_bound_angles_from_below():
     vertices = torch.tensor([[0.0, 0], [4, 0], [1, 2], [5, 2.5]], dtype=torch.float64)
     vertices = torch.cat([vertices, torch.zeros(4, 1).double()], dim=1)
     faces = torch.tensor([[0, 1, 2], [1, 3, 2]])

@@ -32,19 +32,19 @@ def whole(round_about):
     return built(round_about)
 
 
-def test_views_all_round_give_one_closed_surface(whole):
+def test_views_from_all_sides_give_one_closed_surface(whole):
     mesh = whole.mesh
     pairs, _ = face_pairs(mesh.faces)
-    assert 2 * len(pairs) == 3 * len(mesh.faces)  # every edge has two faces: no contour
+    assert 2 * len(pairs) == 3 * len(mesh.faces)  # every edge has two faces: no boundary
     assert int(face_components(mesh.faces).max()) == 0
     assert 500 <= len(mesh.faces) <= 600
     assert len(mesh.vertices_world) - len(pairs) + len(mesh.faces) == 2  # Euler: a ball
 
 
-def test_the_surface_is_where_the_ball_is_and_faces_outward(whole):
+def test_the_surface_is_on_the_ball_and_faces_outward(whole):
     mesh = whole.mesh
     centre = mesh.vertices_world[mesh.faces].mean(dim=1)
-    # A pixel is 1 / 60 of the radius; facets of a ball of 600 lie up to 0.01 inside it.
+    # A pixel is 1 / 60 of the radius; facets of a ball of 600 are up to 0.01 inside it.
     assert (centre.norm(dim=1) - 1).abs().mean() < 0.01
     assert (centre.norm(dim=1) - 1).abs().max() < 0.05
     outward = normalize(face_normals(mesh.vertices_world, mesh.faces), dim=-1)
@@ -52,7 +52,7 @@ def test_the_surface_is_where_the_ball_is_and_faces_outward(whole):
     assert (mesh.normals_world * normalize(mesh.vertices_world, dim=-1)).sum(dim=-1).min() > 0.8
 
 
-def test_facets_carry_the_cloud(whole, round_about):
+def test_facets_have_the_points_of_the_cloud(whole, round_about):
     points = whole.points
     assert len(points.facet) > 0.9 * len(round_about.points_world)
     corners = whole.mesh.vertices_world[whole.mesh.faces[points.facet]]
@@ -65,14 +65,14 @@ def test_facets_carry_the_cloud(whole, round_about):
     assert (whole.support >= Support.LIGHT).all()
 
 
-def test_a_few_views_on_an_arc_give_the_side_that_they_see():
+def test_views_on_an_arc_give_the_visible_side():
     cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=4.0)
     scene = photographed(cameras)
     mesh = built(scene).mesh
-    # What no view sees is gone, and black background gave nothing.
+    # Unseen surface is gone, and the black background has none.
     assert (mesh.vertices_world.norm(dim=1) - 1).abs().max() < 0.1
     assert mesh.vertices_world[:, 2].min() > -0.6
-    # Two views at least see 50 degrees up, down and to the sides.
+    # At least two views see 50 degrees up, down and to the sides.
     wanted = normalize(
         torch.tensor([[0.0, 0, 1], [0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.7, 0.7], [0, -0.7, 0.7]]),
         dim=-1,
@@ -80,17 +80,17 @@ def test_a_few_views_on_an_arc_give_the_side_that_they_see():
     assert (NearestSurface(mesh).query(wanted).distance < 0.03).all()
 
 
-def test_masks_keep_the_rest_out():
+def test_masks_exclude_the_background():
     cameras = arc_cameras(6, width=120, height=100, focal_px=180.0, distance=4.0, sway_deg=0.0)
     scene = photographed(cameras)
     masks = scene.views.inside.clone()
-    masks[:, 50:] = False  # the lower half of the ball in every picture
+    masks[:, 50:] = False  # the lower half of the ball in every image
     mesh = built(scene.replace(views=scene.views.replace(masks=masks))).mesh
     assert mesh.vertices_world[:, 1].min() > -0.1  # y is up
     assert mesh.vertices_world[:, 1].max() > 0.6
 
 
-def test_what_lies_below_the_supporting_plane_gets_no_facets(whole, round_about):
+def test_there_are_no_facets_below_the_supporting_plane(whole, round_about):
     plane = torch.tensor([0.0, 0.6, 0.8, -0.2])
     silhouettes = Silhouettes.everything(round_about.views, plane[None])
     contours = Contours.none(silhouettes, round_about.cameras)
@@ -105,7 +105,7 @@ def test_what_lies_below_the_supporting_plane_gets_no_facets(whole, round_about)
     ).all()
 
 
-def test_a_given_mesh_is_turned_to_the_cameras_and_simplified(round_about):
+def test_a_given_mesh_is_oriented_to_the_cameras_and_simplified(round_about):
     vertices, faces = icosphere(3)
     inside_out = Mesh(vertices_world=vertices, faces=faces.flip(1))
     coarse = built(round_about, inside_out)
@@ -117,9 +117,9 @@ def test_a_given_mesh_is_turned_to_the_cameras_and_simplified(round_about):
     assert len(coarse.points.facet) > 0.9 * len(round_about.points_world)
 
 
-def test_a_small_given_mesh_stays_as_it_is(round_about):
+def test_a_small_given_mesh_is_unchanged(round_about):
     vertices, faces = icosphere(1)
-    assert vertices.dtype == torch.float64  # as files give it
+    assert vertices.dtype == torch.float64  # as read from files
     coarse = built(round_about, Mesh(vertices_world=vertices, faces=faces))
     assert coarse.mesh.vertices_world.dtype == round_about.cameras.intrinsics.dtype == torch.float32
     assert_close(coarse.mesh.vertices_world[coarse.mesh.faces], vertices.float()[faces])
@@ -132,25 +132,25 @@ def test_a_small_given_mesh_stays_as_it_is(round_about):
         (lambda v, f: (v / 0, f), "not finite"),
     ],
 )
-def test_a_mesh_that_cannot_be_used_is_refused(round_about, change, message):
+def test_an_unusable_mesh_is_rejected(round_about, change, message):
     vertices, faces = change(*icosphere(1))
     with pytest.raises(InputError, match=message):
         built(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
 
 
-def test_a_cloud_without_reliable_points_is_refused(round_about):
+def test_a_cloud_without_reliable_points_is_rejected(round_about):
     doubtful = round_about.replace(reprojection_errors_px=round_about.reprojection_errors_px + 100)
     with pytest.raises(ReconstructionError, match="0 of"):
         built(doubtful)
 
 
-def test_of_three_faces_at_an_edge_the_smallest_goes():
+def test_the_smallest_of_three_faces_at_an_edge_is_removed():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.1]])
     faces = torch.tensor([[0, 1, 2], [1, 0, 4], [1, 0, 3]])
     assert limit_faces_per_edge(vertices, faces).tolist() == [[0, 1, 2], [1, 0, 3]]
 
 
-def test_smoothing_normals_leaves_a_plane_alone_and_halves_a_crease():
+def test_smoothing_normals_keeps_a_plane_and_halves_a_crease():
     line = torch.linspace(-1, 1, 3)
     y, x = torch.meshgrid(line, line, indexing="ij")
     flat = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3)
@@ -163,7 +163,7 @@ def test_smoothing_normals_leaves_a_plane_alone_and_halves_a_crease():
     )
     up = torch.tensor([0.0, 0.0, 1.0]).expand(9, 3)
     assert_close(smoothed_normals(flat, faces), up)
-    # A roof along y: normals (-1, 0, 1), up and (1, 0, 1) turn half the way to their neighbours'.
+    # A roof along y: normals (-1, 0, 1), up and (1, 0, 1) rotate halfway to their neighbours.
     roof = flat - flat.new_tensor([0.0, 0.0, 1.0]) * flat[:, :1].abs()
     before, after = vertex_normals(roof, faces), smoothed_normals(roof, faces)
     tilt_before, tilt_after = (torch.atan2(one[3:6, 0], one[3:6, 2]) for one in (before, after))
@@ -174,7 +174,7 @@ def test_smoothing_normals_leaves_a_plane_alone_and_halves_a_crease():
     assert_close(after.norm(dim=1), torch.ones(9))
 
 
-def test_facets_of_a_mesh_are_its_faces_with_the_points_that_a_chain_would_attach(round_about):
+def test_facets_of_a_mesh_are_its_faces_with_points_as_in_a_chain(round_about):
     vertices, faces = icosphere(2)
     mesh = Mesh(vertices_world=vertices, faces=faces.flip(1))  # wound inwards
     found = facets_of(mesh, round_about)
@@ -191,7 +191,7 @@ def test_facets_of_a_mesh_are_its_faces_with_the_points_that_a_chain_would_attac
     assert facets_of(mesh, bare, round_about.views.names[3]).reference == 3
 
 
-def test_facets_of_a_mesh_elsewhere_are_refused(round_about):
+def test_facets_of_a_misplaced_mesh_are_rejected(round_about):
     vertices, faces = icosphere(2)
     mesh = Mesh(vertices_world=1000 * vertices, faces=faces)
     with pytest.raises(InputError, match="not where the photographs show the object"):

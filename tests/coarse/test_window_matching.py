@@ -9,7 +9,7 @@ OFFSETS = [-0.2, -0.003, 0.0, 0.004, 0.05]
 
 
 def textured(width=61, height=47, dtype=torch.float32):
-    """Five views of noise, each with pixels that say nothing, at the borders too."""
+    """Return five views of noise, each with invalid pixels, also at the borders."""
     generator = torch.Generator().manual_seed(0)
     tone = 0.2 + torch.rand(5, height, width, generator=generator, dtype=torch.float64)
     usable = torch.rand(5, height, width, generator=generator) > 0.1
@@ -28,7 +28,7 @@ def field(level):
 
 
 def correlations(level, sources, inverse_depth):
-    """Compute the score of one field in double precision, straight from its definition."""
+    """Compute the scores of one depth field in double precision by definition."""
     height, width = level.tone.shape[-2:]
     rows = torch.arange(height)[:, None] + torch.zeros(width, dtype=torch.long)
     columns = torch.zeros(height, dtype=torch.long)[:, None] + torch.arange(width)
@@ -74,13 +74,13 @@ def test_scores_are_mean_correlations_of_the_best_sources():
     expected = expected_scores(level, sources).float()
     assert not bool(found[:, ~level.usable[2]].any())
     assert float((expected != 0).double().mean()) > 0.5
-    # Where a place is within rounding of the border between pixels, either may be the nearest.
+    # Positions within rounding of a border between pixels may round to either.
     off = (found - expected).abs()
     assert float((off > 1e-4).double().mean()) < 1e-3
     assert_close(found[off <= 1e-4], expected[off <= 1e-4], atol=1e-4, rtol=0)
 
 
-def test_windows_of_a_narrow_picture_and_of_one_without_anything_are_scored():
+def test_windows_of_narrow_and_empty_images_are_scored():
     level = textured(width=3, height=300)
     sources = torch.tensor([1, 3])
     found = Matcher(level, pair(level, 2, sources)).scores(field(level), OFFSETS)
@@ -91,7 +91,7 @@ def test_windows_of_a_narrow_picture_and_of_one_without_anything_are_scored():
     assert_close(none, torch.zeros_like(none))
 
 
-def test_tensors_of_double_precision_with_gradients_give_scores_of_their_type():
+def test_scores_have_the_dtype_of_differentiable_float64_input():
     level, sources = textured(), torch.tensor([1, 3])
     single = Matcher(level, pair(level, 2, sources)).scores(field(level), OFFSETS)
     double = textured(dtype=torch.float64)
