@@ -13,7 +13,7 @@ from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
 from pimper_torch.records import CameraModel, Cameras, SparseScene, Views
 from tests.silhouettes.shapes import all_round
 
-# The ball stands on the plane z = 0.
+# The ball is supported by the plane z = 0.
 CENTER, RADIUS = torch.tensor([0.0, 0.0, 0.5]), 0.5
 
 
@@ -31,7 +31,7 @@ def overlap(found: Tensor, truth: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Staged:
-    """A ball on a table, and which pixels show it."""
+    """A ball on a table, and its true silhouettes."""
 
     scene: SparseScene
     truth: Tensor
@@ -82,7 +82,7 @@ def _speckle(points: Tensor, waves: Tensor) -> Tensor:
 
 
 def _cloud(views: Views, cameras, generator: torch.Generator) -> SparseScene:
-    """Put points on the ball's upper side and the table; views observe those before them."""
+    """Return points on the upper side of the ball and on the table, with their observations."""
     flat = 3 * torch.rand(600, 2, generator=generator) - 1.5
     flat = flat[flat.norm(dim=1) > 0.6]
     table = torch.cat([flat, torch.zeros(len(flat), 1)], dim=1)

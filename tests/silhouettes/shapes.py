@@ -1,4 +1,4 @@
-"""Shapes given by their distance functions, and their silhouettes."""
+"""Shapes as signed distance functions, and their silhouettes."""
 
 from collections.abc import Callable
 from functools import cache
@@ -18,7 +18,7 @@ PIXEL = DISTANCE / FOCAL  # at the origin
 
 
 def all_round() -> Cameras:
-    """Twenty views of the origin, from everywhere."""
+    """Return twenty views of the origin from all sides."""
     index = torch.arange(20, dtype=torch.float64) + 0.5
     z, angle = 1 - index / 10, torch.pi * (1 + 5**0.5) * index
     flat = (1 - z**2).sqrt()
@@ -31,7 +31,7 @@ def all_round() -> Cameras:
 def silhouettes_of(
     distance: Callable[[Tensor], Tensor], cameras: Cameras, reach: float = 1.5
 ) -> Silhouettes:
-    """Draw the silhouettes of a shape that is given by its distance function, about the origin."""
+    """Draw the silhouettes of a signed distance function around the origin."""
     masks = []
     for view in range(cameras.num_views):
         pixels = pixel_centers(WIDTH, HEIGHT, like=cameras.intrinsics).reshape(-1, 2)
@@ -47,7 +47,7 @@ def silhouettes_of(
 def nearest_to(
     distance: Callable[[Tensor], Tensor], centers: Tensor, rays: Tensor, reach: float = 1.5
 ) -> tuple[Tensor, Tensor]:
-    """Give the smallest distance along rays within a ball about the origin, and where it is."""
+    """Return the smallest distance along rays within a ball around the origin, and its point."""
     rays = normalize(rays, dim=-1)
     centre = -(centers * rays).sum(dim=-1)
     best, place = None, None
@@ -68,7 +68,7 @@ def nearest_to(
 
 
 def cuts_of(masks: Tensor, margins_px: Tensor) -> Cuts:
-    """Cuts of which cues doubt none."""
+    """Return cuts that agree with all cues."""
     none = torch.zeros(len(masks), dtype=torch.float64)
     return Cuts(
         masks=masks,
@@ -85,7 +85,7 @@ def ball(points: Tensor) -> Tensor:
 
 
 def ring(points: Tensor) -> Tensor:
-    """A torus about the z axis, of radii 0.9 and 0.35."""
+    """Return the distance to a torus about the z axis, with radii 0.9 and 0.35."""
     flat = points[..., :2].norm(dim=-1) - 0.9
     return torch.stack([flat, points[..., 2]], dim=-1).norm(dim=-1) - 0.35
 
@@ -94,5 +94,5 @@ CENTERS = torch.tensor([[-0.6, 0.0, 0.0], [0.6, 0.2, 0.1]], dtype=torch.float64)
 
 
 def two_balls(points: Tensor) -> Tensor:
-    """Balls of radius 0.5 that do not touch; from some places one hides part of the other."""
+    """Return the distance to two separate balls of radius 0.5, partly hidden in some views."""
     return (points[..., None, :] - CENTERS).norm(dim=-1).amin(dim=-1) - 0.5

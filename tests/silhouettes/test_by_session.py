@@ -7,18 +7,18 @@ from pimper_torch.records import Silhouettes
 
 @pytest.fixture
 def numbers(staged):
-    """Return a function from the scene of a series to the numbers of its views."""
+    """Return a function from the scene of a capture session to the numbers of its views."""
     names = staged.scene.views.names
     return lambda part: [names.index(name) for name in part.views.names]
 
 
 def numbered(part, views):
-    """Write each view's number into its silhouette."""
+    """Return silhouettes with the number of each view as value."""
     inside = torch.tensor(views).float()[:, None, None] * torch.ones_like(part.views.images[:, 0])
     return Silhouettes(inside=inside, reliable=torch.tensor(views) > 2, source="found")
 
 
-def test_silhouettes_of_each_series_come_back_in_the_order_of_the_views(staged, numbers):
+def test_silhouettes_of_sessions_are_in_the_order_of_views(staged, numbers):
     scene = staged.scene
     count = scene.views.num_views
     sessions = torch.arange(count) % 2
@@ -38,13 +38,13 @@ def test_silhouettes_of_each_series_come_back_in_the_order_of_the_views(staged, 
     assert found.hidden[:, 0, 0].tolist() == [view > 0 and view % 2 == 0 for view in range(count)]
 
 
-def test_without_series_all_views_are_looked_at_together(staged, numbers):
+def test_without_sessions_all_views_are_processed_together(staged, numbers):
     scene = staged.scene
     found = by_session(scene, lambda part: numbered(part, numbers(part)))
     assert found.inside[:, 0, 0].tolist() == list(range(scene.views.num_views))
 
 
-def test_everything_in_one_series_is_everything_in_all(staged, numbers):
+def test_one_session_without_silhouettes_discards_all(staged, numbers):
     scene = staged.scene
 
     def find(part):
@@ -57,7 +57,7 @@ def test_everything_in_one_series_is_everything_in_all(staged, numbers):
     assert len(found.inside) == scene.views.num_views
 
 
-def test_everything_is_what_is_above_the_planes_of_all_series(staged, numbers):
+def test_everything_is_bounded_by_the_planes_of_all_sessions(staged, numbers):
     scene = staged.scene
     sessions = torch.arange(scene.views.num_views) % 2
 

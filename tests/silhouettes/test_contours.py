@@ -13,20 +13,20 @@ from tests.silhouettes.shapes import ball, silhouettes_of, two_balls
 
 @pytest.fixture(autouse=True)
 def coarse_voxels(monkeypatch):
-    """Build hulls of voxels of 0.04, two thirds of a pixel: the usual ones take a second each."""
+    """Build hulls with voxels of 0.04, two thirds of a pixel; default ones take a second each."""
     few = partial(trace.visual_hull, num_voxels=300_000)
     monkeypatch.setattr(trace, "visual_hull", few)
 
 
 @pytest.mark.parametrize("shape", [ball, two_balls])
-def test_a_box_holds_what_the_silhouettes_show_and_not_much_more(cameras, shape):
+def test_the_box_of_silhouettes_is_tight(cameras, shape):
     low, high = bounding_box(silhouettes_of(shape, cameras), cameras)
     assert (low < -1.1).all()
     assert (high > 1.1).all()
     assert (high - low).max() < 2 * 2.4
 
 
-def test_two_wrong_silhouettes_in_twenty_cut_nothing_off_where_they_were_found(cameras):
+def test_two_wrong_estimated_silhouettes_of_twenty_remove_no_volume(cameras):
     silhouettes = silhouettes_of(ball, cameras)
     wrong = silhouettes.inside.clone()
     wrong[[3, 15], :, 60:] = 0
@@ -38,10 +38,10 @@ def test_two_wrong_silhouettes_in_twenty_cut_nothing_off_where_they_were_found(c
     true = 4 / 3 * math.pi
     assert true < volume(silhouettes.inside, "found") < 1.1 * true
     assert true < volume(wrong, "found")
-    assert volume(wrong, "masks") < 0.9 * true  # those that are given are believed
+    assert volume(wrong, "masks") < 0.9 * true  # given masks are trusted
 
 
-def test_silhouettes_that_leave_nothing_out_constrain_nothing(cameras):
+def test_silhouettes_that_contain_everything_do_not_constrain(cameras):
     silhouettes = silhouettes_of(ball, cameras).replace(source="everything")
     contours = TraceContours()(silhouettes, cameras)
     assert not contours.confine
@@ -50,7 +50,7 @@ def test_silhouettes_that_leave_nothing_out_constrain_nothing(cameras):
     assert len(contours.touching(far, far).points_world) == 0
 
 
-def test_above_a_plane_is_held_and_its_points_are_used(cameras):
+def test_the_half_space_above_a_plane_is_the_hull(cameras):
     plane = torch.tensor([0.0, 0.0, 1.0, -0.25]).double()
     silhouettes = silhouettes_of(ball, cameras).replace(
         source="everything", planes_world=plane[None]
@@ -65,7 +65,7 @@ def test_above_a_plane_is_held_and_its_points_are_used(cameras):
     assert (contours.hull.depth_of(points) > 0).all()
 
 
-def test_silhouettes_without_a_common_place_are_told_of(cameras):
+def test_silhouettes_without_common_volume_warn(cameras):
     silhouettes = silhouettes_of(ball, cameras)
     nothing = silhouettes.replace(inside=torch.zeros_like(silhouettes.inside))
     with pytest.warns(PimperWarning, match="no point in common"):

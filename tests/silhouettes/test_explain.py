@@ -21,14 +21,14 @@ def sphere(radius=1.0):
     return Mesh(vertices_world=radius * vertices, faces=faces)
 
 
-def test_the_surface_that_silhouettes_show_explains_them(contours, recwarn):
+def test_the_true_surface_explains_its_silhouettes(contours, recwarn):
     found = explain(sphere(), contours, NAMES)
     assert found.uncovered.max() < 0.02
     assert found.outside.max() < 0.02
     assert not recwarn.list
 
 
-def test_a_hole_is_not_covered_by_the_back_that_is_seen_through_it(contours, cameras):
+def test_a_hole_is_not_covered_by_the_back_face_behind_it(contours, cameras):
     whole = sphere()
     up = whole.vertices_world[whole.faces].mean(dim=1)[:, 2]
     with pytest.warns(PimperWarning, match=r"\.png: the surface lacks"):
@@ -39,20 +39,20 @@ def test_a_hole_is_not_covered_by_the_back_that_is_seen_through_it(contours, cam
     assert found.outside.max() < 0.02
 
 
-def test_what_sticks_out_is_told_with_the_photograph(contours):
-    """A radius larger by a tenth: 0.21 of the area, and perspective adds to it."""
+def test_surface_outside_silhouettes_warns_with_the_photograph(contours):
+    """A radius larger by a tenth adds 0.21 of the area, and more by perspective."""
     with pytest.warns(PimperWarning, match=r"\.png: the surface sticks out by 2\d%"):
         found = explain(sphere(1.1), contours, NAMES)
     assert 0.19 < found.outside.min() < found.outside.max() < 0.27
     assert found.uncovered.max() < 0.01
 
 
-def test_no_more_than_plain_sets_have_is_a_figure_and_no_warning(contours, recwarn):
+def test_usual_excess_is_a_figure_without_warning(contours, recwarn):
     assert 0.05 < explain(sphere(1.03), contours, NAMES).outside.max() < 0.09
     assert not recwarn.list
 
 
-def test_unsure_silhouettes_and_views_that_are_not_relied_on_count_less(contours):
+def test_uncertain_silhouettes_and_unreliable_views_count_less(contours):
     silhouettes = contours.silhouettes
     unsure = torch.where(silhouettes.inside < 0.5, 0.25, silhouettes.inside)
     reliable = silhouettes.reliable.clone()

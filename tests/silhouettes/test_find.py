@@ -28,7 +28,7 @@ def test_a_ball_on_a_table_is_found_in_every_view(staged):
     assert silhouettes is not None
     assert silhouettes.source == "found"
     assert silhouettes.reliable.all()
-    # A pixel more all round the ball of 50 pixels is 0.96; the table or its shadow is far less.
+    # One pixel around the ball of 50 pixels gives 0.96; the table or its shadow far less.
     assert overlap(silhouettes.masks, staged.truth).min() > 0.95
     used = masked(staged.scene, silhouettes).views.masks  # a little wider
     assert (used | ~silhouettes.masks).all()
@@ -47,8 +47,8 @@ def test_an_object_without_a_point_is_found_by_parallax(staged):
     assert overlap(silhouettes.masks, staged.truth).median() > 0.9
 
 
-def test_what_stands_before_the_dark_beyond_a_table_is_found(staged):
-    """The table ends below the middle of the ball, and there is nothing behind it."""
+def test_an_object_in_front_of_a_dark_background_is_found(staged):
+    """The table ends below the middle of the ball; the background is black."""
     images = staged.scene.views.images.clone()
     images[:, :, :70] *= staged.truth[:, None, :70]
     scene = staged.scene.replace(views=staged.scene.views.replace(images=images))
@@ -56,7 +56,7 @@ def test_what_stands_before_the_dark_beyond_a_table_is_found(staged):
     assert overlap(silhouettes.masks, staged.truth).median() > 0.9
 
 
-def test_what_hides_the_object_is_of_its_silhouette_and_is_not_used(staged):
+def test_occluders_are_inside_silhouettes_but_not_used(staged):
     hidden = torch.zeros_like(staged.truth)
     hidden[3, 80:100, 110:130] = True
     silhouettes = Silhouettes(
@@ -73,8 +73,8 @@ def test_what_hides_the_object_is_of_its_silhouette_and_is_not_used(staged):
 
 
 @pytest.mark.parametrize("seen_in", [1, 3])
-def test_a_view_abstains_where_something_stands_before_the_object(staged, monkeypatch, seen_in):
-    """What a view's cut lacks and shows the plane carves the hull; what stands there does not."""
+def test_a_view_abstains_at_occluders_of_the_object(staged, monkeypatch, seen_in):
+    """Plane pixels outside a cut carve the hull; occluder pixels do not."""
     cues = cues_of(staged.scene, SMALL)
     agreement = torch.where(staged.truth, -0.2, 0.95)
     person = torch.zeros_like(staged.truth)
@@ -99,9 +99,11 @@ def with_masks(scene, masks):
     return scene.replace(views=scene.views.replace(masks=masks))
 
 
-def test_masks_that_are_given_are_believed(staged):
+def test_given_masks_are_trusted(staged):
     drawn = staged.truth.clone()
-    drawn[:, :90] &= pixel_centers(240, 180, like=torch.ones(()))[:90, :, 0] < 120  # of the ball
+    drawn[:, :90] &= (
+        pixel_centers(240, 180, like=torch.ones(()))[:90, :, 0] < 120
+    )  # only part of the ball
     for masks in (staged.truth, drawn):
         scene = with_masks(staged.scene, masks)
         silhouettes = FindSilhouettes()(scene)
@@ -113,7 +115,7 @@ def test_masks_that_are_given_are_believed(staged):
 
 
 def wrong(truth, kind, view):
-    """One mask of these in place of the right one."""
+    """Return one wrong mask of the given kind."""
     one = torch.zeros_like(truth[0])
     if kind == "inverted":
         one = ~truth[view]
@@ -123,14 +125,14 @@ def wrong(truth, kind, view):
         row, column = truth[view].nonzero()[truth[view].sum() // 2].tolist()
         one[row, column] = True
     else:
-        one[100:, 30:90] = truth[view, 60:140, 90:150]  # of something beside the ball
+        one[100:, 30:90] = truth[view, 60:140, 90:150]  # an object next to the ball
     return one
 
 
 @pytest.mark.parametrize(
     ("kind", "views"), [("inverted", [0, 7]), ("all", [5]), ("pixel", [0, 7]), ("another", [5])]
 )
-def test_masks_that_contradict_the_others_are_not_believed(staged, kind, views):
+def test_masks_that_contradict_the_others_are_not_trusted(staged, kind, views):
     masks = staged.truth.clone()
     for view in views:
         masks[view] = wrong(staged.truth, kind, view)
@@ -142,16 +144,16 @@ def test_masks_that_contradict_the_others_are_not_believed(staged, kind, views):
     used = masked(scene, silhouettes).views.masks
     assert used is not None
     for view in range(12):
-        if view in views:  # what the others leave: the ball, and a little where an arc ends
-            # 86 pixels may be missing, a fifth of the contour's.
+        if view in views:  # the others leave the ball, and a little more at the ends of the arc
+            # 86 pixels may be missing, a fifth of those of the contour.
             assert (used[view] | ~staged.truth[view]).float().mean() > 0.998
             assert overlap(used[view][None], staged.truth[view][None]) > 0.85
         else:
             assert torch.equal(used[view], staged.truth[view])
 
 
-def test_a_mask_of_a_view_that_the_border_cuts_is_right(staged):
-    """Half of the photographs end at the middle of the ball."""
+def test_masks_of_truncated_views_are_trusted(staged):
+    """Half of the photographs are truncated at the middle of the ball."""
     sizes, masks = staged.scene.views.sizes_px.clone(), staged.truth.clone()
     sizes[::2, 0] = 120
     masks[::2, :, 120:] = False
@@ -161,14 +163,14 @@ def test_a_mask_of_a_view_that_the_border_cuts_is_right(staged):
     cameras = staged.scene.cameras.replace(sizes_px=sizes)
     scene = staged.scene.replace(views=views, cameras=cameras)
     assert FindSilhouettes()(scene).reliable.all()
-    masks[4] = views.inside[4]  # all of it
+    masks[4] = views.inside[4]  # the complete view
     with pytest.warns(PimperWarning, match=r"\(view 04\.png\): its mask contradicts"):
         silhouettes = FindSilhouettes()(with_masks(scene, masks))
     assert not silhouettes.inside[4, :, 120:].any()
     assert overlap(silhouettes.masks[4, :, :120][None], staged.truth[4, :, :120][None]) > 0.85
 
 
-def test_masks_of_which_no_majority_agrees_are_refused(staged):
+def test_masks_without_a_consistent_majority_are_rejected(staged):
     masks = staged.truth.clone()
     masks[::2] = ~masks[::2]
     with pytest.raises(InputError, match="masks contradict each other, and at most half"):
@@ -176,12 +178,12 @@ def test_masks_of_which_no_majority_agrees_are_refused(staged):
 
 
 def test_masks_are_asked_for_and_missing(staged):
-    with pytest.raises(InputError, match="photographs have no masks"):
+    with pytest.raises(InputError, match="come without any"):
         FindSilhouettes(SilhouetteConfig(object="masks"))(staged.scene)
 
 
-def test_silhouettes_that_contradict_one_another_are_not_trusted(staged):
-    """Photographs under other cameras than theirs have no hull in common."""
+def test_silhouettes_that_contradict_each_other_are_not_trusted(staged):
+    """Photographs with permuted cameras have no common hull."""
     views = staged.scene.views
     shifted = [image.roll(90 * (view % 2) - 45, 2) for view, image in enumerate(views.images)]
     scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))
@@ -190,10 +192,10 @@ def test_silhouettes_that_contradict_one_another_are_not_trusted(staged):
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
-def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
+def test_implausible_silhouettes_fall_back_to_everything_with_a_warning(
     staged, monkeypatch, fraction
 ):
-    """Cuts that meet the hull's projections by chance, or not at all, are no silhouettes."""
+    """Cuts that agree with projections of the hull by chance or not at all are rejected."""
     projections = torch.full(staged.truth.shape, -5.0)
     projections[:, 60:120, 60:180] = 5.0
     masks = torch.zeros_like(staged.truth)
@@ -206,7 +208,7 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
     ):
         silhouettes = FindSilhouettes(SMALL)(staged.scene)
     assert silhouettes.source == "everything"
-    # The ball stands on z = 0; what is a few hundredths thick is the table.
+    # The ball is on z = 0; the first few hundredths are the table.
     table = torch.tensor([[0.5, 0.5, 0.0, 1.0], [0.5, -0.5, 0.05, 1.0], [0.0, 0.0, -1.0, 1.0]])
     assert ((table @ silhouettes.planes_world[0]) > 0).tolist() == [False, True, False]
     meant = FindSilhouettes(SilhouetteConfig(object="everything"))(staged.scene)
@@ -214,7 +216,7 @@ def test_nonsense_falls_back_to_everything_and_says_how_far_off_it_is(
 
 
 def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
-    """Half of the views and more have to."""
+    """At least half of the views must agree."""
     projections = torch.full(staged.truth.shape, -5.0)
     projections[:, 60:120, 60:180] = 5.0
     masks = projections > 0
@@ -229,8 +231,8 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
     ("grown_px", "why"),
     [(20, "show background on"), (-20, "contain [0-9]+% of the object's points")],
 )
-def test_silhouettes_that_all_err_alike_are_not_trusted(staged, monkeypatch, grown_px, why):
-    """Hulls twice and half as wide as the ball: all views agree with them."""
+def test_silhouettes_with_a_shared_error_are_not_trusted(staged, monkeypatch, grown_px, why):
+    """All views agree with hulls twice and half as wide as the ball."""
     reach = signed_distances(staged.truth)
     masks = reach > -grown_px
     margins = torch.where(masks, 5.0, -5.0)
@@ -247,8 +249,8 @@ def signed_distances(masks):
     return torch.stack([signed_distance(mask) for mask in masks])
 
 
-def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
-    """A place of the table that is hidden in eight of twelve views is known from the other four."""
+def test_the_plane_is_learned_from_views_that_show_it(staged, generator):
+    """Table pixels hidden in eight of twelve views are learned from the other four."""
     views, cameras = staged.scene.views, staged.scene.cameras
     place, _ = project(
         torch.tensor([[0.0, -0.75, 0.0]]), cameras.cam_from_world, cameras.intrinsics
@@ -260,31 +262,31 @@ def test_the_plane_is_learned_where_nothing_hides_it(staged, generator):
     images = torch.where(hidden[:, None], other, views.images)
     pictures = working_pictures(views.replace(images=images), cameras, 240)
     plane = Plane(normal_world=torch.tensor([0.0, 0, 1]), offset=torch.tensor(0.0))
-    seed_at_fixation = fixation(pictures.cameras.cam_from_world)
-    before = plane_agreement(pictures, plane, seed_at_fixation)
-    after = plane_agreement(pictures, plane, seed_at_fixation, hidden)
-    centre = (away < 8) & after.isfinite()  # not where the table is flat
+    target = fixation(pictures.cameras.cam_from_world)
+    before = plane_agreement(pictures, plane, target)
+    after = plane_agreement(pictures, plane, target, hidden)
+    centre = (away < 8) & after.isfinite()  # the table is flat elsewhere
     seen, covered = centre & (torch.arange(12) >= 8)[:, None, None], centre & hidden
     assert seen.sum() > 400
-    assert (before[seen] > 0.75).float().mean() < 0.4  # what hides it counts for it
+    assert (before[seen] > 0.75).float().mean() < 0.4  # occluders count as plane
     assert (after[seen] > 0.75).float().mean() > 0.9
-    assert (after[covered] < 0.5).float().mean() > 0.8  # what hides it stands out
+    assert (after[covered] < 0.5).float().mean() > 0.8  # occluders are detected
 
 
-def before_a_room(generator, num_views=9):
-    """A textured disc that moves before a room that shifts, each photograph under its own light."""
+def before_shifting_background(generator, num_views=9):
+    """Return a disc moving over a shifting background, each photograph under its own light."""
     wide, high = 480, 360
-    room = smooth(torch.rand(1, 1, 480, 600, generator=generator))
+    background = smooth(torch.rand(1, 1, 480, 600, generator=generator))
     thing = smooth(torch.rand(num_views, 1, high, wide, generator=generator))
     maps = torch.eye(3).repeat(num_views, 1, 1)
     maps[:, :2, 2] = torch.randint(0, 120, (num_views, 2), generator=generator).float()
-    corner = pixel_centers(wide, high, like=room)
+    corner = pixel_centers(wide, high, like=background)
     covered = torch.stack(
         [(corner - corner.new_tensor([240 + 7 * view, 180])).norm(dim=-1) < 80 for view in range(9)]
     )
     seen = torch.stack(
         [
-            room[0, 0, int(v) : int(v) + high, int(u) : int(u) + wide]
+            background[0, 0, int(v) : int(v) + high, int(u) : int(u) + wide]
             for u, v in maps[:, :2, 2].tolist()
         ]
     )
@@ -303,15 +305,15 @@ def smooth(noise):
     return torch.nn.functional.avg_pool2d(noise, 9, 1, 4) ** 4
 
 
-def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator):
-    views, maps, covered = before_a_room(generator)
+def test_a_mapped_static_background_is_detected(staged, generator):
+    views, maps, covered = before_shifting_background(generator)
     cameras = staged.scene.cameras.take(list(range(9)))
-    pictures = working_pictures(views, cameras, 240)  # half as large
+    pictures = working_pictures(views, cameras, 240)  # at half size
     half = covered[:, ::2, ::2]
     maps[4] = torch.nan
     found = background_agreement(pictures, maps)
-    room = ~torch.nn.functional.max_pool2d(half[:, None].float(), 13, 1, 6)[:, 0].bool()
-    known = room & found.isfinite()
+    background = ~torch.nn.functional.max_pool2d(half[:, None].float(), 13, 1, 6)[:, 0].bool()
+    known = background & found.isfinite()
     assert found[4].isnan().all()
     assert known[:4].float().mean() > 0.5
     assert (found[known] > 0.75).float().mean() > 0.95
@@ -321,10 +323,8 @@ def test_a_room_is_known_where_it_is_at_rest_once_it_is_mapped(staged, generator
     assert (wrong[wrong.isfinite()] > 0.75).float().mean() < 0.2
 
 
-def test_a_room_that_shifts_is_found_without_maps_and_none_where_the_camera_moves(
-    staged, generator
-):
-    views, maps, covered = before_a_room(generator)
+def test_a_shifting_background_is_detected_unless_the_camera_moves(staged, generator):
+    views, maps, covered = before_shifting_background(generator)
     pictures = working_pictures(views, staged.scene.cameras.take(list(range(9))), 240)
     found = static_background_maps(pictures, covered[:, ::2, ::2])
     shifts = (found[:, :2, 2] - maps[:, :2, 2]).float()
@@ -333,11 +333,11 @@ def test_a_room_that_shifts_is_found_without_maps_and_none_where_the_camera_move
     assert len(static_background_maps(pictures, staged.truth)) == 0
 
 
-def test_the_region_keeps_what_is_outside_from_being_the_object(staged):
+def test_the_object_is_limited_to_the_region(staged):
     left = SilhouetteConfig(size_px=240, region=(-0.6, -0.6, 0.0, 0.0, 0.6, 1.1))
     silhouettes = FindSilhouettes(left)(staged.scene)
     assert silhouettes is not None
-    assert 0 < silhouettes.masks.sum() < 0.8 * staged.truth.sum()  # half a ball, as the box cuts it
+    assert 0 < silhouettes.masks.sum() < 0.8 * staged.truth.sum()  # half a ball, cut by the box
 
 
 def test_a_region_is_two_corners():
@@ -346,12 +346,12 @@ def test_a_region_is_two_corners():
             SilhouetteConfig(region=wrong)
 
 
-def test_a_region_that_nothing_shows_is_refused(staged):
+def test_a_region_outside_all_views_is_rejected(staged):
     away = SilhouetteConfig(size_px=240, region=(50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
     with pytest.raises(
         InputError, match="no photograph shows it, and no point of the cloud is in it"
     ):
         FindSilhouettes(away)(staged.scene)
     tiny = SilhouetteConfig(size_px=240, region=(0.0, 0.0, 0.4, 1e-6, 1e-6, 0.400001))
-    with pytest.warns(PimperWarning, match="Everything"):  # shown, though no point is in it
+    with pytest.warns(PimperWarning, match="Everything"):  # visible, but without points
         FindSilhouettes(tiny)(staged.scene)

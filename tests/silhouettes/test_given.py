@@ -1,4 +1,4 @@
-"""Masks that files hold otherwise than their photographs."""
+"""Masks stored in a different way than their photographs."""
 
 import warnings
 
@@ -19,7 +19,7 @@ from pimper_torch.runtime.errors import InputError, PimperWarning
 from pimper_torch.runtime.stage import Stage
 from tests.silhouettes.shapes import FOCAL, HEIGHT, WIDTH, all_round, silhouettes_of
 
-# Three balls without any symmetry, and the radius on which points of the background are.
+# Three balls without symmetry, and the radius of background points.
 CENTERS = torch.tensor([[-0.4, 0.0, 0.0], [0.6, 0.3, 0.2], [0.0, 0.2, 0.7]]).double()
 RADII, FAR, VIEWS = torch.tensor([0.5, 0.3, 0.2]).double(), 1.3, 20
 NAMES = tuple(f"{view:02d}.png" for view in range(VIEWS))
@@ -36,7 +36,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def scene(truth):
-    """Points of the balls and around them; views observe what faces them, or is not before them."""
+    """Return points on and around the balls, observed by views that they face."""
     generator, cameras = torch.Generator().manual_seed(3), all_round()
     outward = normalize(torch.randn(900, 3, generator=generator).double(), dim=1)
     ball = torch.arange(600) % 3
@@ -53,7 +53,7 @@ def scene(truth):
     away = cameras.centers_world[:, None] - points
     faces = (normalize(away, dim=-1) * outward).sum(dim=-1) > 0.2
     on_ball = torch.arange(len(points)) < len(points) - 300
-    # A ball may hide another one's points, which are inside all the same.
+    # A ball may hide points of a different ball; they are inside its silhouette anyway.
     seen = framed & torch.where(on_ball, faces & inside, ~inside)
     middle = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     lens = CameraModel(camera=1, model="PINHOLE", params=middle, width=WIDTH, height=HEIGHT)
@@ -72,20 +72,20 @@ def hard(views, masks):
 
 
 def soft(views, masks):
-    """As a segmenter has them: never certain."""
+    """Return masks like those of a segmenter: never certain."""
     inside = torch.where(masks, 0.9, 0.05)
     prior = SilhouettePrior(names=views.names, sizes_px=views.sizes_px, inside=inside)
     return views.replace(masks=None, priors=(prior,))
 
 
 def read(views, reading):
-    """Masks as a reading shows them."""
+    """Return the masks in a reading."""
     found = reading.of(views)
     return found.priors[0].inside > 0.5 if found.masks is None else found.masks
 
 
 def order(*changed):
-    """Names in their order, but for some."""
+    """Return names in order, with some changed."""
     return torch.tensor([dict(changed).get(view, view) for view in range(VIEWS)])
 
 
@@ -110,20 +110,18 @@ def order(*changed):
         ),
     ],
 )
-def test_masks_of_another_reading_are_read_as_cameras_and_points_say(
-    scene, truth, form, wrong, said
-):
+def test_cameras_and_points_select_the_reading_of_masks(scene, truth, form, wrong, said):
     views = form(scene.views, wrong(truth))
     with pytest.warns(PimperWarning, match=f"if they are {said}.*, so they are read like that"):
         reading = right_reading(scene.replace(views=views), views)
     assert torch.equal(read(views, reading), truth)
-    if form is soft:  # as certain as they were
+    if form is soft:  # with the same certainty
         inside = reading.of(views).priors[0].inside
         assert_close((inside - 0.5).abs().sum(), (views.priors[0].inside - 0.5).abs().sum())
 
 
-def test_right_masks_stay_as_they_are_and_drawn_ones_do_too(scene, truth):
-    """Masks a pixel too wide and too narrow in turns, and those of four photographs alone."""
+def test_correct_and_slightly_inaccurate_masks_are_unchanged(scene, truth):
+    """Masks alternately a pixel too wide and too narrow, and those of four photographs only."""
     wide = torch.nn.functional.max_pool2d(truth.float(), 3, 1, 1) > 0
     narrow = torch.nn.functional.max_pool2d((~truth).float(), 3, 1, 1) == 0
     drawn = torch.where((torch.arange(VIEWS) % 2 > 0)[:, None, None], wide, narrow)
@@ -138,7 +136,7 @@ def test_right_masks_stay_as_they_are_and_drawn_ones_do_too(scene, truth):
         assert right_reading(scene.replace(views=views), views) is AS_THEY_ARE
 
 
-def test_soft_masks_of_some_photographs_may_have_the_names_of_the_next_ones(scene, truth):
+def test_shifted_names_of_soft_masks_are_corrected(scene, truth):
     prior = soft(scene.views, truth).priors[0].take(list(range(12))).replace(names=NAMES[1:13])
     views = scene.views.replace(priors=(prior,))
     with pytest.warns(PimperWarning, match=r"shifted by 1 in the list \(00\.png has that of 01"):
@@ -148,8 +146,8 @@ def test_soft_masks_of_some_photographs_may_have_the_names_of_the_next_ones(scen
     assert torch.equal(found.inside[order], prior.inside)
 
 
-def test_clicks_stay_where_they_are(scene, truth):
-    """Those in photographs of unlike sizes, too, whose rasters are padded with 0."""
+def test_clicks_are_unchanged(scene, truth):
+    """This includes photographs of different sizes, with rasters padded by 0."""
     inside = torch.full((2, 40, 60), 0.5)
     inside[0, :, 50:], inside[:, 10:13, 20:23] = 0, 1
     sizes = torch.tensor([[50, 40], [60, 40]])
@@ -161,9 +159,7 @@ def test_clicks_stay_where_they_are(scene, truth):
     assert torch.equal(inverted.inside > 0.5, ~truth)
 
 
-def test_an_object_without_texture_is_found_in_inverted_masks_and_nothing_else_is_guessed(
-    scene, truth
-):
+def test_only_inverted_masks_are_detected_on_an_untextured_object(scene, truth):
     bare = observing(scene, scene.observation_point >= len(scene.points_world) - 300)
     for wrong in (truth, truth.flip(1, 2)):
         views = hard(scene.views, wrong)
@@ -174,7 +170,7 @@ def test_an_object_without_texture_is_found_in_inverted_masks_and_nothing_else_i
         assert right_reading(bare.replace(views=views), views).inverted
 
 
-def test_without_a_cloud_the_masks_alone_are_compared(scene, truth):
+def test_without_a_cloud_only_masks_are_compared(scene, truth):
     bare, views = observing(scene, slice(0)), hard(scene.views, truth)
     assert right_reading(bare.replace(views=views), views) is AS_THEY_ARE
     views = hard(scene.views, truth[order((3, 11), (11, 3))])
@@ -183,15 +179,15 @@ def test_without_a_cloud_the_masks_alone_are_compared(scene, truth):
     assert torch.equal(read(views, reading), truth)
 
 
-def test_an_object_that_fills_its_photographs_is_not_taken_for_inverted(scene, truth):
-    """Its masks run along the borders; points inside are wrong by as much as a cloud may be."""
+def test_masks_of_an_object_that_fills_its_photographs_are_not_inverted(scene, truth):
+    """Its masks touch the borders; a cloud may have as many wrong points inside."""
     filling = hard(scene.views, torch.ones_like(truth))
     filling.masks[:, :9, :9] = False
     assert right_reading(scene.replace(views=filling), filling) is AS_THEY_ARE
 
 
 @pytest.mark.parametrize("form", [hard, soft])
-def test_masks_that_contradict_points_in_any_reading_are_refused(scene, truth, form):
+def test_masks_that_contradict_points_in_any_reading_are_rejected(scene, truth, form):
     moved = [mask.roll((17 * view % 61, 23 * view % 83), (0, 1)) for view, mask in enumerate(truth)]
     views = form(scene.views, torch.stack(moved))
     with pytest.raises(InputError, match=r"contradict [0-9]+% of the points in the median view"):
@@ -199,7 +195,7 @@ def test_masks_that_contradict_points_in_any_reading_are_refused(scene, truth, f
 
 
 @pytest.mark.parametrize("turn", range(1, 9))
-def test_a_turn_of_masks_is_that_of_photographs(turn):
+def test_masks_are_rotated_like_photographs(turn):
     masks = torch.rand(2, 5, 7, generator=torch.Generator().manual_seed(turn)) > 0.5
     files = dict(zip("ab", masks, strict=True))
     found = Reading(turns={"b": turn}).masks(files, files, torch.logical_not)
@@ -207,8 +203,8 @@ def test_a_turn_of_masks_is_that_of_photographs(turn):
     assert torch.equal(found["b"], torch.from_numpy(rotated(masks[1].numpy(), turn)))
 
 
-def test_square_masks_may_be_turned_by_a_quarter(scene, truth):
-    """Photographs cropped to squares; their soft masks keep whatever size they have."""
+def test_quarter_turns_of_square_masks_are_detected(scene, truth):
+    """Photographs are cropped to squares; their soft masks keep their size."""
     cut = slice((WIDTH - HEIGHT) // 2, (WIDTH + HEIGHT) // 2)
     sizes, cameras = torch.tensor([[HEIGHT, HEIGHT]] * VIEWS), scene.cameras
     intrinsics = cameras.intrinsics.clone()
@@ -225,7 +221,7 @@ def test_square_masks_may_be_turned_by_a_quarter(scene, truth):
 
 
 class Placed(Stage):
-    """Cameras that are there already, in the place of structure from motion."""
+    """Known cameras instead of structure from motion."""
 
     def __init__(self, scene):
         super().__init__()
@@ -236,7 +232,7 @@ class Placed(Stage):
         return self.scene.replace(views=views)
 
 
-def test_a_chain_finds_cameras_anew_with_the_masks_that_are_right(scene, truth):
+def test_a_chain_recomputes_cameras_with_the_corrected_masks(scene, truth):
     stage, views = Placed(scene), hard(scene.views, truth.flip(1, 2))
     chain = CoarseToFine(reconstruct=stage)
     with pytest.warns(PimperWarning, match="half turn"):
@@ -250,7 +246,7 @@ def test_a_chain_finds_cameras_anew_with_the_masks_that_are_right(scene, truth):
     assert len(stage.asked) == 2
 
 
-def test_a_chain_that_takes_everything_does_not_look_at_masks(scene, truth):
+def test_a_chain_without_silhouettes_ignores_masks(scene, truth):
     config = CoarseToFineConfig(silhouettes=SilhouetteConfig(object="everything"))
     chain, views = CoarseToFine(config), hard(scene.views, ~truth)
     with warnings.catch_warnings():

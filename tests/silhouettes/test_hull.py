@@ -25,21 +25,21 @@ def ball(cameras):
     return hull
 
 
-def test_the_hull_of_a_ball_contains_it_and_little_more(ball):
+def test_the_hull_of_a_ball_contains_it_tightly(ball):
     steps = ball.occupied.nonzero()
     radius = (ball.origin_world + ball.spacing * steps).norm(dim=1)
-    # The tangent cones of 20 views leave corners: at most 1 / cos of half the angle between
-    # neighbouring views (some 41 degrees) off the ball.
+    # The tangent cones of 20 views leave corners, at radii up to 1 / cos of half the angle
+    # between neighbouring views (some 41 degrees).
     assert radius.max() < 1 / torch.deg2rad(torch.tensor(22.0)).cos() + ball.spacing
     volume = float(ball.occupied.sum() * ball.spacing**3)
-    assert 4.189 * 0.99 < volume < 4.189 * 1.06  # 4/3 pi; a cube of corners would have 1.9 times
+    assert 4.189 * 0.99 < volume < 4.189 * 1.06  # 4/3 pi; a cube would have 1.9 times that
 
 
 def test_depth_is_the_distance_to_the_border_along_every_radius(ball, generator):
     direction = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=1)
     shells = torch.tensor([0.5, 0.9, 0.97])[:, None, None]
     depth = ball.depth_of(shells * direction)
-    # A quarter of a pixel is 0.6 % of the radius; the hull itself is larger than the ball.
+    # A quarter of a pixel is 0.6 % of the radius; the hull is larger than the ball.
     assert_close(depth.amin(dim=1), 1 - shells[:, 0, 0], atol=0.02, rtol=0)
     assert (depth > 0).all()
     assert (ball.depth_of(1.15 * direction) < 0).all()
@@ -52,16 +52,16 @@ def test_off_the_grid_depth_falls_with_distance(ball):
     assert near < -1
 
 
-def test_projections_are_the_silhouettes_that_the_hull_was_built_from(ball, cameras):
+def test_projections_of_the_hull_are_its_silhouettes(ball, cameras):
     drawn = of_ball(cameras).masks
     for view in (0, 7, 15):
         camera = cameras.intrinsics[view], cameras.cam_from_world[view]
         found = margins(ball, *camera, (WIDTH, HEIGHT)) > 0
         union = (found | drawn[view]).sum()
-        assert (found & drawn[view]).sum() / union > 0.985  # half a pixel all round is 2.5 %
+        assert (found & drawn[view]).sum() / union > 0.985  # half a pixel around is 2.5 %
 
 
-def test_a_view_that_is_wrong_is_outvoted_or_left_out(cameras):
+def test_a_wrong_view_is_outvoted_or_excluded(cameras):
     silhouettes = of_ball(cameras)
     wrong = silhouettes.inside.clone()
     wrong[3] = 0
@@ -80,12 +80,12 @@ def test_a_view_that_is_wrong_is_outvoted_or_left_out(cameras):
     assert voted is not None
     volume = float(left_out.occupied.sum() * left_out.spacing**3)
     assert 4.1 < volume < 4.6
-    assert voted.occupied.sum() * voted.spacing**3 >= 0.99 * volume  # one vote less holds it
+    assert voted.occupied.sum() * voted.spacing**3 >= 0.99 * volume  # inside with one vote less
 
 
 @pytest.mark.parametrize(("doubt", "held"), [(0.3, True), (0.2, False)])
-def test_words_add_up_and_a_tie_is_the_objects(cameras, doubt, held):
-    """Of 20 views a tenth may disagree: 5 that count 0.4 each are as much as 2."""
+def test_votes_are_summed_and_a_tie_counts_as_object(cameras, doubt, held):
+    """A tenth of 20 views may disagree: 5 views of weight 0.4 equal 2."""
     silhouettes = of_ball(cameras).replace(source="found")
     wrong = silhouettes.inside.clone()
     wrong[:10:2, :, WIDTH // 2 :] = doubt * (wrong[:10:2, :, WIDTH // 2 :] > 0)
@@ -96,8 +96,8 @@ def test_words_add_up_and_a_tie_is_the_objects(cameras, doubt, held):
     assert (float(hull.occupied.sum() * hull.spacing**3) > 4.0) == held
 
 
-def test_what_only_doubt_leaves_inside_is_left_out_where_it_stands_apart(cameras):
-    """A second ball that no view shows, and none denies for certain."""
+def test_separate_components_of_uncertain_silhouettes_are_excluded(cameras):
+    """A second ball that no view shows and none excludes with certainty."""
     silhouettes = of_ball(cameras).replace(source="found")
     hull = visual_hull(silhouettes, cameras, BOX, num_voxels=32**3, disagreeing=0.1)
     other = silhouettes_of(lambda points: shapes.ball(3 * (points - 0.9)), cameras).inside
@@ -112,7 +112,7 @@ def test_what_only_doubt_leaves_inside_is_left_out_where_it_stands_apart(cameras
     assert 0.95 * before < volume < 1.2 * before
 
 
-def test_views_abstain_where_their_pixels_show_the_object_or_not(cameras):
+def test_views_abstain_at_unknown_pixels(cameras):
     silhouettes = of_ball(cameras)
     wrong = silhouettes.inside.clone()
     wrong[:9] = 0.5
@@ -124,7 +124,7 @@ def test_views_abstain_where_their_pixels_show_the_object_or_not(cameras):
 
 
 def test_views_abstain_outside_their_photographs(cameras):
-    """Photographs that show half of the ball do not cut the other half off."""
+    """Photographs of half of the ball do not remove the other half."""
     silhouettes = of_ball(cameras)
     left = torch.tensor([[WIDTH // 2, HEIGHT]]).repeat(10, 1)
     sizes = torch.cat([left, cameras.sizes_px[10:]])
@@ -143,11 +143,11 @@ def test_views_abstain_outside_their_photographs(cameras):
     assert 4.1 < float(hull.occupied.sum() * hull.spacing**3) < 4.8
 
 
-def test_what_too_few_views_look_at_is_outside(cameras):
+def test_points_seen_by_too_few_views_are_outside(cameras):
     near = visual_hull(of_ball(cameras), cameras, BOX + 4.0, num_voxels=32**3)
-    assert near is None  # the box stands beside the ball
+    assert near is None  # the box is next to the ball
     everything = silhouettes_of(lambda points: points.norm(dim=-1) - 100.0, cameras)
     hull = visual_hull(everything, cameras, 4 * BOX, num_voxels=32**3, min_seen=0.9)
     assert hull is not None
     radius = (hull.origin_world + hull.spacing * hull.occupied.nonzero()).norm(dim=1)
-    assert radius.max() < 2.5  # beyond the pictures' width at the origin, 2, few views look
+    assert radius.max() < 2.5  # few views see beyond the image width at the origin, 2

@@ -1,4 +1,4 @@
-"""What OpenCV computes on masks and photographs."""
+"""OpenCV's results on masks and photographs."""
 
 import numpy as np
 import torch
@@ -14,8 +14,8 @@ from pimper_torch.ground.geometry.opencv import (
 from pimper_torch.ground.geometry.pixels import pixel_centers
 
 
-def test_a_cut_of_every_other_pixel_is_right_to_two_pixels(generator):
-    width, height = 121, 95  # odd: the last column and row stand for half a pixel
+def test_a_cut_at_half_resolution_has_an_error_below_two_pixels(generator):
+    width, height = 121, 95  # odd: the last column and row cover half a pixel
     away = pixel_centers(width, height, like=torch.zeros(())) - torch.tensor([70.0, 40.0])
     disc = away.norm(dim=-1) < 30
     noise = torch.randint(0, 20, (height, width, 3), generator=generator)
@@ -29,13 +29,13 @@ def test_a_cut_of_every_other_pixel_is_right_to_two_pixels(generator):
     assert not cut[:4].any()
 
 
-def test_a_distance_is_exact_wherever_in_memory_the_mask_lies():
-    """OpenCV's differs in the last bit from call to call."""
+def test_distances_do_not_depend_on_the_memory_address_of_the_mask():
+    """OpenCV's result differs in the last bit from call to call."""
     mask = torch.zeros(60, 80, dtype=torch.bool)
     mask[13:41, 22:57] = True
     inner, outer = (distance_transform_edt(side) for side in (mask, ~mask))
     exact = np.where(mask, inner - 0.5, 0.5 - outer).astype(np.float32)
     kept = []
     for extra in range(200):
-        kept.append(np.empty(13 * extra + 1))  # so that the next call finds other addresses
+        kept.append(np.empty(13 * extra + 1))  # so that the next call gets different addresses
         assert np.array_equal(signed_distance(mask).numpy(), exact)

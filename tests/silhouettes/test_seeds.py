@@ -1,4 +1,4 @@
-"""What is labelled before a view is cut, on pictures that are drawn."""
+"""Labels that initialize the cut of a view, on synthetic images."""
 
 import pytest
 import torch
@@ -32,7 +32,7 @@ def square(left: int, top: int, right: int, bottom: int) -> torch.Tensor:
 
 
 def agreeing(hidden: torch.Tensor) -> torch.Tensor:
-    """The plane is seen but where something stands before it."""
+    """Return agreement with the plane, which is visible except at occluders."""
     return torch.where(hidden, -0.2, 0.95)
 
 
@@ -41,7 +41,7 @@ def thing() -> torch.Tensor:
     return square(100, 80, 200, 180)
 
 
-def test_points_label_discs_about_them_and_background_wins_nothing_from_the_object(thing):
+def test_points_label_discs_and_object_overrides_background(thing):
     points, others = torch.tensor([[150.5, 130.5]]), torch.tensor([[20.5, 20.5]])
     labels = labels_from_points(points, others, None, (WIDTH, HEIGHT))
     assert labels[130, 150] == OBJECT
@@ -51,15 +51,15 @@ def test_points_label_discs_about_them_and_background_wins_nothing_from_the_obje
     assert (labels[:, -1] == BACKGROUND).all()
 
 
-def test_the_plane_beside_the_object_is_background_but_for_a_seam(thing):
+def test_the_plane_next_to_the_object_is_background_except_a_seam(thing):
     labels = labels_from_points(NOTHING, NOTHING, agreeing(thing), (WIDTH, HEIGHT))
     assert labels[130, 20] == BACKGROUND
-    assert labels[130, 99] == PERHAPS_BACKGROUND  # an object's foot agrees with the plane, too
+    assert labels[130, 99] == PERHAPS_BACKGROUND  # the foot of an object also agrees with the plane
     assert labels[130, 150] != BACKGROUND
 
 
-def test_what_a_window_holds_that_agrees_is_not_the_object_for_certain(thing):
-    """Windows that reach over the border of the object agree less: the plane goes on there."""
+def test_windows_that_agree_with_the_plane_are_not_certainly_object(thing):
+    """Windows across the border of the object agree less: they contain plane."""
     corners = torch.tensor([[60.5, 60.5], [240.5, 60.5], [240.5, 200.5], [60.5, 200.5]])
     labels = labels_from_points(corners, NOTHING, agreeing(thing), (WIDTH, HEIGHT))
     assert labels[130, 101] == PERHAPS_BACKGROUND  # half a window of 320 / 80 pixels
@@ -68,7 +68,7 @@ def test_what_a_window_holds_that_agrees_is_not_the_object_for_certain(thing):
     assert not_seen_through(corners, agreeing(thing))[130, 103]
 
 
-def test_gaps_between_legs_are_background_where_the_plane_is_seen_in_them():
+def test_gaps_that_show_the_plane_are_background():
     legs = square(100, 80, 130, 180) | square(145, 80, 175, 180)
     hull = square(100, 80, 175, 180)
     margin = torch.where(hull, 1.0, -1.0)
@@ -77,7 +77,7 @@ def test_gaps_between_legs_are_background_where_the_plane_is_seen_in_them():
     assert labels[130, 115] == PERHAPS_OBJECT
 
 
-def test_deep_inside_the_hull_parallax_is_enough_and_far_beyond_it_nothing_is(thing):
+def test_parallax_suffices_inside_the_hull_but_not_far_outside(thing):
     margin = torch.where(thing, 20.0, -20.0)
     labels = labels_from_hull(margin, thing, NOTHING, agreeing(thing))
     assert labels[130, 150] == OBJECT
@@ -87,7 +87,7 @@ def test_deep_inside_the_hull_parallax_is_enough_and_far_beyond_it_nothing_is(th
     assert labels[10, 10] == BACKGROUND
 
 
-def test_what_does_not_show_the_plane_is_off_it_and_grains_are_not(thing):
+def test_pixels_that_disagree_are_off_the_plane_except_grains(thing):
     grain = square(20, 20, 22, 22)
     found = off_plane_mask(agreeing(thing | grain))
     assert found[130, 150]
@@ -95,7 +95,7 @@ def test_what_does_not_show_the_plane_is_off_it_and_grains_are_not(thing):
     assert not off_plane_mask(torch.full((HEIGHT, WIDTH), torch.nan)).any()
 
 
-def test_what_is_wide_and_off_the_plane_but_not_the_object_stands_before_it(thing):
+def test_wide_off_plane_regions_outside_the_object_are_occluders(thing):
     person, halo = square(200, 40, 240, 240), square(95, 75, 205, 185)
     agreement = agreeing(thing | person | halo)
     agreement[100:140, 210:214] = 0.9  # a grain
@@ -108,14 +108,14 @@ def test_what_is_wide_and_off_the_plane_but_not_the_object_stands_before_it(thin
 
 
 @pytest.mark.parametrize("seen_through", [False, True])
-def test_holes_are_filled_unless_the_plane_is_seen_through_them(thing, seen_through):
+def test_holes_are_filled_unless_they_show_the_plane(thing, seen_through):
     hole = square(140, 120, 160, 140)
     cut = thing & ~hole
     agreement = agreeing(thing & ~hole) if seen_through else agreeing(thing)
     assert bool(filled(cut, agreement)[130, 150]) != seen_through
 
 
-def test_a_cut_exposes_what_it_shows_of_the_plane_but_for_a_seam():
+def test_the_exposed_fraction_counts_visible_plane_except_a_seam():
     agreement = torch.ones(200, 400)
     agreement[:, :200] = torch.nan
     cut = torch.zeros(200, 400, dtype=torch.bool)
@@ -126,7 +126,7 @@ def test_a_cut_exposes_what_it_shows_of_the_plane_but_for_a_seam():
     assert float(exposed_fraction(~cut & cut, agreement)) == 0
 
 
-def test_a_cut_holds_the_points_in_it_and_a_few_points_tell_nothing():
+def test_the_held_fraction_counts_points_and_needs_enough():
     cut = torch.zeros(20, 30, dtype=torch.bool)
     cut[:, :10] = True
     points = torch.stack([torch.arange(0.5, 30, 1.0), torch.full((30,), 7.5)], dim=1)
@@ -134,7 +134,7 @@ def test_a_cut_holds_the_points_in_it_and_a_few_points_tell_nothing():
     assert float(held_fraction(cut, points[20:])) == 1  # ten
 
 
-def test_the_middle_of_a_thin_part_is_the_objects_and_a_shadows_edge_is_not(thing):
+def test_the_medial_axis_of_a_thin_part_is_object_and_a_streak_is_not(thing):
     leg, streak = square(120, 180, 130, 220), square(160, 180, 163, 220)
     shape = thing | leg | streak
     labels = labels_from_hull(signed_distance(shape), thing, NOTHING, agreeing(shape))
@@ -143,7 +143,7 @@ def test_the_middle_of_a_thin_part_is_the_objects_and_a_shadows_edge_is_not(thin
     assert not (labels[185:, 128:] == OBJECT).any()
 
 
-def test_where_the_vote_was_unknown_nothing_is_certain_outside_the_hull(thing):
+def test_unknown_votes_leave_pixels_outside_the_hull_uncertain(thing):
     unknown, margin = square(0, 0, WIDTH, 40), signed_distance(thing)
     agreement = agreeing(thing).masked_fill(unknown, torch.nan)
     labels = labels_from_hull(margin, thing, NOTHING, agreement, unknown)

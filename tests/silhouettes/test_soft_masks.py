@@ -23,28 +23,28 @@ def with_priors(scene, *priors):
 
 
 def soft(truth, size=(180, 240)):
-    """Masks as a segmenter has them: 8 bits, soft at their borders."""
+    """Return masks like those of a segmenter: 8 bits, soft at their borders."""
     small = interpolate(truth[None].float(), size, mode="area")[0]
     return (255 * (0.02 + 0.96 * small)).round() / 255
 
 
 def without_any_hint(scene):
-    """One colour, no point: nothing but masks tells of the object."""
+    """Return a scene with one colour and no points: only masks indicate the object."""
     images = torch.full_like(scene.views.images, 0.3)
     return observing(scene, slice(0)).replace(views=scene.views.replace(images=images))
 
 
-def test_masks_of_half_the_size_are_followed(staged):
+def test_masks_at_half_size_are_followed(staged):
     scene = without_any_hint(staged.scene)
     prior = guessed(scene.views.names, soft(staged.truth, (90, 120)))
     found = FindSilhouettes(SMALL)(with_priors(scene, prior))
     assert found.source == "found"
     assert found.reliable.all()
-    # Without colours the cut lies anywhere within 1.5 pixels of the mask's border: 0.89 of 50.
+    # Without colours the cut is anywhere within 1.5 pixels of the mask border: 0.89 of 50.
     assert overlap(found.masks, staged.truth).min() > 0.9
 
 
-def test_what_single_masks_take_along_the_others_leave_out(staged):
+def test_excess_in_a_few_masks_is_outvoted(staged):
     scene, wide = without_any_hint(staged.scene), staged.truth.clone()
     for view in (1, 4, 8):
         wide[view, 60:170, 20 + 5 * view : 60 + 5 * view] = True
@@ -53,7 +53,7 @@ def test_what_single_masks_take_along_the_others_leave_out(staged):
     assert overlap(found.masks, staged.truth).min() > 0.9
 
 
-def test_masks_of_another_thing_are_doubted_by_name(staged):
+def test_masks_of_a_different_object_warn_with_their_names(staged):
     wrong, views = staged.truth.clone(), [0, 6, 7]
     for view in views:
         wrong[view] = False
@@ -65,7 +65,7 @@ def test_masks_of_another_thing_are_doubted_by_name(staged):
     assert overlap(found.masks, staged.truth).min() > 0.95
 
 
-def test_masks_of_some_photographs_tell_of_all(staged):
+def test_masks_of_some_photographs_suffice(staged):
     names = staged.scene.views.names
     prior = guessed((*names[::3], "another.png"), soft(staged.truth)[[0, 3, 6, 9, 0]])
     found = FindSilhouettes(SMALL)(with_priors(staged.scene, prior))
@@ -84,7 +84,7 @@ def test_log_odds_of_two_maps_of_a_view_add_up(staged):
     assert (merged.inside[[3, 5]] == 0.5).all()
 
 
-def test_a_map_without_background_points_at_the_object(staged):
+def test_a_map_without_background_seeds_the_object(staged):
     pointing = torch.full((1, 180, 240), 0.5)
     pointing[0, 80:83, 100:103] = 1
     views = staged.scene.views.replace(priors=(guessed(("02.png",), pointing),))
@@ -96,8 +96,8 @@ def test_a_map_without_background_points_at_the_object(staged):
 
 
 @pytest.mark.parametrize("place", [(100, 5), (5, 100)])
-def test_a_click_that_meets_nothing_is_refused_by_name(staged, place):
-    """One on the table, though a second one in the same photograph is on the ball."""
+def test_a_click_off_the_object_is_rejected_by_name(staged, place):
+    """A click on the table is rejected even if a second one in the photograph is on the ball."""
     row, column = staged.truth[4].nonzero().float().mean(dim=0).long().tolist()
     pointing = torch.full((1, 180, 240), 0.5)
     pointing[0, row : row + 3, column : column + 3] = 1
@@ -112,7 +112,7 @@ def test_a_click_that_meets_nothing_is_refused_by_name(staged, place):
         FindSilhouettes(SMALL)(with_priors(staged.scene, prior, missed))
 
 
-def test_the_component_that_a_click_meets_first_is_kept():
+def test_the_first_component_along_the_ray_of_a_click_is_kept():
     cameras = all_round().to(torch.float32)
     places = torch.tensor([[-0.35, 0.0, 0.0], [0.35, 0.0, 0.0]])
 
@@ -129,7 +129,7 @@ def test_the_component_that_a_click_meets_first_is_kept():
     view = int((silhouettes_of(ball(0), cameras).masks & alone).sum(dim=(1, 2)).argmin())
     seeds = [torch.zeros(0, 2)] * cameras.num_views
     seeds[view] = torch.tensor([[0.5, 0.5]])
-    assert keep_seeded_components(hull, cameras, seeds) is hull  # it meets nothing
+    assert keep_seeded_components(hull, cameras, seeds) is hull  # the ray has no hit
     seeds[view] = alone[view].nonzero().float().mean(dim=0).flip(0)[None] + 0.5
     kept = keep_seeded_components(hull, cameras, seeds)
     assert kept.holds(places).tolist() == [False, True]
@@ -139,4 +139,4 @@ def test_the_component_that_a_click_meets_first_is_kept():
     assert own is not None
     lens = cameras.intrinsics[view], cameras.cam_from_world[view], (WIDTH, HEIGHT)
     shown, alone_shown = (margins(one, *lens) > 0 for one in (kept, own))
-    assert overlap(shown[None], alone_shown[None]).item() > 0.95  # voxels of other sizes
+    assert overlap(shown[None], alone_shown[None]).item() > 0.95  # voxel sizes differ

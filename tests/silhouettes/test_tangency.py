@@ -23,14 +23,14 @@ def touched(shape, cameras, points, normals):
 
 
 def test_contour_points_of_a_ball_are_its_contour(cameras):
-    # Of a ball with half its radius, which no ray meets: the nearest place is right all the same.
+    # No ray meets a ball of half its radius, but the nearest point is still correct.
     for radius in (1.0, 0.5):
         towards = directions(2000)
         rays, found = touched(ball, cameras, radius * towards, towards)
         assert len(found.ray) > 0.95 * len(rays.view)
         centers = cameras.centers_world[found.view]
-        # On the contour the radius is across the ray: points . center = 1. Within 4 pixels of
-        # it a ray leaves this ball by a fifth of a pixel: its mask tells no better.
+        # On the contour the radius is perpendicular to the ray: points . center = 1. Within 4
+        # pixels of it a ray leaves this ball by a fifth of a pixel, as accurate as its mask.
         along = ((found.points_world * centers).sum(dim=1) - 1) / DISTANCE
         assert along.abs().mean() < 4 * PIXEL
         assert ball(found.points_world).abs().mean() < 0.3 * PIXEL
@@ -40,7 +40,7 @@ def test_contour_points_of_a_ball_are_its_contour(cameras):
         assert ((found.variance.sqrt() / sigma - 1).abs() < 0.3).all()  # depths from 4 to 6
 
 
-def test_contour_points_of_a_ring_lie_on_it_also_inside_its_hole(cameras):
+def test_contour_points_of_a_ring_are_on_it_even_inside_its_hole(cameras):
     rotation, roll = (
         2 * torch.pi * torch.rand(2, 4000, generator=torch.Generator().manual_seed(2)).double()
     )
@@ -61,7 +61,7 @@ def test_contour_points_of_a_ring_lie_on_it_also_inside_its_hole(cameras):
     assert angles.quantile(0.95) < 15
 
 
-def test_where_one_ball_hides_another_no_point_is_between_them(cameras):
+def test_no_contour_point_is_between_overlapping_balls(cameras):
     towards = directions(1500)
     points = torch.cat([center + 0.5 * towards for center in CENTERS])
     rays, found = touched(two_balls, cameras, points, towards.repeat(2, 1))
@@ -73,27 +73,27 @@ def test_where_one_ball_hides_another_no_point_is_between_them(cameras):
     assert angles_deg(found.normals_world, normalize(own, dim=1)).quantile(0.99) < 20
 
 
-def test_a_ray_that_is_as_near_to_two_surfaces_abstains(cameras):
+def test_a_ray_close_to_two_surfaces_abstains(cameras):
     inf = torch.inf
     cost = torch.tensor(
         [
             [inf, 5.0, 1.0, 0.2, 1.0, 5.0, inf, 5.0],  # one
-            [5.0, 0.1, 5.0, 5.0, 0.3, 5.0, inf, inf],  # two, a rise between
-            [inf, 0.1, inf, inf, 0.3, inf, inf, inf],  # two, the hull ends between
-            [5.0, 0.1, 5.0, 5.0, 2.0, 5.0, inf, inf],  # the other is further off
-            [5.0, 0.1, 0.9, 1.2, 0.3, 5.0, inf, inf],  # one, hardly bent
-            [5.0, -3.0, 5.0, 5.0, -1.0, 5.0, inf, inf],  # runs below both
+            [5.0, 0.1, 5.0, 5.0, 0.3, 5.0, inf, inf],  # two with a rise in between
+            [inf, 0.1, inf, inf, 0.3, inf, inf, inf],  # two, the hull ends in between
+            [5.0, 0.1, 5.0, 5.0, 2.0, 5.0, inf, inf],  # the second is farther
+            [5.0, 0.1, 0.9, 1.2, 0.3, 5.0, inf, inf],  # one, hardly curved
+            [5.0, -3.0, 5.0, 5.0, -1.0, 5.0, inf, inf],  # below both
         ]
     )
     found = ambiguous(cost, torch.full((6,), 1.0))
     assert found.tolist() == [False, True, True, False, False, True]
 
 
-def test_beyond_the_border_of_what_is_known_no_place_is_below_it(cameras):
+def test_contour_points_beyond_a_partial_surface_are_not_below_it(cameras):
     towards = directions(6000)
     cap = towards[towards[:, 2] > 0.6]
     rays, found = touched(ball, cameras, cap, cap)
-    # Rays that pass far from the cap know the hull alone, which is the ball within corners.
+    # Far from the cap, rays only have the hull, which is the ball plus corners.
     assert len(found.ray) > 0.8 * len(rays.view)
     assert ball(found.points_world).abs().max() < 0.35
     near = found.points_world[:, 2] > 0.6
