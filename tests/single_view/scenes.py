@@ -1,4 +1,4 @@
-"""Closed-form surfaces from one viewpoint, camera frame."""
+"""Closed-form surfaces from one viewpoint, in the camera frame."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ class Scene:
         return torch.where((x // 9 + y // 7) % 2 == 0, 0.8, 0.35).double()
 
     def raster(self, samples: Tensor) -> Tensor:
-        """Put samples (view pixel) on the raster as images of one channel."""
+        """Return samples (view pixel) as single-channel images on the raster."""
         images = samples.new_zeros(len(samples), 1, *self.mask.shape)
         images[:, 0, self.mask] = samples
         return images
@@ -42,7 +42,7 @@ def square(side):
 
 
 def bumpy() -> Scene:
-    """A bowl with waves, bulging towards the viewer, without any symmetry."""
+    """Return a wavy bowl, convex towards the viewer, without symmetry."""
     x, y = square(torch.linspace(-1, 1, 56, dtype=torch.float64))
     first, second = torch.cos(4 * x + 1.5 * y), torch.sin(5 * y - 2 * x)
     slope_x = 0.9 * x + 0.6 * first + 0.2 * second
@@ -65,13 +65,13 @@ BUMPY, BALL = bumpy(), ball()
 
 
 def strong_lights(generator, views: int, spread: float = 0.6) -> Tensor:
-    """Point lights of strength one, on the viewer's side."""
+    """Return point lights of unit strength on the viewer's side."""
     sideways = 2 * torch.rand(views, 2, generator=generator, dtype=torch.float64) - 1
     ahead = -torch.ones_like(sideways[:, :1])
     return normalize(torch.cat([spread * sideways, ahead], dim=1), dim=1)
 
 
 def angles_deg(found: Tensor, true: Tensor) -> Tensor:
-    """Angles between columns, by the chord, which float64 resolves near zero."""
+    """Return angles between columns by the chord, which is accurate near zero."""
     chord = (normalize(found, dim=0) - normalize(true, dim=0)).norm(dim=0)
     return torch.rad2deg(2 * torch.asin((chord / 2).clamp_max(1)))

@@ -29,16 +29,16 @@ def fixed(tmp_path):
     return tmp_path
 
 
-def test_the_gamma_of_a_folder_is_told_with_the_option_that_says_so(fixed, capsys):
+def test_the_gamma_of_a_folder_is_printed_with_the_option_to_set_it(fixed, capsys):
     mask = str(fixed / "mask.png")
     assert main(["gamma", str(fixed / "photos"), "--mask", mask, "--rank", "3"]) == 0
-    told = capsys.readouterr().out
-    found = float(told.split()[1])
+    output = capsys.readouterr().out
+    found = float(output.split()[1])
     assert abs(found - 1.8) < 0.06
-    assert f"--photographs.response {found:.2f}" in told
+    assert f"--photographs.response {found:.2f}" in output
 
 
-def test_the_mask_is_shrunk_with_the_photographs(fixed, capsys, monkeypatch):
+def test_the_mask_is_reduced_with_the_photographs(fixed, capsys, monkeypatch):
     given = {}
 
     def stand_in(views, *, mask, rank):
@@ -75,7 +75,7 @@ def estimate(gamma, residuals, determined=True):
         (1.81, (0.005, 0.012, 0.009), " 1.81"),
     ],
 )
-def test_the_curve_that_does_as_well_is_advised(gamma, residuals, advised):
+def test_the_simplest_curve_that_fits_is_advised(gamma, residuals, advised):
     assert advice(estimate(gamma, residuals)).endswith(advised)
     assert advice(estimate(gamma, residuals, determined=False)) == ""
 
@@ -84,6 +84,6 @@ def test_an_undetermined_gamma_advises_no_option(fixed, capsys, monkeypatch):
     undetermined = estimate(1.81, (0.2, 0.3, 0.3), determined=False)
     monkeypatch.setattr(estimate_gamma, "gamma_of_photographs", lambda *_, **__: undetermined)
     assert main(["gamma", str(fixed / "photos")]) == 0
-    told = capsys.readouterr()
-    assert "a moved camera" in told.out
-    assert "--photographs.response" not in told.out
+    output = capsys.readouterr().out
+    assert "a camera that moved" in output
+    assert "--photographs.response" not in output

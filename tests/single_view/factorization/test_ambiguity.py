@@ -22,14 +22,14 @@ def cone_points(generator, batch=3, samples=40):
     return (rho * harmonics(n)).mT
 
 
-def test_the_inverse_undoes_and_the_generator_negated_is_the_inverse(generator):
+def test_the_inverse_is_that_of_the_negated_generator(generator):
     A, eye = some(generator), torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
     assert_close(A.inverse().matrix @ A.matrix, eye)
     g = torch.randn(3, 6, generator=generator, dtype=torch.float64)
     assert_close(lorentz(g) @ lorentz(-g), eye)
 
 
-def test_the_ambiguity_changes_neither_the_data_nor_the_cone(generator):
+def test_the_ambiguity_keeps_the_data_and_the_cone(generator):
     A, N = some(generator), cone_points(generator)
     L = torch.randn(3, 7, 4, generator=generator, dtype=torch.float64)
     moved = A.on_shading(N)
@@ -39,7 +39,7 @@ def test_the_ambiguity_changes_neither_the_data_nor_the_cone(generator):
 
 
 @pytest.mark.parametrize("mirrored", [1.0, -1.0])  # convex to concave
-def test_alignment_finds_the_transformation_that_was_applied(generator, mirrored):
+def test_alignment_recovers_the_applied_transformation(generator, mirrored):
     N, weight = cone_points(generator), torch.ones(3, 40, dtype=torch.float64)
     A = some(generator).matrix * torch.tensor([1.0, 1, 1, mirrored], dtype=torch.float64)
     assert_close(align_factorizations(N, A @ N, weight).matrix, A)

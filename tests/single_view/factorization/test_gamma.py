@@ -14,7 +14,7 @@ from pimper_torch.single_view.factorization.estimate_gamma import (
 
 
 def shaded(seed=0, views=10, samples=60, ambient=0.0, aside=0.6):
-    """Radiance of half a sphere's normals under point lights that stray to the side."""
+    """Return radiance of a hemisphere of normals under point lights off the axis."""
     generator = torch.Generator().manual_seed(seed)
     normals = torch.randn(samples, 3, generator=generator, dtype=torch.float64)
     normals = normalize(normals - torch.tensor([0, 0, 1.0]), dim=1)
@@ -35,7 +35,7 @@ def estimate(encoded, rank=3):
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
-def test_the_gamma_of_a_matrix_without_noise_is_found(gamma):
+def test_gamma_is_recovered_from_exact_data(gamma):
     encoded = shaded() ** (1 / gamma)
     found = estimate(encoded)
     assert_close(found.gamma, gamma, rtol=1e-3, atol=0)
@@ -45,11 +45,11 @@ def test_the_gamma_of_a_matrix_without_noise_is_found(gamma):
     assert (found.residual_linear < 1e-5) == (gamma == 1)
 
 
-def test_noise_moves_gamma_by_no_more_than_its_standard_error_tells():
+def test_the_error_of_gamma_is_within_its_standard_error():
     encoded = noisy(shaded(samples=120) ** (1 / 2.2), 0.01)
     found = estimate(encoded)
     assert abs(found.gamma - 2.2) < 3 * found.standard_error < 0.2
-    assert 0.007 < found.residual < 0.013  # the noise that was put in
+    assert 0.007 < found.residual < 0.013  # the added noise
 
 
 @pytest.mark.slow
@@ -61,20 +61,20 @@ def test_noise_does_not_bias_gamma(gamma, noise):
         found.append(estimate(encoded))
     off = torch.tensor([one.gamma - gamma for one in found])
     error = torch.tensor([one.standard_error for one in found])
-    # Taking entries by their noisy values is off by a whole one on linear data.
+    # Selecting entries by their noisy values is off by 1 on linear data.
     assert off.mean().abs() < 0.75 * error.mean()
     assert ((off / error).abs() < 3.5).all()
     assert error.max() < 0.06 * gamma
 
 
-def test_ambient_light_and_attached_shadows_are_told_from_a_gamma():
+def test_ambient_light_and_attached_shadows_are_not_mistaken_for_gamma():
     encoded = shaded(samples=150, views=12, ambient=0.2) ** (1 / 2.2)
     found = estimate(encoded, rank=4)
     assert abs(found.gamma - 2.2) < 0.25
     assert found.determined
 
 
-def test_srgb_is_near_a_gamma_of_two_point_two_and_explains_its_own_values_better():
+def test_srgb_is_close_to_gamma_2_2_but_fits_srgb_values_better():
     encoded = Srgb().encoded_from_linear(shaded())
     found = estimate(encoded)
     assert 2.1 < found.gamma < 2.4
@@ -91,9 +91,9 @@ def test_cast_shadows_lose_weight():
 
 
 @pytest.mark.parametrize("seed", [8, 9, 10])
-def test_highlights_beside_black_shadows_move_gamma_by_more_than_it_says_but_not_far(seed):
-    # Of four per cent outliers half are bright: the rule that believes bright entries is misled,
-    # by 0.15, 0.12 and 0.01 on these draws, with standard errors of 0.03 to 0.05.
+def test_highlights_with_black_shadows_bias_gamma_slightly(seed):
+    # Half of the four per cent outliers are bright and mislead the rule that trusts bright
+    # entries, by 0.15, 0.12 and 0.01 on these draws, with standard errors of 0.03 to 0.05.
     encoded = noisy(shaded(samples=150) ** (1 / 2.2), 0.003)
     drawn = torch.rand(encoded.shape, generator=torch.Generator().manual_seed(seed))
     spoilt = torch.where(drawn < 0.02, 0.02, encoded)
@@ -101,7 +101,7 @@ def test_highlights_beside_black_shadows_move_gamma_by_more_than_it_says_but_not
     assert abs(estimate(spoilt).gamma - 2.2) < 0.2
 
 
-def test_light_from_one_direction_tells_nothing():
+def test_light_from_one_direction_does_not_determine_gamma():
     encoded = (
         shaded(aside=0.0, samples=40) * torch.linspace(0.4, 1, 10, dtype=torch.float64)[:, None]
     )
@@ -111,7 +111,7 @@ def test_light_from_one_direction_tells_nothing():
         assert "not determined" in str(found)
 
 
-def test_values_that_no_gamma_explains_are_not_determined():
+def test_values_that_fit_no_gamma_are_not_determined():
     generator = torch.Generator().manual_seed(9)
     rough = 0.3 + 0.4 * torch.rand(8, 60, generator=generator, dtype=torch.float64)
     found = estimate(rough)
@@ -139,7 +139,7 @@ def photographs(gamma=1.8, width=14, height=12):
     )
 
 
-def test_photographs_of_a_fixed_camera_tell_their_gamma():
+def test_gamma_is_recovered_from_photographs_of_a_fixed_camera():
     views = photographs()
     mask = torch.ones(12, 14, dtype=torch.bool)
     mask[:, 0] = False
@@ -152,7 +152,7 @@ def test_photographs_of_a_fixed_camera_tell_their_gamma():
     assert_close(gamma_of_photographs(masked, rank=3).gamma, found.gamma)
 
 
-def test_photographs_or_masks_of_unlike_sizes_are_refused():
+def test_photographs_or_masks_of_different_sizes_are_rejected():
     views = photographs()
     with pytest.raises(InputError, match="unlike sizes"):
         gamma_of_photographs(views.replace(sizes_px=torch.tensor([[14, 12]] * 9 + [[12, 12]])))
@@ -172,6 +172,6 @@ def test_photographs_or_masks_of_unlike_sizes_are_refused():
         (lambda x: 0 * x + 1, 3, "only 0 samples are lit"),
     ],
 )
-def test_values_without_an_estimate_are_refused(change, rank, found):
+def test_values_without_an_estimate_are_rejected(change, rank, found):
     with pytest.raises(InputError, match=found):
         estimate(change(shaded()), rank)

@@ -27,7 +27,7 @@ def best_right(problem):
 
 @pytest.fixture
 def product(generator):
-    """Products of rank three, a part of them missing."""
+    """Products of rank three with missing entries."""
 
     def make(rows=12, columns=60, rank=3, batch=2, missing=0.3, noise=0.0):
         def draw(*shape):
@@ -42,7 +42,7 @@ def product(generator):
     return make
 
 
-def test_missing_entries_come_back(product, generator):
+def test_missing_entries_are_recovered(product, generator):
     X, weight, whole = product()
     found = factorize(X, weight, random_left(2, 12, 3, generator))
     assert_close(found.lights @ found.shading, whole, rtol=1e-5, atol=1e-5)
@@ -51,14 +51,14 @@ def test_missing_entries_come_back(product, generator):
     assert_close(found.lights.mT @ found.lights, torch.eye(3).double().expand(2, 3, 3))
 
 
-def test_singular_vectors_of_the_filled_matrix_are_a_start_near_the_solution(product):
+def test_singular_vectors_of_the_filled_matrix_start_near_the_solution(product):
     X, weight, whole = product(missing=0.1)
     left = singular_left(X, weight, 3)
     assert_close(left.mT @ left, torch.eye(3).double().expand(2, 3, 3))
     assert (left @ (left.mT @ whole) - whole).norm() < 0.05 * whole.norm()
 
 
-def test_matrices_of_a_batch_do_not_influence_one_another(product, generator):
+def test_matrices_of_a_batch_are_independent(product, generator):
     X, weight, _ = product(noise=0.1)
     start = random_left(2, 12, 3, generator)
     both, alone = factorize(X, weight, start), factorize(X[1:], weight[1:], start[1:])
@@ -67,7 +67,7 @@ def test_matrices_of_a_batch_do_not_influence_one_another(product, generator):
     assert_close(*products, rtol=1e-5, atol=1e-6)
 
 
-def test_without_missing_entries_it_is_the_singular_value_decomposition(product, generator):
+def test_without_missing_entries_the_solution_is_the_svd(product, generator):
     X, weight, _ = product(missing=0.0, noise=0.3, batch=1)
     found = factorize(X, weight, random_left(1, 12, 3, generator))
     U, S, V = torch.linalg.svd(X[0], full_matrices=False)
@@ -76,9 +76,7 @@ def test_without_missing_entries_it_is_the_singular_value_decomposition(product,
     assert_close(found.convergence.residual, (X[0] - best).square().mean().sqrt()[None])
 
 
-def test_weights_count_as_repetitions_and_columns_with_too_few_entries_disturb_nothing(
-    product, generator
-):
+def test_weights_count_as_repetitions_and_sparse_columns_are_ignored(product, generator):
     X, weight, _ = product(noise=0.2, batch=1)
     start = random_left(1, 12, 3, generator)
     doubled, thin = weight.clone(), weight[..., :2].clone()
@@ -95,7 +93,7 @@ def test_weights_count_as_repetitions_and_columns_with_too_few_entries_disturb_n
     )
 
 
-def test_the_matrix_is_ruhe_and_wedins(product, generator):
+def test_the_normal_matrix_is_that_of_ruhe_and_wedin(product, generator):
     X, weight, _ = product(rows=5, columns=7, rank=2, batch=1, missing=0.2, noise=0.3)
     given = low_rank_problem(X, weight, random_left(1, 5, 2, generator))
     right, left = best_right(given), given.lights
@@ -107,7 +105,7 @@ def test_the_matrix_is_ruhe_and_wedins(product, generator):
     assert_close(curvature_of_lights(given, left, right, given.weight)[0], expected)
 
 
-def test_starts_are_repeated_until_the_best_minimum_is(product, generator):
+def test_starts_are_added_until_the_best_minimum_is_repeated(product, generator):
     X, weight, whole = product(batch=1)
     found = factorize_from_many(X[0], weight[0], 3, generator)
     assert found.repeated
@@ -126,7 +124,7 @@ def test_starts_are_repeated_until_the_best_minimum_is(product, generator):
         (lambda X, w: (X[..., :2], w[..., :2]), "rank is 3"),
     ],
 )
-def test_impossible_matrices_are_refused(product, generator, change, found):
+def test_impossible_matrices_are_rejected(product, generator, change, found):
     X, weight, _ = product()
     with pytest.raises(InputError, match=found):
         factorize(*change(X, weight), random_left(2, 12, 3, generator))

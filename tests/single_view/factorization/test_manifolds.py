@@ -36,7 +36,7 @@ def test_albedo_and_normal_are_joined_and_split(manifold, generator):
     assert_close(manifold.retract(vectors), vectors)
 
 
-def test_tangents_are_derivatives_of_albedo_and_of_turns_of_the_normal(generator):
+def test_tangents_are_derivatives_by_albedo_and_rotation_of_the_normal(generator):
     manifold = Cone()
     vectors, albedo, _ = some(manifold, 20, generator)
     for place, column in enumerate(manifold.tangents(vectors.mT)):
@@ -49,7 +49,7 @@ def test_tangents_are_derivatives_of_albedo_and_of_turns_of_the_normal(generator
         assert_close(angle, 1e-6 - by_albedo, rtol=0, atol=5e-12)
 
 
-def test_what_bends_away_from_a_normal_costs_its_square(generator):
+def test_the_normal_prior_is_quadratic_in_the_deviation(generator):
     vectors, albedo, normals = some(Cone(), 20, generator)
     other = normalize(draw(generator, 20, 3), dim=-1)
     form = Cone().normal_prior(other.mT)
@@ -61,7 +61,7 @@ def test_what_bends_away_from_a_normal_costs_its_square(generator):
     ("solve", "tolerance"), [(solve_balm, 1e-6), (solve_variable_projection, 1e-12)]
 )
 @MANIFOLDS
-def test_every_solver_explains_the_data_on_every_manifold(solve, tolerance, manifold, generator):
+def test_every_solver_fits_the_data_on_every_manifold(solve, tolerance, manifold, generator):
     vectors = torch.stack([some(manifold, 120, generator)[0].mT for _ in range(2)])
     lights = draw(generator, 2, 25, manifold.rank)
     weight = (torch.rand(2, 25, 120, generator=generator) > 0.3).double()

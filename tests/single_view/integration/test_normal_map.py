@@ -27,7 +27,7 @@ def normals_of(p, q):
 
 
 def bumps(width, height=None):
-    """A closed-form surface over a square of side 2: its normals, and where they are."""
+    """Return normals and depth of a closed-form surface over a square of side 2, and its grid."""
     height = height or width
     spacing = 2 / width, 2 / height
     x, y = centres(height, width, spacing)
@@ -38,14 +38,14 @@ def bumps(width, height=None):
 
 
 def pinhole(size):
-    """A camera whose pixels are not square, and the rays of its pixels."""
+    """Return a camera with non-square pixels, and the rays of its pixels."""
     K = [[1.5 * size, 0, size / 2 + 3], [0, 1.65 * size, size / 2 - 2], [0, 0, 1]]
     K = torch.tensor(K, dtype=torch.float64)
     return K, homogeneous(pixel_centers(size, size, K)) @ torch.linalg.inv(K).mT
 
 
 def ball(size, away=4.0):
-    """A sphere before a pinhole: normals, depth and where it is met, the rim left out."""
+    """Return normals, depth and hit mask of a sphere in perspective, without its rim."""
     K, ray = pinhole(size)
     direction = normalize(ray, dim=-1)
     along = direction[..., 2] * away
@@ -61,7 +61,7 @@ def misfit(found, depth, mask=...):
 
 @ALL
 def test_the_error_falls_with_the_spacing(method):
-    # The cubic is of fourth order, of second at borders.
+    # The cubic is of fourth order, and of second order at borders.
     errors = []
     for size in (24, 48):
         normals, z, at = bumps(size)
@@ -73,7 +73,7 @@ def test_the_error_falls_with_the_spacing(method):
 
 
 @ALL
-def test_any_plane_comes_back_exactly(method):
+def test_planes_are_reproduced_exactly(method):
     x, y = centres(9, 13, (0.5, 0.2))
     normals = normals_of(0 * x + 0.7, 0 * x - 0.4)
     found = integrate_normal_map(normals, spacing=(0.5, 0.2), method=method)
@@ -87,7 +87,7 @@ def test_any_plane_comes_back_exactly(method):
 
 
 @ALL
-def test_a_ball_before_a_pinhole_comes_back_with_the_order_of_the_cubic(method):
+def test_a_ball_in_perspective_has_errors_of_cubic_order(method):
     errors = []
     for size in (32, 64):
         normals, depth, mask, K = ball(size)
@@ -100,7 +100,7 @@ def test_a_ball_before_a_pinhole_comes_back_with_the_order_of_the_cubic(method):
 
 
 @ALL
-def test_turning_the_raster_turns_the_answer(method):
+def test_rotating_the_raster_rotates_the_result(method):
     normals = bumps(16)[0][:, :11]
     rotated = normals.rot90(1, (0, 1))
     rotated = torch.stack([rotated[..., 1], -rotated[..., 0], rotated[..., 2]], dim=-1)
@@ -110,7 +110,7 @@ def test_turning_the_raster_turns_the_answer(method):
 
 
 @ALL
-def test_empty_margins_change_nothing(method):
+def test_empty_margins_do_not_change_the_result(method):
     normals, _, mask, K = ball(24)
     wide = torch.zeros(40, 50, 3).double(), torch.zeros(40, 50, dtype=torch.bool)
     wide[0][5:29, 20:44], wide[1][5:29, 20:44] = normals, mask
@@ -127,7 +127,7 @@ def test_empty_margins_change_nothing(method):
 
 
 @ALL
-def test_holes_islands_and_single_pixels_each_have_their_own_constant(method):
+def test_every_component_has_its_own_constant(method):
     normals, z, at = bumps(40)
     parts = torch.zeros(2, 40, 40, dtype=torch.bool)
     parts[0, 2:30, 2:30], parts[1, 34:38, 5:20] = True, True
@@ -145,7 +145,7 @@ def test_holes_islands_and_single_pixels_each_have_their_own_constant(method):
 
 
 @ALL
-def test_missing_and_turned_away_normals_are_bridged_and_say_so(method):
+def test_missing_and_averted_normals_are_bridged_and_marked(method):
     normals, z, at = bumps(40)
     normals[20:23, 18:22] = torch.nan
     normals[5, 7] = 0
@@ -177,7 +177,7 @@ def cliff(noise=0.0):
 
 
 @pytest.mark.parametrize(("noise", "bar"), [(0.0, 0.5), (0.05, 0.9)])
-def test_depth_may_jump_where_the_surface_goes_round_the_jump(noise, bar):
+def test_depth_may_jump_where_the_surface_continues_around_the_jump(noise, bar):
     normals, z = cliff(noise)
     assert misfit(integrate_normal_map(normals, method="weighted"), z) > 4
     torn = integrate_normal_map(normals)
@@ -186,8 +186,8 @@ def test_depth_may_jump_where_the_surface_goes_round_the_jump(noise, bar):
     assert torn.continuity.convergence.converged.all()
 
 
-def test_stripes_that_rise_and_sink_come_apart_along_their_sides():
-    # From plain least squares alone every stripe looks flat: only the twist shows its sides.
+def test_rising_and_falling_stripes_are_separated_at_their_edges():
+    # In plain least squares every stripe is flat: only the twist reveals its edges.
     x, y = centres(40, 48)
     up = (torch.arange(48) // 8 % 2 == 0).expand(40, 48)
     slope = torch.where(y > 0, 0.0, torch.where(up, 1.0, -1.0))
@@ -208,16 +208,16 @@ def test_noise_alone_does_not_tear_the_surface():
     assert float((torn.depth - smooth.depth).std()) < 0.1
 
 
-def test_a_crease_is_no_jump():
+def test_a_crease_is_not_a_jump():
     x, _ = centres(20, 41)
     found = integrate_normal_map(normals_of(torch.where(x < 0.5, 1.5, -1.5).double(), 0 * x))
-    # The crease lies somewhere on the step between two pixels: the mean slope is as good as any.
+    # The crease is somewhere between two pixels: the mean slope is as good as any.
     assert misfit(found, torch.where(x < 0.5, 1.5 * x, 1.5 - 1.5 * x)) < 0.8
     rows = found.depth - found.depth.mean(dim=1, keepdim=True)
     assert_close(rows, rows[:1].expand_as(rows), rtol=0, atol=1e-6)
 
 
-def test_the_answer_does_not_depend_on_how_linear_systems_are_solved(monkeypatch):
+def test_the_result_does_not_depend_on_the_linear_solver(monkeypatch):
     normals = cliff(0.02)[0][8:32, 8:32]
     exact = integrate_normal_map(normals)
     monkeypatch.setattr(raster_system, "_CHOLESKY_PIXELS", 0)
@@ -227,7 +227,7 @@ def test_the_answer_does_not_depend_on_how_linear_systems_are_solved(monkeypatch
 
 
 @ALL
-def test_known_depths_fix_the_constant_and_bend_what_normals_say(method):
+def test_known_depths_fix_the_constant_and_deform_the_surface(method):
     normals, z, at = bumps(30)
     known = torch.full_like(z, torch.nan)
     known[4, 5], known[20, 25] = z[4, 5] + 7, z[20, 25] + 7
@@ -243,7 +243,7 @@ def test_known_depths_fix_the_constant_and_bend_what_normals_say(method):
     assert lift[1] == pytest.approx(0.5, abs=1e-3)
 
 
-def test_normals_that_are_not_trusted_yield():
+def test_normals_with_low_weight_yield():
     normals, z, at = bumps(30)
     normals[10:14, 10:14] = normalize(torch.tensor([1.0, 1.0, -1.0]).double(), dim=0)
     around = torch.ones(30, 30, dtype=torch.bool)
@@ -274,7 +274,7 @@ def test_gradients_reach_normals_weights_and_known_depths():
     assert torch.autograd.gradcheck(depth, leaves, atol=1e-6)
 
 
-def test_gradients_take_continuity_as_given():
+def test_gradients_treat_continuity_as_constant():
     normals, _ = cliff(0.02)
     slopes = (-normals[..., :2] / normals[..., 2:]).requires_grad_()
 
@@ -297,7 +297,7 @@ def test_a_map_whose_normals_all_fail_is_flat_and_not_valid():
     assert not found.valid.any()
 
 
-def test_arrays_of_float32_and_masks_of_bytes_are_taken():
+def test_float32_arrays_and_byte_masks_are_accepted():
     normals, _, mask, _ = ball(40)
     found = integrate_normal_map(normals.numpy(), mask.numpy().astype("uint8") * 255).depth
     assert torch.equal(found, integrate_normal_map(normals, mask).depth)
@@ -327,7 +327,7 @@ OPENGL = torch.tensor([1.0, -1, -1]).double()
         (lambda n: n, {"spacing": (1.0, 0.0)}, "spacing"),
     ],
 )
-def test_input_that_means_nothing_and_other_conventions_are_refused(change, given, needed):
+def test_invalid_input_and_different_conventions_are_rejected(change, given, needed):
     normals, _, mask, _ = ball(40)
     with pytest.raises(InputError, match=needed):
         integrate_normal_map(change(normals), **{"mask": mask, **given})

@@ -39,7 +39,7 @@ def masked(weighted, inside):
 
 
 def ragged(height, width):
-    """A disc with two holes, an island of 2 x 2 and a single pixel apart from it."""
+    """Return a disc with two holes, an island of 2 x 2 and a separate single pixel."""
     row, col = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     inside = (row - height / 2) ** 2 + (col - width / 2) ** 2 < (0.4 * min(height, width)) ** 2
     inside[height // 2 : height // 2 + 2, width // 2] = False
@@ -50,7 +50,7 @@ def ragged(height, width):
 
 
 def terraced(height, width, drop=1e-8):
-    """Plateaus tied to each other by next to nothing, as heights cut at depth edges are."""
+    """Return plateaus with tiny weights between them, like heights cut at depth edges."""
     row, col = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     level = ((col / 5).sin() * (row / 7).cos() * 3).floor()
     weighted = equal(height, width)
@@ -67,7 +67,7 @@ def method(request, monkeypatch):
 
 @pytest.fixture(params=["equal", "ragged", "terraced", "jumping", "strips", "empty"])
 def weighted(request, generator):
-    plain = equal(20, 23)  # more than the dense coarsest level of a hierarchy holds
+    plain = equal(20, 23)  # larger than the dense coarsest level of a hierarchy
     part = ragged(20, 23)
     return {
         "equal": plain,
@@ -92,26 +92,24 @@ def applied(weighted, heights):
 
 
 def component_means(weighted, heights):
-    """Move every height to the mean of those it hangs together with, by brute force."""
+    """Replace every height by the mean of its connected component, by brute force."""
     reach = ((weighted.dense() != 0) | torch.eye(heights.numel(), dtype=torch.bool)).double()
-    for _ in range(12):  # paths double in length
+    for _ in range(12):  # path lengths double
         reach = (reach @ reach).sign()
     return (reach @ heights.flatten() / reach.sum(dim=1)).reshape(heights.shape)
 
 
-def test_heights_come_back_from_their_own_source_up_to_the_mean_of_each_part(
-    weighted, method, generator
-):
+def test_heights_are_recovered_from_their_source_up_to_component_means(weighted, method, generator):
     heights = uniform(generator, weighted.shape)
     found = RasterSystem(*weighted).solve(applied(weighted, heights))
     expected = heights - component_means(weighted, heights)
-    # A plateau tied by 1e-8 amplifies the rounding of its source by as much.
+    # A plateau coupled by 1e-8 amplifies the rounding of its source by 1e8.
     assert_close(found, expected, atol=3e-6, rtol=0)
 
 
-def test_with_anchors_the_solution_is_that_of_the_dense_matrix(weighted, method, generator):
+def test_with_anchors_the_solution_equals_a_dense_solve(weighted, method, generator):
     anchor = 0.1 * (uniform(generator, weighted.shape) < 0.2).double()
-    anchor[:2, :2] = 1e-6  # an island held by next to nothing
+    anchor[:2, :2] = 1e-6  # an island with a tiny anchor
     held = weighted._replace(anchor=anchor)
     matrix = held.dense()
     joined = (component_means(held, (anchor > 0).double()) > 0).flatten()
@@ -135,7 +133,7 @@ def test_weights_of_two_sizes_on_rectangles_and_lines(method, shape, generator):
     assert_close(RasterSystem(*scaled).solve(source), expected, rtol=1e-8, atol=1e-8)
 
 
-def test_steps_without_weight_may_be_anything():
+def test_steps_without_weight_are_ignored():
     right, down = torch.ones(3, 3), torch.ones(2, 4)
     right[0], down[0] = 0, 0
     solver = RasterSystem(right, down)
@@ -165,7 +163,7 @@ def test_gradients_reach_weights_anchors_and_source(method, held, generator, mon
 
     leaves = [part.requires_grad_() for part in inputs]
     assert torch.autograd.gradcheck(heights, leaves)
-    if method == "cholesky":  # the way back is the same
+    if method == "cholesky":  # the backward pass is the same
         leaves[2] = leaves[2].detach()[:1].requires_grad_()
         assert torch.autograd.gradgradcheck(heights, leaves, atol=1e-4)
 
@@ -181,7 +179,7 @@ def test_float32_rasters_are_solved_in_float64(method, generator):
 
 
 @pytest.mark.parametrize("where", [0, 2])
-def test_a_source_or_weight_that_is_not_finite_is_refused(method, where):
+def test_a_source_or_weight_that_is_not_finite_is_rejected(method, where):
     right, down, source = given = torch.ones(30, 29), torch.ones(29, 30), torch.ones(30, 30)
     given[where][5, 6] = torch.nan
     with pytest.raises(SingularSystemError):
@@ -190,7 +188,7 @@ def test_a_source_or_weight_that_is_not_finite_is_refused(method, where):
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-def test_cuda_gives_what_the_cpu_gives(weighted, generator):
+def test_cuda_agrees_with_the_cpu(weighted, generator):
     source = applied(weighted, uniform(generator, weighted.shape))
     found = RasterSystem(*(part.cuda() for part in weighted)).solve(source.cuda())
     assert_close(found.cpu(), RasterSystem(*weighted).solve(source), atol=1e-5, rtol=0)

@@ -17,7 +17,7 @@ HIDDEN = BasRelief(
 
 
 def painted(shape, size=28, seed=1):
-    """Normals, shading and the number of each pixel's paint."""
+    """Return normals, shading vectors and the albedo index of each pixel."""
     generator = torch.Generator().manual_seed(seed)
     normals, mask = ball(size) if shape == "ball" else bumps(size, generator)
     normals, albedo = normals[mask].mT, regions(size, generator)[mask].mT
@@ -30,7 +30,7 @@ def off_deg(b, normals, groups=None):
 
 
 @pytest.mark.parametrize("shape", ["ball", "bumps"])
-def test_the_relief_of_a_surface_in_few_albedos_is_found(shape):
+def test_the_relief_of_a_surface_with_few_albedos_is_recovered(shape):
     normals, shading, _ = painted(shape)
     b = HIDDEN.on_shading(shading)
     assert angles_deg(b, normals).mean() > 10
@@ -38,7 +38,7 @@ def test_the_relief_of_a_surface_in_few_albedos_is_found(shape):
     assert off_deg(b, normals) < 1
 
 
-def test_noise_and_a_second_cue_of_colour(generator):
+def test_the_relief_is_recovered_under_noise_and_with_colour(generator):
     normals, shading, groups = painted("ball")
     noise = torch.randn(shading.shape, generator=generator, dtype=torch.float64)
     noisy = shading + 0.01 * noise
@@ -46,13 +46,13 @@ def test_noise_and_a_second_cue_of_colour(generator):
     assert off_deg(HIDDEN.on_shading(noisy), normals, groups) < floor + 0.5
 
 
-def test_colour_finds_what_brightness_misses():
-    # Five albedos within a factor of 1.7, among which the search without colour goes astray.
+def test_colour_determines_the_relief_where_brightness_fails():
+    # Five albedos within a factor of 1.7: the search without colour finds a wrong minimum.
     normals, shading, groups = painted("bumps", size=48, seed=3)
     assert off_deg(HIDDEN.on_shading(shading), normals, groups) < 1
 
 
-def test_the_answer_does_not_depend_on_the_relief_handed_in():
+def test_the_result_does_not_depend_on_the_initial_relief():
     _, b, _ = painted("ball")
     moved = HIDDEN.on_shading(5 * b)
     one = resolve_by_albedo_entropy(b).on_shading(b)
@@ -60,7 +60,7 @@ def test_the_answer_does_not_depend_on_the_relief_handed_in():
     assert_close(other, 5 * one, atol=1e-6, rtol=1e-6)
 
 
-def test_entropy_is_that_of_the_paints_plus_the_kernels():
+def test_entropy_is_that_of_the_albedos_plus_that_of_the_kernel():
     normals, _, _ = painted("ball")
     albedo = torch.ones_like(normals[0])
     albedo[: len(albedo) // 2] = 2.0
@@ -68,11 +68,11 @@ def test_entropy_is_that_of_the_paints_plus_the_kernels():
     both = albedo_entropy(albedo * normals, labels, stay, 0.01)
     one = albedo_entropy(normals, labels, stay, 0.01)
     assert_close(both - one, torch.tensor([2.0]).double().log(), atol=5e-3, rtol=0)
-    told = albedo_entropy(albedo * normals, (albedo > 1).long(), stay, 0.01)
-    assert_close(told, both, atol=5e-3, rtol=0)  # joint entropy: known paints stay counted
+    joint = albedo_entropy(albedo * normals, (albedo > 1).long(), stay, 0.01)
+    assert_close(joint, both, atol=5e-3, rtol=0)  # known labels still count in joint entropy
 
 
-def test_the_dtype_is_kept_and_empty_vectors_are_left_out():
+def test_the_dtype_is_kept_and_empty_vectors_are_ignored():
     normals, shading, _ = painted("ball")
     b = HIDDEN.on_shading(shading).float()
     b[:, ::7], b[:, 3] = 0, torch.nan
@@ -89,6 +89,6 @@ def test_the_dtype_is_kept_and_empty_vectors_are_left_out():
         (torch.tensor([[0.0], [0], [-1]]).expand(3, 60), "parallel"),
     ],
 )
-def test_too_few_vectors_and_planes_are_refused(shading, needed):
+def test_too_few_vectors_and_planes_are_rejected(shading, needed):
     with pytest.raises(InputError, match=needed):
         resolve_by_albedo_entropy(shading)

@@ -54,14 +54,14 @@ def test_equations_vanish_on_normals_of_a_surface(generator):
     cofactors = torch.linalg.inv(matrix).mT.flatten()
     assert_close(rows @ cofactors, 0 * x, atol=1e-12, rtol=0)
     values = torch.linalg.svdvals(rows)
-    assert values[-1] < 1e-10 < 1e-4 < values[-2]  # and nothing else solves them
+    assert values[-1] < 1e-10 < 1e-4 < values[-2]  # the solution is unique
 
 
 @pytest.mark.parametrize("steepest", [1.0, -1.0])
-def test_everything_but_scale_is_found_hollows_and_hills(generator, steepest):
+def test_convex_and_concave_surfaces_are_recovered_up_to_scale(generator, steepest):
     made, intrinsics = seen_in_perspective(generator, steepest=steepest)
     shading, lights = factorize_in_perspective(made.images, made.mask, intrinsics)
-    # What is left are fifth derivatives over squares of seven pixels.
+    # The remaining error is due to fifth derivatives over windows of seven pixels.
     assert off_deg(shading, made.normals) < 0.2
     assert off_deg(lights.mT, made.lights.mT) < 0.2
     factor = made.lights.square().sum(dim=1).mean().sqrt()
@@ -69,7 +69,7 @@ def test_everything_but_scale_is_found_hollows_and_hills(generator, steepest):
     assert_close(lights @ shading, made.images.sum(dim=1)[:, made.mask], atol=1e-10, rtol=0)
 
 
-def test_a_ball_which_has_two_solutions_is_refused(generator):
+def test_a_ball_has_two_solutions_and_is_rejected(generator):
     size, focal = 64, 88.0
     intrinsics = torch.tensor([[focal, 0, 32], [0, focal, 32], [0, 0, 1]]).double()
     rays = homogeneous((pixel_centers(size, size, intrinsics) - 32) / focal)
@@ -83,36 +83,36 @@ def test_a_ball_which_has_two_solutions_is_refused(generator):
         factorize_in_perspective(made.images, mask, intrinsics, lit(made))
 
 
-def test_shadows_are_left_out(generator):
+def test_shadows_are_ignored(generator):
     made, intrinsics = seen_in_perspective(generator, widest_deg=65.0)
     seen = lit(made)
     assert 0.02 < 1 - seen.double().mean() < 0.5
     shading, lights = factorize_in_perspective(made.images, made.mask, intrinsics, seen)
     assert off_deg(shading, made.normals) < 0.3
     dark = made.images.sum(dim=1)[:, made.mask][~seen]
-    assert ((lights @ shading)[~seen] - dark).min() < -0.1  # the product goes below zero there
+    assert ((lights @ shading)[~seen] - dark).min() < -0.1  # the product is negative there
 
 
-def test_noise_of_half_a_per_cent_is_borne(generator):
+def test_noise_of_half_a_per_cent_is_tolerated(generator):
     made, intrinsics = seen_in_perspective(generator, noise=0.005)
     shading, _ = factorize_in_perspective(made.images, made.mask, intrinsics, radius=4)
-    # A pixel's own noise costs 0.5 degrees; perspective of 40 degrees is a weak cue.
+    # Noise of the pixels costs 0.5 degrees; perspective of 40 degrees is a weak cue.
     assert off_deg(shading, made.normals) < 3
 
 
-def test_oblong_and_skewed_pixels_are_followed(generator):
-    # The same picture seen by another camera: only the meaning of its pixels changes.
+def test_non_square_and_skewed_pixels_are_supported(generator):
+    # The same image in a different camera: only the rays of its pixels change.
     made, intrinsics = seen_in_perspective(generator)
     change = torch.tensor([[1.0, 0.2, 3.0], [0.0, 0.7, -5.0], [0.0, 0.0, 1.0]]).double()
-    # Rays K^-1 u of the new camera are change^-1 of the old, normals turn by its transpose.
+    # Rays K^-1 u of the new camera are change^-1 of the old; normals transform by its transpose.
     rotated = normalize(change.mT @ made.normals, dim=0)
     assert off_deg(rotated, made.normals) > 1
     shading, _ = factorize_in_perspective(made.images, made.mask, intrinsics @ change)
-    # Lights turn by the inverse, and images stay the product: the truth for the new camera.
+    # Lights transform by the inverse, so images are unchanged: the truth for the new camera.
     assert off_deg(shading, rotated) < 0.2
 
 
-def test_dtype_and_pixels_without_enough_views(generator):
+def test_the_dtype_is_kept_and_pixels_with_few_views_are_ignored(generator):
     made, intrinsics = seen_in_perspective(generator)
     seen = torch.ones(12, made.normals.shape[1], dtype=torch.bool)
     seen[2:, 100] = False
@@ -138,7 +138,7 @@ THREE = (torch.arange(12) < 3)[:, None].expand(12, 64**2)
         (lambda images, mask, K: (images, mask, K, THREE), "0 pixels more than 3"),
     ],
 )
-def test_what_does_not_fit_is_refused(generator, change, needed):
+def test_inconsistent_input_is_rejected(generator, change, needed):
     made, intrinsics = seen_in_perspective(generator)
     with pytest.raises(InputError, match=needed):
         factorize_in_perspective(*change(made.images, made.mask, intrinsics))

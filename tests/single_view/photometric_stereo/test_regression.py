@@ -29,7 +29,7 @@ def test_plain_regression_is_weighted_least_squares(generator):
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_what_has_no_weight_does_not_matter_not_even_when_it_is_no_number(generator, robust):
+def test_samples_without_weight_are_ignored_even_if_nan(generator, robust):
     lights = uniform(generator, 8, 3)
     radiance = lights @ uniform(generator, 3, 20)
     weight, spoilt = torch.ones_like(radiance), radiance.clone()
@@ -41,7 +41,7 @@ def test_what_has_no_weight_does_not_matter_not_even_when_it_is_no_number(genera
 def test_shadows_and_highlights_lose_their_weight(generator):
     lights = strong_lights(generator, 16, spread=1.5)
     exact = lights @ BUMPY.columns
-    assert (exact < 0).double().mean() > 0.05  # attached shadows there are
+    assert (exact < 0).double().mean() > 0.05  # there are attached shadows
     draw = uniform(generator, *exact.shape)
     radiance = torch.where(draw < 0.08, 0, exact.clamp_min(0))  # cast shadows
     radiance = torch.where(draw > 0.95, radiance + 0.7, radiance)  # highlights
@@ -56,7 +56,7 @@ def test_shadows_and_highlights_lose_their_weight(generator):
     assert robust.weight[draw > 0.95].mean() < 0.2 * inliers.mean()
 
 
-def test_lights_from_behind_are_no_measurements(generator):
+def test_lights_from_behind_do_not_count(generator):
     lights = strong_lights(generator, 16, spread=1.5)
     radiance = (lights @ BUMPY.columns).clamp_min(0)
     found = regress(radiance, torch.ones_like(radiance), lights)
@@ -68,17 +68,17 @@ def test_lights_from_behind_are_no_measurements(generator):
 def test_pixels_are_determined_by_enough_samples_of_lights_that_span():
     lights = torch.tensor([[0.0, 0, -1], [0.6, 0, -0.8], [-0.6, 0, -0.8], [0, 0.6, -0.8]])
     weight = torch.tensor([[1.0, 1, 1, 1], [1, 1, 1, 0.01], [1, 1, 0, 1], [1, 0, 0, 0.01]])
-    # The second has lights in a plane.
+    # The lights of the second are in a plane.
     assert determined(weight, lights).tolist() == [True, False, False, False]
 
 
 def in_span(found, true):
-    """How much of the true columns a factorization of lights does not reach."""
+    """Return the part of the true columns outside the span of the found ones."""
     left = torch.linalg.qr(found).Q
     return (true - left @ (left.mT @ true)).norm() / true.norm()
 
 
-def test_without_holes_it_is_the_singular_value_decomposition(generator):
+def test_without_holes_the_factorization_is_the_svd(generator):
     radiance = uniform(generator, 9, 50)
     found = factorize_photographs(radiance, torch.ones_like(radiance), 3, robust=False)
     U, S, Vh = torch.linalg.svd(radiance, full_matrices=False)
@@ -87,7 +87,7 @@ def test_without_holes_it_is_the_singular_value_decomposition(generator):
 
 
 @pytest.mark.parametrize("robust", [False, True])
-def test_holes_are_filled_by_the_rest(generator, robust):
+def test_holes_are_filled_from_the_remaining_entries(generator, robust):
     lights = strong_lights(generator, 14, spread=0.2)
     radiance = lights @ (BUMPY.patchwork * BUMPY.columns)
     weight = ((uniform(generator, *radiance.shape) > 0.4) & (radiance > 0)).double()
@@ -98,7 +98,7 @@ def test_holes_are_filled_by_the_rest(generator, robust):
     assert_close((found.lights @ found.shading)[:, enough], radiance[:, enough], atol=1e-4, rtol=0)
 
 
-def test_shadows_do_not_disturb_the_lights(generator):
+def test_shadows_do_not_bias_the_lights(generator):
     lights = strong_lights(generator, 20, spread=1.3)
     radiance = (lights @ BUMPY.columns).clamp_min(0)
     radiance = torch.where(uniform(generator, *radiance.shape) < 0.07, 0, radiance)
@@ -112,7 +112,7 @@ def test_shadows_do_not_disturb_the_lights(generator):
 @pytest.mark.parametrize(
     ("seen", "pixels", "found"), [(2, 40, "2 views have samples"), (5, 2, "2 pixels more than 3")]
 )
-def test_fewer_views_or_pixels_than_the_rank_are_refused(generator, seen, pixels, found):
+def test_fewer_views_or_pixels_than_the_rank_are_rejected(generator, seen, pixels, found):
     radiance = uniform(generator, 5, pixels)
     weight = torch.ones_like(radiance)
     weight[seen:] = 0
@@ -132,7 +132,7 @@ def test_colours_share_their_normal(generator, robust):
     assert_close(found.albedo[:, lit], albedo[:, lit])
 
 
-def test_the_colour_that_says_most_counts_most(generator):
+def test_the_brightest_channel_has_most_weight(generator):
     lights = strong_lights(generator, 12, spread=0.3)
     albedo = torch.tensor([0.9, 0.05, 0.05], dtype=torch.float64)[:, None]
     shade = lights @ BUMPY.columns
@@ -152,7 +152,7 @@ def test_a_black_pixel_has_no_normal(generator):
     assert (found.albedo == 0).all()
 
 
-def test_albedo_is_the_best_one_for_its_shade(generator):
+def test_chromatic_albedo_is_that_of_least_squares(generator):
     shade, weight = uniform(generator, 2, 9, 4)
     radiance = uniform(generator, 9, 2, 4)
     found = chromatic_albedo(radiance, weight, shade)

@@ -32,7 +32,7 @@ def test_the_slopes_change_as_those_of_the_transformed_surface(generator):
     assert_close(-y / z, move.lam * q + move.nu)
 
 
-def test_transformations_form_a_group_and_change_no_image(generator):
+def test_transformations_form_a_group_and_keep_images(generator):
     move, second = some(generator), some(generator)
     shading = torch.randn(3, 40, generator=generator, dtype=torch.float64)
     lights = torch.randn(7, 3, generator=generator, dtype=torch.float64)
@@ -41,7 +41,7 @@ def test_transformations_form_a_group_and_change_no_image(generator):
     assert_close(second.after(move).matrix, second.matrix @ move.matrix)
 
 
-def test_alignment_finds_the_transformation_and_ignores_what_has_no_weight(generator):
+def test_alignment_recovers_the_transformation_and_ignores_zero_weights(generator):
     move = some(generator)
     shading = torch.randn(3, 60, generator=generator, dtype=torch.float64)
     moved, weight = 3.0 * move.on_shading(shading), torch.ones(60, dtype=torch.float64)
@@ -72,26 +72,26 @@ def rounded(shading, weight, mask):
 
 
 @pytest.mark.parametrize("lam", [0.4, -0.25])
-def test_any_relief_of_a_ball_is_made_a_ball_again(lam):
+def test_any_relief_of_a_ball_is_restored_to_a_ball(lam):
     found = rounded(relief(0.3, -0.7, lam).on_shading(BALL.columns), BALL.even, BALL.mask)
-    # A disc cut short of the rim is flatter than a half ball: by 3 %, from 0.97 squared.
+    # A disc without its rim is flatter than a hemisphere, by 3 %, from 0.97 squared.
     assert_close(found[2], BALL.columns[2])
     assert (found[:2] - BALL.columns[:2]).abs().max() < 0.07
 
 
-def test_the_choice_does_not_depend_on_the_relief_it_starts_from(generator):
+def test_the_result_does_not_depend_on_the_initial_relief(generator):
     weight = torch.rand(BUMPY.columns.shape[1], generator=generator, dtype=torch.float64)
     moved = relief(0.2, 0.5, -3.0).on_shading(BUMPY.columns)
     assert_close(rounded(BUMPY.columns, weight, BUMPY.mask), rounded(moved, weight, BUMPY.mask))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_convex_one_has_normals_that_point_outwards(sign):
+def test_the_convex_solution_has_outward_normals(sign):
     assert convex(relief(0.0, 0.0, sign), BALL.columns, BALL.even, BALL.mask).lam == 1
 
 
 @pytest.mark.parametrize("shrunk", [0.05, 1.0, 20.0])
-def test_a_relief_is_undone_by_point_lights_of_one_strength(generator, shrunk):
+def test_equal_light_strengths_resolve_the_relief(generator, shrunk):
     lights, tilted = strong_lights(generator, 12), relief(0.4, -0.3, 0.35)
     lights[3] *= 1.4  # an outlier
     moved, shading = shrunk * tilted.on_lights(lights), tilted.on_shading(BUMPY.columns)

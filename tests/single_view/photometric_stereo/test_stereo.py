@@ -10,7 +10,7 @@ COLOURS = torch.tensor([0.9, 0.5, 0.2], dtype=torch.float64)
 
 
 def photographed(scene, lights, albedo=1.0):
-    """Images in colour, and the truth about shadows."""
+    """Return colour images and the true shadows."""
     shade = (lights @ scene.columns).clamp_min(0)
     return COLOURS[:, None, None] * scene.raster(albedo * shade), shade > 0
 
@@ -18,7 +18,7 @@ def photographed(scene, lights, albedo=1.0):
 @pytest.mark.parametrize(
     ("method", "resolve"), [("calibrated", None), ("integrability", "equal_strength")]
 )
-def test_point_lights_of_one_strength_are_enough(generator, method, resolve):
+def test_equal_light_strengths_determine_normals(generator, method, resolve):
     lights = 1.3 * strong_lights(generator, 16, spread=0.5)
     images, lit = photographed(BUMPY, lights, BUMPY.patchwork)
     known = lights if method == "calibrated" else None
@@ -26,7 +26,7 @@ def test_point_lights_of_one_strength_are_enough(generator, method, resolve):
     some = found.valid[BUMPY.mask]
     assert some.double().mean() > 0.97
     off = angles_deg(found.normals[BUMPY.mask].mT, BUMPY.columns)[some]
-    # Without the lights, integrability is as exact as cells of 1/56 of the surface are.
+    # Without lights, integrability is as exact as cells of 1/56 of the surface.
     assert off.mean() < (0.01 if method == "calibrated" else 0.7)
     assert angles_deg(found.lights.mT, lights.mT).mean() < 0.7
     scale = 1.0 if method == "calibrated" else 1.3
@@ -36,7 +36,7 @@ def test_point_lights_of_one_strength_are_enough(generator, method, resolve):
     assert (found.lit[:, BUMPY.mask] == lit)[:, some].double().mean() > 0.99
 
 
-def test_without_knowledge_a_convention_is_taken_and_named(generator):
+def test_without_a_cue_a_convention_is_used_and_named(generator):
     images, _ = photographed(BALL, strong_lights(generator, 12, spread=0.5))
     found = photometric_stereo(images, BALL.mask, method="integrability", resolve="rounded")
     assert "bas-relief" in found.free
@@ -44,7 +44,7 @@ def test_without_knowledge_a_convention_is_taken_and_named(generator):
     assert found.applied.lam.isfinite()
 
 
-def test_what_is_missing_may_be_no_number_or_without_weight(generator):
+def test_missing_samples_may_be_nan_or_have_no_weight(generator):
     lights = strong_lights(generator, 14, spread=0.3)
     images, _ = photographed(BUMPY, lights)
     gone, unwanted = torch.rand(2, 14, 56, 56, generator=generator) < 0.2
@@ -76,7 +76,7 @@ def test_pixels_that_cannot_be_determined_are_not_valid():
     flat = [[0.0, 0, -1], [0.6, 0, -0.8], [-0.6, 0, -0.8]]
     lights = torch.tensor([*flat, [0.0, 0.6, -0.8]], dtype=torch.float64)
     normals = torch.tensor([[0.0, 0, -1]] * 5 + [[0.3, 0, 0.954]], dtype=torch.float64)
-    # The last one is a fake: its radiance is what a normal from behind would have, unclamped.
+    # The radiance of the last one is that of an averted normal, without clamping.
     images = (lights @ normals.mT)[:, None, None]
     images[:, :, :, 1] = 0
     weight = torch.ones(4, 1, 6, dtype=torch.float64)
@@ -86,7 +86,7 @@ def test_pixels_that_cannot_be_determined_are_not_valid():
     found = photometric_stereo(
         images, mask, method="calibrated", lights=lights, weight=weight, robust=False
     )
-    # Found, black, too few samples, lights in a plane, outside, facing away.
+    # Determined, black, too few samples, coplanar lights, outside, averted.
     assert found.valid[0].tolist() == [True, False, False, False, False, False]
     assert (found.normals[0, 4] == 0).all()
 
@@ -121,7 +121,7 @@ EYE = torch.eye(3).double()
         ({"method": "perspective", "intrinsics": EYE, "dark": 4}, "2 photographs have samples"),
     ],
 )
-def test_impossible_requests_are_refused(settings, needed):
+def test_impossible_requests_are_rejected(settings, needed):
     images, _ = photographed(BUMPY, SIX)
     images[: settings.get("dark", 0)] = torch.nan
     given = {"mask": BUMPY.mask, "method": "calibrated", **settings}
