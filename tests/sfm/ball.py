@@ -1,4 +1,4 @@
-"""A textured ball, or a wall, before cameras on an arc, each under its own light; closed forms."""
+"""Closed forms of a textured ball or wall seen from an arc, each view under its own light."""
 
 import torch
 from sparse_models import observed, views_of
@@ -12,7 +12,7 @@ from pimper_torch.records import CameraModel, Cameras, Views
 
 WIDTH, HEIGHT, FOCAL = 480, 360, 840.0
 
-# Where the wall stands; its normal is the z axis.
+# Position of the wall, whose normal is the z axis.
 WALL = -0.9
 
 
@@ -43,7 +43,7 @@ def albedo(points: Tensor) -> Tensor:
 
 
 def photographs(cameras: Cameras, *, lit: bool = True, wall: bool = False) -> Views:
-    """Render every view; ``lit`` turns the light from view to view; a wall in place of the ball."""
+    """Render every view of the ball or wall; ``lit`` rotates the light from view to view."""
     pixels = pixel_centers(WIDTH, HEIGHT, like=cameras.intrinsics).reshape(-1, 2)
     images = []
     for view in range(cameras.num_views):

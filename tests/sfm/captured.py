@@ -1,4 +1,4 @@
-"""Features of things in photographs, in an order of their own in each, and their matches."""
+"""Features of points in photographs, in random order, and their matches."""
 
 import torch
 from torch import Tensor
@@ -12,11 +12,11 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0
 
 
 class Captured:
-    """All that two photographs show is matched, one in ten wrongly.
+    """Features with matches of all common points, one in ten of which is wrong.
 
     Args:
-        generator: Of the order, the noise of 0.2 px and the wrong matches.
-        pixels: Of things, ``view thing 2``; NaN where not seen.
+        generator: Draws the order, the noise of 0.2 px and the wrong matches.
+        pixels: Pixels of points, ``view thing 2``; NaN if not seen.
     """
 
     def __init__(self, generator: torch.Generator, pixels: Tensor) -> None:
@@ -40,12 +40,12 @@ class Captured:
         return torch.stack([one, other], dim=1)
 
     def right(self, pair: tuple[int, int], rows: Tensor) -> Tensor:
-        """Know which matches are of one thing, as a verification finds out."""
+        """Return which matches are correct, as after verification."""
         one, other = rows.unbind(dim=1)
         return self.thing[pair[0]][one] == self.thing[pair[1]][other]
 
     def rest(self) -> StaticBackground:
-        """Find what is at rest."""
+        """Find the static background."""
         return find_static_background(
             self.keypoints,
             self.pairs,
@@ -55,7 +55,7 @@ class Captured:
 
 
 def orbit(count: int, span_deg: float, elevation_deg: float = 25.0) -> Cameras:
-    """Look down on the origin from round it."""
+    """Return cameras around the origin that look down on it."""
     return arc_cameras(
         count,
         width=WIDTH,
@@ -71,7 +71,7 @@ def orbit(count: int, span_deg: float, elevation_deg: float = 25.0) -> Cameras:
 
 
 def seen_of_ball(generator: torch.Generator, count: int, cameras: Cameras) -> Tensor:
-    """Give pixels ``view point 2`` of random points on a unit ball; NaN on its far side."""
+    """Return pixels ``view point 2`` of random points on a unit ball; NaN on its far side."""
     points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     points = points / points.norm(dim=1, keepdim=True)
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
@@ -89,15 +89,15 @@ def turntable(
     count: int = 12,
     span_deg: float = 330.0,
 ) -> Captured:
-    """Turn a ball before a room at rest; things from ``turning`` on are the room's.
+    """Turn a ball in front of a static background, whose points start at ``turning``.
 
     Args:
-        generator: Of everything.
-        turning: Points of the ball.
-        resting: Points of the room.
-        elevation_deg: Of the camera.
-        count: Photographs.
-        span_deg: Turn of the ball, in all.
+        generator: Random generator.
+        turning: Number of points of the ball.
+        resting: Number of points of the background.
+        elevation_deg: Elevation of the camera.
+        count: Number of photographs.
+        span_deg: Total rotation of the ball.
     """
     cameras = orbit(count, span_deg, elevation_deg)
     ball = seen_of_ball(generator, turning, cameras)

@@ -23,7 +23,7 @@ def lens() -> CameraModel:
 
 @pytest.fixture
 def model(generator: torch.Generator, lens: CameraModel) -> SparseModel:
-    """Five cameras of two kinds before a box of points, every point seen by most views."""
+    """Five cameras with two camera models; every point of a box is seen by most views."""
     other = CameraModel(
         camera=7,
         model="OPENCV",

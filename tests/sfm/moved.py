@@ -1,4 +1,4 @@
-"""Two rigid bodies before cameras: an object, and the table that it is moved on."""
+"""Two rigid bodies: an object, and the table on which it is moved."""
 
 import torch
 
@@ -18,7 +18,7 @@ def poses(num_views, elevation_deg=25.0):
 
 
 def bodies(generator, num_object=60, num_table=90):
-    """Give points of a unit box that stands on z = 0, and of the table round it."""
+    """Return points of a unit box on z = 0, and of the table around it."""
     own = torch.rand(num_object, 3, generator=generator, dtype=torch.float64)
     own = own - own.new_tensor([0.5, 0.5, 0.0])
     own[0], own[1] = own.new_tensor([-0.5, -0.5, 0.0]), own.new_tensor([0.5, 0.5, 1.0])
@@ -28,7 +28,7 @@ def bodies(generator, num_object=60, num_table=90):
 
 
 def photographed(sessions, generator, **counts):
-    """Give pixels of all points in every view: the object's first, turned over in series 1."""
+    """Return pixels of all points in all views, object first; it is turned over in session 1."""
     own, table = bodies(generator, **counts)
     over = transform(upside_down(own), own)
     cameras = poses(len(sessions) // 2).repeat(2, 1, 1) if 1 in sessions else poses(len(sessions))

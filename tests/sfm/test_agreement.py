@@ -1,4 +1,4 @@
-"""Views that the pairs with most matches contradict."""
+"""Views that are inconsistent with the pairs that have most matches."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from tests.sfm import ball
 
 
 def bent(model):
-    """Give the model's cameras a lens that bends."""
+    """Give the cameras of a model lens distortion."""
     lens = model.lenses[0].replace(params=(*model.lenses[0].params[:3], 0.3))
     return model.replace(lenses=(lens,) * model.num_views)
 
@@ -36,7 +36,7 @@ def scene(generator):
 
 
 def rotated(model, view, angle=0.6):
-    """Put a view elsewhere on the arc: it looks at the ball as before."""
+    """Move a view along the arc, still aimed at the ball."""
     rotation = torch.zeros(3, 3, dtype=torch.float64)
     rotation[0, 2], rotation[2, 0] = angle, -angle
     moved = rigid(torch.linalg.matrix_exp(rotation)[None], torch.zeros(1, 3).double())[0]
@@ -45,7 +45,7 @@ def rotated(model, view, angle=0.6):
     return model.replace(cam_from_world=poses)
 
 
-def test_a_view_put_elsewhere_is_told_from_its_neighbours(generator):
+def test_a_misplaced_view_is_identified(generator):
     model, points = scene(generator)
     pairs = pairs_of(model, points)
     found = verify_model(rotated(model, 3), model.names, pairs, 4.0).misplaced
@@ -54,11 +54,11 @@ def test_a_view_put_elsewhere_is_told_from_its_neighbours(generator):
     assert min(judges) <= found["3.png"] <= max(judges) < 0.5
 
 
-def test_matches_are_explained_by_fraction_those_of_missing_photographs_not_at_all(generator):
+def test_the_inlier_ratio_counts_matches_of_missing_photographs_as_outliers(generator):
     model, points = scene(generator)
     pairs = pairs_of(model, points)
     counts = torch.tensor([pair.num_matches for pair in pairs]).double()
-    right = verify_model(model, model.names, pairs, 0.01)  # through a lens that bends
+    right = verify_model(model, model.names, pairs, 0.01)  # with lens distortion
     assert right.inlier_ratio == 1
     assert right.misplaced == {}
     wrong = rotated(model, 3)
@@ -72,7 +72,7 @@ def test_matches_are_explained_by_fraction_those_of_missing_photographs_not_at_a
     assert verify_model(model, model.names, [], 4.0).inlier_ratio == 0
 
 
-def test_pairs_with_few_matches_do_not_judge(generator):
+def test_pairs_with_few_matches_do_not_count(generator):
     model, points = scene(generator)
     pairs = [
         pair.replace(first=pair.first.flip(0)) if pair.views in ((0, 4), (0, 5)) else pair
@@ -82,7 +82,7 @@ def test_pairs_with_few_matches_do_not_judge(generator):
     assert verify_model(model, model.names, pairs, 4.0).misplaced == {}
 
 
-def test_photographs_that_the_model_lacks_do_not_judge(generator):
+def test_photographs_missing_from_the_model_do_not_count(generator):
     model, points = scene(generator)
     files = ("x.png", *model.names)
     pairs = [

@@ -1,4 +1,4 @@
-"""A cloud that came with cameras, on a ball whose surface is known."""
+"""A cloud given with cameras, on a known ball."""
 
 import pytest
 import torch
@@ -29,7 +29,7 @@ def bare(generator) -> SparseModel:
     return model_of(cameras_on_an_arc(), torch.zeros(0, 3).double(), generator, 0.0)
 
 
-def test_points_of_a_ball_are_in_sight_on_the_side_of_the_viewer():
+def test_points_of_a_ball_are_visible_on_the_side_of_the_viewer():
     points, center = sphere(2000), torch.tensor([1.0, -2.0, 4.5], dtype=torch.float64)
     facing = points @ center  # more than 1 where the tangent plane is in front of the viewer
     seen = visible_from(points, center)
@@ -37,7 +37,7 @@ def test_points_of_a_ball_are_in_sight_on_the_side_of_the_viewer():
     assert not bool(seen[facing < 0.5].any())  # behind the rim by a spacing of the points
 
 
-def test_points_on_one_plane_are_all_in_sight():
+def test_points_on_a_plane_are_all_visible():
     plane = torch.cartesian_prod(*[torch.linspace(-1, 1, 9).double()] * 2)
     points = torch.cat([plane, torch.zeros(81, 1).double()], dim=1)
     assert bool(visible_from(points, torch.tensor([0.3, 0.2, 5.0]).double()).all())
@@ -49,7 +49,7 @@ def test_of_points_at_one_place_some_are_in_sight(count):
     assert bool(seen.any())
 
 
-def test_of_a_cloud_that_is_found_nowhere_nothing_is_kept(views, bare):
+def test_a_cloud_without_photographic_support_is_dropped(views, bare):
     dark = views.replace(images=0.01 * torch.ones_like(views.images))
     with pytest.warns(PimperWarning, match="0 could be triangulated"):
         found = triangulate(
@@ -59,7 +59,7 @@ def test_of_a_cloud_that_is_found_nowhere_nothing_is_kept(views, bare):
     assert torch.equal(found.cam_from_world, bare.cam_from_world)
 
 
-def test_points_are_found_where_the_photographs_show_them(views, bare):
+def test_points_are_observed_where_the_photographs_show_them(views, bare):
     found = cloud_tracks(views, bare.replace(points_world=sphere(1500)))
     assert torch.equal(found.cam_from_world, bare.cam_from_world)
     assert len(found.points_world) > 150
@@ -72,13 +72,13 @@ def test_points_are_found_where_the_photographs_show_them(views, bare):
 @pytest.mark.parametrize(
     "wrong", [lambda points: 1.1 * points, lambda points: points + torch.tensor([0.0, 0, -0.2])]
 )
-def test_points_of_another_frame_are_hardly_found(views, bare, wrong):
+def test_points_in_a_different_frame_are_hardly_observed(views, bare, wrong):
     right = cloud_tracks(views, bare.replace(points_world=sphere(1500)))
     found = cloud_tracks(views, bare.replace(points_world=wrong(sphere(1500))))
     assert len(found.points_world) < 0.05 * len(right.points_world)
 
 
-def test_cameras_with_a_cloud_get_more_points_which_lie_on_the_surface(views, bare):
+def test_cameras_with_a_cloud_get_more_points_on_the_surface(views, bare):
     settings = ReconstructConfig(threads=1)
     with pytest.warns(PimperWarning, match=r"were triangulated from the photographs"):
         without = triangulate(views, bare, settings, "The file")

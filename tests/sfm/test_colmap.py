@@ -1,4 +1,4 @@
-"""COLMAP's library beside others: Pillow, whose zlib it has, too, and signals."""
+"""COLMAP's library with others: Pillow, which shares its zlib, and signals."""
 
 import subprocess
 import sys
@@ -36,7 +36,7 @@ def run(script):
     )
 
 
-def test_once_colmap_is_loaded_a_png_is_written_and_a_polite_kill_still_cleans_up(tmp_path):
+def test_with_colmap_loaded_png_is_written_and_sigterm_cleans_up(tmp_path):
     ran = run(SCRIPT.format(path=str(tmp_path / "a.png")))
     assert (ran.stdout, ran.stderr) == ("written\ncleaned up\n", "")
 

@@ -1,4 +1,4 @@
-"""Given cameras beside photographs that were resized, turned by EXIF, or cropped."""
+"""Given cameras of photographs that were resized, turned by EXIF, or cropped."""
 
 import warnings
 
@@ -21,7 +21,7 @@ EXIF = {quarters: tag for tag, quarters in QUARTERS.items()}
 
 @pytest.fixture(scope="module")
 def stored() -> Views:
-    """Photographs as their files store them."""
+    """Return photographs as stored in files."""
     return ball.photographs(ball.cameras_on_an_arc())
 
 
@@ -38,12 +38,12 @@ def written(model, folder):
 
 @pytest.fixture(scope="module")
 def sparse(tmp_path_factory):
-    """A model of the pixels that files store."""
+    """A model of the stored pixels."""
     return written(ball_model(), tmp_path_factory.mktemp("sparse"))
 
 
 def turned(views: Views, quarters: list[int]) -> Views:
-    """Turn photographs clockwise, as reading them does where EXIF says so."""
+    """Turn photographs clockwise, as they are read under EXIF orientation."""
     side = max(views.images.shape[-2:])
     images = views.images.new_zeros(*views.images.shape[:2], side, side)
     sizes = views.sizes_px.clone()
@@ -57,7 +57,7 @@ def turned(views: Views, quarters: list[int]) -> Views:
 
 
 def back(model, quarters):
-    """Turn poses back by hand: the picture's right becomes what was its down, and so on."""
+    """Turn poses back explicitly: image right becomes the former image down."""
     poses = model.cam_from_world.clone()
     for view, turns in enumerate(quarters):
         angle = torch.tensor(-turns * torch.pi / 2, dtype=torch.float64)
@@ -67,9 +67,9 @@ def back(model, quarters):
     return poses
 
 
-# A quarter turn, which shapes show, decides for the half turn beside it.
+# A quarter turn, evident from the shape, decides for half turns of the same set.
 @pytest.mark.parametrize("quarters", [[1] * 6, [3] * 6, [0, 1, 3, 2, 1, 0]])
-def test_a_model_of_stored_pixels_gives_the_same_cameras(stored, sparse, quarters):
+def test_a_model_of_stored_pixels_gives_the_cameras_of_turned_ones(stored, sparse, quarters):
     plain = existing_model(stored, sparse)
     views = turned(stored, quarters)
     with pytest.warns(PimperWarning, match="before EXIF turns them"):
@@ -78,7 +78,7 @@ def test_a_model_of_stored_pixels_gives_the_same_cameras(stored, sparse, quarter
     assert torch.equal(found.points_world, plain.points_world)
     cameras = {(turns, lens.camera) for turns, lens in zip(quarters, found.lenses, strict=True)}
     assert len(cameras) == len(set(quarters))  # one camera for each turn
-    # Lenses, pixels and poses belong together, and to the pictures.
+    # Camera models, pixels and poses are consistent with each other and the images.
     scene, plain_scene = assemble_scene(views, found), assemble_scene(stored, plain)
     assert_close(
         scene.reprojection_errors_px, plain_scene.reprojection_errors_px, rtol=0, atol=1e-9
@@ -89,7 +89,7 @@ def test_a_model_of_stored_pixels_gives_the_same_cameras(stored, sparse, quarter
         assert torch.equal(picture, plain_scene.views.images[view])
 
 
-def test_photographs_turned_and_made_smaller_have_the_lens_of_that(stored, sparse):
+def test_turned_and_reduced_photographs_have_transformed_camera_models(stored, sparse):
     images = torch.nn.functional.avg_pool2d(stored.images, 2)
     small = stored.replace(images=images, sizes_px=stored.sizes_px // 2)
     with pytest.warns(PimperWarning, match="before EXIF turns them"):
@@ -100,20 +100,20 @@ def test_photographs_turned_and_made_smaller_have_the_lens_of_that(stored, spars
     assert {lens.camera for lens in found.lenses} == {1}
 
 
-def test_a_model_of_photographs_as_exif_turns_them_is_taken_as_it_is(stored, sparse):
+def test_a_model_of_exif_turned_photographs_is_unchanged(stored, sparse):
     plain = existing_model(stored, sparse)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = existing_model(stored.replace(orientations=torch.tensor([3, 6] * 3)), sparse)
     assert torch.equal(found.cam_from_world, plain.cam_from_world)
-    # Half turns alone are taken as made before, and a person is asked.
+    # Half turns alone are treated as already applied, and the user is asked.
     with pytest.warns(PimperWarning, match=r"The COLMAP model in .*shapes do not show .*exiftool"):
         found = existing_model(turned(stored, [0, 2] * 3), sparse)
     assert torch.equal(found.cam_from_world, plain.cam_from_world)
 
 
 def without_columns(views, count=80):
-    """Crop photographs at their left."""
+    """Crop photographs on the left."""
     sizes = views.sizes_px - torch.tensor([count, 0])
     return views.replace(images=views.images[..., count:].contiguous(), sizes_px=sizes)
 
@@ -126,19 +126,19 @@ def on_its_side(views, tag=None):
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        (without_columns, r"6 of 6 photographs: 0\.png is 400x360, its camera's image 480x360"),
-        (on_its_side, r"0\.png is 360x480, its camera's image 480x360"),
-        (lambda views: on_its_side(views, tag=5), "0.png is 360x480"),  # which mirrors, too
+        (without_columns, r"6 of 6 photographs: 0\.png is 400x360, its camera's picture 480x360"),
+        (on_its_side, r"0\.png is 360x480, its camera's picture 480x360"),
+        (lambda views: on_its_side(views, tag=5), "0.png is 360x480"),  # which too mirrors
     ],
     ids=["cropped", "turned", "mirrored"],
 )
 def test_photographs_of_another_shape_are_refused(stored, sparse, change, found):
-    needed = r"Needed: the photographs that it was made of.*neither cropped nor turned.*omit the"
+    needed = r"Needed: the photographs that it was made of.*neither cropped nor turned.*leave the"
     with pytest.raises(InputError, match=f"The COLMAP model in .*{found}.*{needed}"):
         existing_model(change(stored), sparse)
 
 
-def test_of_a_model_of_two_cameras_the_photographs_folder_takes_its_own(stored, tmp_path):
+def test_a_folder_of_photographs_uses_its_camera_of_a_model_with_two(stored, tmp_path):
     own = ball_model(50)
     both = own.replace(
         names=tuple(f"{folder}/{name}" for folder in ("cam2", "cam1") for name in own.names),
@@ -150,6 +150,6 @@ def test_of_a_model_of_two_cameras_the_photographs_folder_takes_its_own(stored, 
     )
     written(both, tmp_path)
     found = existing_model(stored.replace(folder="/data/cam1"), tmp_path)
-    assert_close(found.cam_from_world, own.cam_from_world, rtol=0, atol=1e-12)  # by quaternions
+    assert_close(found.cam_from_world, own.cam_from_world, rtol=0, atol=1e-12)  # via quaternions
     with pytest.raises(InputError, match=r"0\.png may be any of cam2/0\.png, cam1/0\.png"):
         existing_model(stored.replace(folder="/data/photos"), tmp_path)

@@ -1,4 +1,4 @@
-"""Guided matching of features in closed form, and of two photographs."""
+"""Guided matching of synthetic features and of two photographs."""
 
 from importlib.resources import files
 
@@ -46,7 +46,7 @@ RIVALS = features([[30.0, 11.0], [40.0, 9.0]], [10.0, 12.0])
 @pytest.mark.parametrize(
     ("first", "second", "ratio", "found"),
     [
-        # A twin off the line is no rival, and one on it is: 0 against 2 degrees is clear.
+        # A similar feature off the line is no rival; on the line, 0 against 2 degrees is distinct.
         (
             features(TWO, [0.0, 90.0]),
             features([[30.0, 11], [40, 30], [30, 60], [40, 61.5]], [10.0, 0, 90, 92]),
@@ -55,13 +55,13 @@ RIVALS = features([[30.0, 11.0], [40.0, 9.0]], [10.0, 12.0])
         ),
         (features(TWO, [0.0, 90.0]), RIVALS, 0.8, []),
         (features(TWO, [0.0, 90.0]), RIVALS, 0.9, [[0, 0]]),
-        # Each other's best.
+        # Mutual best.
         (features([[5.0, 10], [9, 10.5]], [0.0, 10]), features([[30.0, 10]], [2.0]), 0.8, [[0, 0]]),
-        (features(ONE, [0.0]), features([[30.0, 10.0]], [45.0]), 0.8, []),  # unlike, without rivals
+        (features(ONE, [0.0]), features([[30.0, 10.0]], [45.0]), 0.8, []),  # unlike, no rivals
         (features([[5.0, 200.0]], [0.0]), features(TWO, [10.0, 0.0]), 0.8, []),  # none near
     ],
 )
-def test_matches_are_clearly_each_others_best_along_the_line(first, second, ratio, found):
+def test_matches_are_mutual_best_and_distinct_along_the_line(first, second, ratio, found):
     assert guided_matches(first, second, BESIDE, ratio).tolist() == found
 
 
@@ -100,14 +100,14 @@ def test_the_two_largest_products_within_the_distance_are_found(generator, lengt
     for alike, table in zip(found, (products, products.mT), strict=True):
         largest, best = table.topk(2, dim=1)
         best = torch.where(largest[:, 0] >= 0, best[:, 0], -1)
-        assert (best >= 0).sum() > 0.8 * len(best)  # most have some that are near
+        assert (best >= 0).sum() > 0.8 * len(best)  # most have candidates nearby
         assert (largest[:, 1] >= 0).sum() > 0.5 * len(best)
         assert torch.equal(alike[1], best)
-        # Float32 sums of up to 128 products, of size one in all, in another order.
+        # Float32 sums of up to 128 products, of total size one, in a different order.
         torch.testing.assert_close(alike[0], largest, rtol=0, atol=length * 6e-8)
 
 
-def test_guided_matches_are_more_and_near_the_pair_s_epipolar_lines():
+def test_guided_matching_adds_matches_near_epipolar_lines():
     views = load_views(str(files("pimper_torch").joinpath("data/skull")), max_size_px=400)
     views = views.take([views.names.index(name) for name in ("35.jpg", "36.jpg")])
     with workspace(views, 1) as space:

@@ -10,7 +10,7 @@ SETTINGS = ReconstructConfig(threads=1)
 
 
 def stored(scene, path):
-    """Put features, matches and verified pairs in a database, images in reversed order."""
+    """Write features, matches and verified pairs to a database, images in reversed order."""
     pycolmap = loaded()
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.max_error, options.ransac.random_seed = 2.0, 0
@@ -38,7 +38,7 @@ def stored(scene, path):
 
 
 def read(path, scene):
-    """Give matches and verified matches of each pair."""
+    """Return matches and verified matches of each pair."""
     with loaded().Database.open(path) as database:
         return [
             (
@@ -55,8 +55,8 @@ def read(path, scene):
         ]
 
 
-def test_pairs_that_were_verified_on_the_room_are_verified_on_what_turns(tmp_path, generator):
-    # So many features at rest that every pair is first verified on them.
+def test_pairs_verified_on_the_background_are_verified_on_the_object(tmp_path, generator):
+    # Enough static features that every pair is first verified on them.
     scene = turntable(generator, turning=250, resting=300, count=5, span_deg=100.0)
     path = stored(scene, tmp_path / "database.db")
     on_room = 0

@@ -30,11 +30,11 @@ QUICK = ReconstructConfig(
         ([(9, 6)] * 4, [10.0, 10.19, 10.21, 10.3], [0, 0, 1, 1]),
     ],
 )
-def test_photographs_of_one_size_and_focal_length_are_of_one_lens(sizes, focals, groups):
+def test_photographs_of_one_size_and_focal_length_share_a_camera_model(sizes, focals, groups):
     assert group_lenses(sizes, focals) == groups
 
 
-def test_one_lens_and_one_each_are_what_was_asked_for():
+def test_one_shared_and_one_camera_model_each_follow_the_settings():
     views = views_of(torch.rand(3, 3, 6, 9), focals_px=torch.tensor([10.0, 15.0, NAN]))
     assert choose_lenses(views) == [0, 1, 2]
     assert choose_lenses(views, shared=True) == [0, 0, 0]
@@ -44,7 +44,7 @@ def test_one_lens_and_one_each_are_what_was_asked_for():
 
 
 @pytest.mark.slow
-def test_every_other_photograph_zoomed_as_exif_says_is_of_a_lens_of_its_own():
+def test_photographs_zoomed_according_to_exif_have_separate_camera_models():
     cameras, focals = cameras_on_an_arc(10), torch.tensor([840.0, 1176.0] * 5).double()
     K = cameras.intrinsics.clone()
     K[:, 0, 0] = K[:, 1, 1] = focals
@@ -54,4 +54,4 @@ def test_every_other_photograph_zoomed_as_exif_says_is_of_a_lens_of_its_own():
     assert len({lens.camera for lens in model.lenses}) == 2
     found = torch.tensor([lens.params[0] for lens in model.lenses])
     assert_close(found[1::2] / found[::2], torch.full((5,), 1.4), rtol=0.01, atol=0)
-    assert_close(found, focals.to(found), rtol=0.05, atol=0)  # an arc tells it from distance badly
+    assert_close(found, focals.to(found), rtol=0.05, atol=0)  # on an arc, weakly determined

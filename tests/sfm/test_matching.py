@@ -1,7 +1,7 @@
 from pimper_torch.method.sfm.matching import all_pairs, strongest, tiles
 
 
-def test_tiles_hold_every_pair_once_and_few_photographs_each():
+def test_tiles_contain_every_pair_once_and_few_photographs_each():
     pairs = all_pairs(60)
     groups = list(tiles(pairs))
     assert sorted(pair for some in groups for pair in some) == sorted(pairs)
@@ -9,7 +9,7 @@ def test_tiles_hold_every_pair_once_and_few_photographs_each():
     assert max(len({view for pair in some for view in pair}) for some in groups) <= 32
 
 
-def test_tiles_of_few_pairs_are_as_full_as_those_of_all():
+def test_tiles_of_sparse_pairs_are_well_filled():
     pairs = [pair for pair in all_pairs(300) if pair[1] - pair[0] <= 10]
     groups = list(tiles(pairs))
     assert sorted(pair for some in groups for pair in some) == pairs

@@ -3,7 +3,7 @@ import torch
 from pimper_torch.method.sfm.model import drop_weak_views, longest_tracks, select_views
 
 
-def test_a_point_that_only_one_kept_view_sees_goes(model):
+def test_a_point_seen_by_only_one_kept_view_is_removed(model):
     kept = select_views(model, [3, 1])
     assert kept.names == ("d.jpg", "a.jpg")
     seen = torch.zeros(40, 5, dtype=torch.bool)
@@ -12,7 +12,7 @@ def test_a_point_that_only_one_kept_view_sees_goes(model):
     assert 0 < both.sum() < 40
     assert torch.equal(kept.points_world, model.points_world[both])
     assert len(kept.observation_point) == 2 * both.sum()
-    # Each observation is still the one of its view and point.
+    # Observations still belong to their views and points.
     for point, view, pixel in zip(
         kept.observation_point, kept.observation_view, kept.observation_pixels, strict=True
     ):
@@ -28,9 +28,9 @@ def test_maps_to_a_static_background_follow_their_views(model):
     assert len(select_views(model, [3, 1]).background_from_view) == 0
 
 
-def test_a_view_that_loses_its_points_with_a_weak_one_goes_too(model):
-    # View 2 sees 20 points with the others; view 3 sees 12 of which 8 only with view 4, and
-    # view 4 sees those 8: once 4 has gone, 3 keeps 4.
+def test_a_view_that_loses_its_points_with_a_weak_view_is_removed(model):
+    # View 2 shares 20 points with the others; view 3 has 12 points, 8 of them shared only with
+    # view 4, which sees just these 8. After the removal of view 4, view 3 keeps 4 points.
     pairs = [(p, v) for p in range(20) for v in (0, 1, 2)]
     pairs += [(p, 3) for p in range(4)] + [(p, v) for p in range(20, 28) for v in (3, 4)]
     point, view = torch.tensor(pairs).T

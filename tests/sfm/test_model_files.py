@@ -1,4 +1,4 @@
-"""COLMAP's files: as COLMAP reads them, and what is broken in them."""
+"""COLMAP's files: agreement with COLMAP, and damaged files."""
 
 import math
 import struct
@@ -19,7 +19,7 @@ COLORS = torch.zeros(POINTS, 3, dtype=torch.uint8)
 
 
 def four_views():
-    """Four views of twenty points, each of which three views see."""
+    """Return four views of twenty points, each seen by three views."""
     generator = torch.Generator().manual_seed(4)
     cameras = arc_cameras(VIEWS, width=64, height=48, focal_px=80.0, distance=5.0)
     points = torch.randn(POINTS, 3, generator=generator, dtype=torch.float64)
@@ -46,7 +46,7 @@ def change(path, layout, at, *values):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_files_are_read_as_colmap_reads_them(model, tmp_path, text):
+def test_files_are_read_as_by_colmap(model, tmp_path, text):
     if text:
         model = model.replace(names=("a.png", *model.names[1:]))
     own = reconstruction_of(model, COLORS)
@@ -72,7 +72,7 @@ def test_a_name_with_spaces_and_line_ends_of_unicode_is_read_from_text(model, tm
     assert len(read.observation_point) == len(model.observation_point)
 
 
-def test_lines_that_end_as_windows_ends_them_are_read(model, tmp_path):
+def test_windows_line_ends_are_read(model, tmp_path):
     reconstruction_of(model, COLORS).write_text(str(tmp_path))
     for path in tmp_path.glob("*.txt"):
         path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
@@ -98,14 +98,14 @@ SHORT = b"\xff" * 4096, struct.pack("<Q", 2**40), b"", b"\1"
         lambda folder: as_text(folder, "points3D", "x"),
     ],
 )
-def test_files_that_are_cut_short_or_none_of_colmaps_are_refused(folder, damage):
+def test_truncated_or_foreign_files_are_rejected(folder, damage):
     damage(folder)
     with pytest.raises(InputError, match="cannot be read: truncated or malformed"):
         read_model(folder)
 
 
 def as_text(folder, part, line):
-    """Put a line before those of a file of text, in the place of the binary ones."""
+    """Replace binary files by text, with a line prepended to one of them."""
     for path in folder.iterdir():
         path.unlink()
     reconstruction_of(four_views(), COLORS).write_text(str(folder))
@@ -113,7 +113,7 @@ def as_text(folder, part, line):
     path.write_text(f"{line}\n{path.read_text()}")
 
 
-def test_an_image_that_is_there_twice_is_refused(model, tmp_path):
+def test_a_duplicate_image_is_rejected(model, tmp_path):
     twice = model.replace(names=("a.png", "b.png", "a.png", "c.png"))
     reconstruction_of(twice, COLORS).write_text(str(tmp_path))
     with pytest.raises(InputError, match=r"is broken: a\.png appears twice"):
@@ -126,20 +126,20 @@ def test_an_image_that_is_there_twice_is_refused(model, tmp_path):
         ("images", "<4d", 4, [0.0] * 4),
         ("images", "<4d", 4, [NAN] * 4),
         ("images", "<d", 4 + 32, [NAN]),
-        ("images", "<I", 60, [99]),  # a camera that is not there
+        ("images", "<I", 60, [99]),  # a missing camera
         ("cameras", "<d", 24, [NAN]),
         ("cameras", "<d", 24, [0.0]),
         ("cameras", "<d", 32, [-1.0]),
-        ("cameras", "<Q", 8, [0]),  # a picture without width
+        ("cameras", "<Q", 8, [0]),  # an image without width
     ],
 )
-def test_an_image_without_a_sound_pose_or_camera_is_refused(folder, name, layout, at, values):
+def test_an_image_without_a_valid_pose_or_camera_is_rejected(folder, name, layout, at, values):
     change(folder / f"{name}.bin", layout, 8 + at, *values)
     with pytest.raises(InputError, match=r"is broken: a b\.png has no valid pose or camera"):
         read_model(folder)
 
 
-def test_points_and_observations_of_nothing_are_left_out_and_counted(folder, model):
+def test_dangling_points_and_observations_are_dropped_and_counted(folder, model):
     size = 43 + 8 + 3 * 8
     for index in range(0, POINTS, 2):
         change(folder / "points3D.bin", "<d", 8 + size * index + 8, NAN)

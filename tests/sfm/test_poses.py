@@ -1,4 +1,4 @@
-"""Several photographs of one pose: one picture for structure from motion, one camera for all."""
+"""Several photographs of one pose: one image for structure from motion, one camera for all."""
 
 import pytest
 import torch
@@ -43,7 +43,7 @@ def test_structure_from_motion_gets_the_mean_radiance_of_a_pose(views):
     assert mean_images(plain) is plain
 
 
-def test_photographs_of_unlike_sizes_are_not_one_pose(views):
+def test_photographs_of_different_sizes_do_not_share_a_pose(views):
     sizes = views.sizes_px.clone()
     sizes[4, 0] = 10
     with pytest.raises(
@@ -52,7 +52,7 @@ def test_photographs_of_unlike_sizes_are_not_one_pose(views):
         mean_images(views.replace(sizes_px=sizes))
 
 
-def test_cameras_and_observations_of_a_picture_are_those_of_all_photographs_of_its_pose(views):
+def test_photographs_of_a_pose_share_its_camera_and_observations(views):
     lens = CameraModel(camera=1, model="PINHOLE", params=(90.0, 90.0, 6.0, 4.0), width=12, height=8)
     model = SparseModel(
         names=("d", "a"),  # pose 1 is not registered
@@ -75,7 +75,7 @@ def test_cameras_and_observations_of_a_picture_are_those_of_all_photographs_of_i
     assert expand_to_photographs(model, views.replace(poses=None)) is model
 
 
-def test_equal_cameras_are_one_pose_and_neighbours_are_not():
+def test_equal_cameras_share_a_pose_and_neighbours_do_not():
     cameras = arc_cameras(40, width=60, height=40, focal_px=90.0, distance=3.0, span_deg=60.0)
     assert equal_poses(cameras).tolist() == list(range(40))
     order = torch.tensor([0, 7, 0, 7, 7, 39])
@@ -86,11 +86,11 @@ def test_equal_cameras_are_one_pose_and_neighbours_are_not():
     assert equal_poses(again.replace(cam_from_world=poses)).tolist() == [0, 1, 0, 1, 1, 5]
 
 
-def test_one_photograph_stands_for_its_pose_with_what_all_of_it_observe(reconstruction):
+def test_one_photograph_of_a_pose_has_the_observations_of_all(reconstruction):
     scene = reconstruction.scene
     copies = torch.tensor([0, 1, 2, 1])
     views = scene.views.take(copies).replace(names=("a.png", "b.png", "c.png", "d.png"))
-    fourth = scene.observation_view == 1  # the second's points, now seen by its twin alone
+    fourth = scene.observation_view == 1  # points of the second, now seen only by its duplicate
     views = views.replace(images=views.images * torch.tensor([1, 0.1, 1, 1])[:, None, None, None])
     four = scene.replace(
         views=views,
@@ -115,7 +115,7 @@ def test_one_photograph_stands_for_its_pose_with_what_all_of_it_observe(reconstr
     assert one_view_per_pose(scene).scene is scene
 
 
-def test_silhouettes_of_any_photograph_of_a_pose_are_those_of_the_one_that_is_kept(reconstruction):
+def test_the_kept_photograph_of_a_pose_has_the_silhouette_of_any(reconstruction):
     scene = reconstruction.scene
     copies = torch.tensor([0, 1, 2, 1, 1])
     names = ("a.png", "b.png", "c.png", "d.png", "e.png")

@@ -13,7 +13,7 @@ COUNTS = dict(camera_models().values())
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 @pytest.mark.parametrize("model", sorted(COUNTS.keys() - {"EQUIRECTANGULAR"}))
-def test_a_turned_camera_images_as_the_picture_is_turned(model, quarters, generator):
+def test_a_turned_camera_projects_to_the_turned_image(model, quarters, generator):
     count = COUNTS[model]
     one_focal = model.startswith(("SIMPLE_", "RADIAL"))
     start = (90.0, 41.0, 29.0) if one_focal else (90.0, 97.0, 41.0, 29.0)
@@ -30,11 +30,11 @@ def test_a_turned_camera_images_as_the_picture_is_turned(model, quarters, genera
     assert before.isfinite().all()
 
 
-def test_a_picture_turned_by_torch_has_its_pixels_where_they_are_said_to_be(generator):
+def test_pixels_of_an_image_turned_by_torch_are_mapped_correctly(generator):
     picture = torch.rand(6, 8, generator=generator)
     centers = torch.cartesian_prod(torch.arange(6.0), torch.arange(8.0)).flip(1) + 0.5
     for quarters in range(-1, 5):
         moved = turned_pixels(centers, 8, 6, quarters)
         column, row = (moved - 0.5).long().unbind(dim=1)
-        turned = torch.rot90(picture, -quarters)  # against the clock
+        turned = torch.rot90(picture, -quarters)  # counterclockwise
         assert torch.equal(turned[row, column], picture.reshape(-1))

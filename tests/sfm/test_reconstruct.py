@@ -36,18 +36,18 @@ def named(*names):
         (named("b.jpg", "a.jpg", "x", "y", "z"), "2 of 5 photographs .*at least 3 are needed"),
     ],
 )
-def test_a_model_of_other_photographs_is_refused(scene, views, tmp_path, change, sentence):
+def test_a_model_of_other_photographs_is_rejected(scene, views, tmp_path, change, sentence):
     write_model(scene, tmp_path)
     with pytest.raises((InputError, ReconstructionError), match=sentence):
         Reconstruct()(change(views), tmp_path)
 
 
-def test_a_folder_without_a_model_is_refused(views, tmp_path):
+def test_a_folder_without_a_model_is_rejected(views, tmp_path):
     with pytest.raises(InputError, match="no COLMAP model"):
         Reconstruct()(views, tmp_path)
 
 
-def test_photographs_that_the_model_lacks_are_left_out_with_a_warning(scene, views, tmp_path):
+def test_photographs_missing_from_the_model_are_excluded_with_a_warning(scene, views, tmp_path):
     write_model(scene, tmp_path)
     more = views.take([4, 0, 1, 2, 3]).replace(
         names=("ü.tif", "b.jpg", "new.jpg", "c 1.png", "d.jpg")
@@ -62,7 +62,7 @@ def test_photographs_that_the_model_lacks_are_left_out_with_a_warning(scene, vie
         rtol=0,
         atol=1e-12,  # through quaternions
     )
-    # Every observation is still where the original scene has it, under the new numbers.
+    # Every observation keeps its pixel under the new indices.
     for index, old in enumerate([4, 0, 2, 3]):
         mine = placed.observation_view == index
         theirs = scene.observation_view == old
@@ -76,7 +76,7 @@ def test_photographs_that_the_model_lacks_are_left_out_with_a_warning(scene, vie
         )
 
 
-def test_one_image_a_folder_places_every_photograph_of_the_pose(scene, views, tmp_path):
+def test_one_registered_image_gives_the_pose_of_its_folder(scene, views, tmp_path):
     write_model(scene, tmp_path)
     twice = [0, 0, 1, 1, 2, 2, 3, 3, 4, 4]
     names = [
@@ -102,7 +102,7 @@ def test_a_models_subfolders_do_not_matter(scene, views, tmp_path):
     assert Reconstruct()(views, str(tmp_path)).views.names == views.names
 
 
-def test_a_model_of_larger_photographs_is_scaled_to_these(scene, views, tmp_path):
+def test_a_model_of_larger_photographs_is_scaled_down(scene, views, tmp_path):
     write_model(scene, tmp_path)
     small = views.replace(
         images=views.images[..., ::2, ::2].contiguous(), sizes_px=views.sizes_px // 2
@@ -142,7 +142,7 @@ SIZES = [(40, 30)] * 3 + [(60, 45)]
             blank(SIZES),
             r"2 sizes \(40x30: 0.png, 1.png, 2.png; 60x45: 3.png\).*`--reconstruct.shared-camera`",
         ),
-        ({}, blank(SIZES), "No features"),  # with a camera for each size it goes on
+        ({}, blank(SIZES), "No features"),  # with a camera for each size
         ({}, blank([(40, 30)] * 3), r"No features.*3 of 3.*0\.png, 1\.png, 2\.png"),
         ({}, blank([(40, 30)] * 2), "at least 3 are needed, and 10 to 50 are usual"),
         (
@@ -155,7 +155,7 @@ SIZES = [(40, 30)] * 3 + [(60, 45)]
         ({}, blank([(64, 15)] * 3), "have sides of fewer than 16 pixels"),
     ],
 )
-def test_photographs_that_cannot_be_placed_are_refused(settings, views, sentence):
+def test_photographs_that_cannot_be_registered_are_rejected(settings, views, sentence):
     with pytest.raises((InputError, ReconstructionError), match=sentence):
         Reconstruct(ReconstructConfig(**settings))(views)
 
@@ -167,16 +167,16 @@ def test_photographs_that_cannot_be_placed_are_refused(settings, views, sentence
         ({"camera_model": "SIMPLE_RADAL"}, "camera_model"),
     ],
 )
-def test_settings_that_contradict_or_name_nothing_are_refused(settings, field):
+def test_contradictory_or_unknown_settings_are_rejected(settings, field):
     with pytest.raises(ConfigError, match=field):
         ReconstructConfig(**settings)
 
 
-def test_photographs_are_written_as_srgb_without_padding_and_masks_beside():
+def test_photographs_are_written_as_srgb_without_padding_with_masks():
     views = blank([(4, 3), (2, 3)])
     images = views.images.clone()
     images[0] = 0.21586  # sRGB 128/255
-    images[1, :, :, 2:] = 1.0  # what lies in the padding must not be written
+    images[1, :, :, 2:] = 1.0  # padding must not be written
     masks = torch.zeros(2, 3, 4, dtype=torch.bool)
     masks[:, :, 0] = True
     with workspace(views.replace(images=images, masks=masks), threads=2) as space:
@@ -191,26 +191,26 @@ def test_photographs_are_written_as_srgb_without_padding_and_masks_beside():
 
 
 @pytest.mark.slow
-def test_eight_photographs_of_the_skull_register_and_their_points_reproject():
+def test_eight_photographs_of_the_skull_are_registered():
     from pimper_torch.doors.io.photographs import load_views
 
     views = load_views(str(files("pimper_torch").joinpath("data/skull")))
     chosen = [views.names.index(f"{number}.jpg") for number in (35, 36, 37, 38, 53, 54, 55, 56)]
-    told: list[tuple[int, int]] = []
-    with listening(lambda done, total: told.append((done, total))):
+    progress: list[tuple[int, int]] = []
+    with listening(lambda done, total: progress.append((done, total))):
         scene = Reconstruct(ReconstructConfig(threads=2))(views.take(chosen))
-    # Two photographs a thread: two steps of extraction, then one tile of pairs; the guided pairs
-    # one by one; then the mapper, from its third view. Nothing at rest is looked for.
-    guided = told[3][1]
+    # Two photographs per thread: two steps of extraction, then one tile of pairs; the guided
+    # pairs one by one; then the mapper, from its third view. No background search.
+    guided = progress[3][1]
     assert 8 < guided <= 8 * 7 // 2
-    assert told[:3] == [(1, 2), (2, 2), (1, 1)]
-    assert told[3 : 3 + guided] == [(done, guided) for done in range(1, guided + 1)]
-    assert told[3 + guided] == (3, 8)
-    assert all(done <= total for done, total in told)
+    assert progress[:3] == [(1, 2), (2, 2), (1, 1)]
+    assert progress[3 : 3 + guided] == [(done, guided) for done in range(1, guided + 1)]
+    assert progress[3 + guided] == (3, 8)
+    assert all(done <= total for done, total in progress)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert scene.unregistered == ()
-    # The whole set of 66 photographs gives 2048 px at this size, and a lens bent by 0.04.
+    # The complete set of 66 photographs gives 2048 px at this size, and a distortion of 0.04.
     assert scene.cameras.intrinsics[0, 0, 0] == pytest.approx(2048, rel=0.05)
     assert len(scene.points_world) > 500
     assert scene.reprojection_errors_px.median() < 1
@@ -234,7 +234,7 @@ def test_the_same_photographs_give_the_same_bits_on_any_number_of_threads(small,
     assert None not in found
 
 
-def test_photographs_with_pixels_that_are_no_numbers_are_refused_by_name(views, tmp_path):
+def test_photographs_with_nan_pixels_are_rejected_by_name(views, tmp_path):
     images = views.images.clone()
     images[1, :, 3, 4] = torch.nan
     images[1, 0, 3, 5] = torch.inf
@@ -258,7 +258,7 @@ def test_the_same_photographs_are_reconstructed_once(views, model, tmp_path, mon
     assert len(runs) == 1
     assert digest(first) == digest(second) is not None
     kept = [find_model(views, ReconstructConfig(), Store(folder=tmp_path)) for _ in range(2)]
-    assert kept[0][1] == kept[1][1] > 0  # the seconds in which it was found
+    assert kept[0][1] == kept[1][1] > 0  # the seconds of the reconstruction
     Reconstruct(ReconstructConfig(seed=1), cache=tmp_path)(views)
     Reconstruct()(views)
     Reconstruct(cache=tmp_path)(views.replace(masks=views.inside))

@@ -14,7 +14,7 @@ def shape_error(points, truth):
 
 
 def camera_error(model, points):
-    """Bend space as the model's cameras do: where they see exact pixels come from."""
+    """Map points by the error of the model's cameras, to where they see exact pixels."""
     truth = ball.cameras_on_an_arc()
     pixels, _ = project(points, truth.cam_from_world, truth.intrinsics)
     each = torch.cartesian_prod(torch.arange(len(points)), torch.arange(6))
@@ -28,20 +28,20 @@ def camera_error(model, points):
 
 
 def found_by_features(generator, noise_px=0.5, fraction=0.6):
-    """Adjust the truth to noisy features: what structure from motion would give."""
+    """Adjust the truth to noisy features, as structure from motion does."""
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(200, generator)
     model = ball.model_of(cameras, points, generator, noise_px, fraction)
     return cameras, points, bundle(model, 1.0)
 
 
-def test_cameras_come_five_times_nearer_to_the_truth_under_changing_light(generator):
+def test_camera_errors_shrink_fivefold_under_changing_light(generator):
     cameras, points, model = found_by_features(generator)
     better = refine_tracks(ball.photographs(cameras), model, 1)
     assert camera_error(better, points) < camera_error(model, points) / 5
 
 
-def test_views_that_missed_a_point_are_found_to_show_it(generator):
+def test_missing_observations_are_recovered(generator):
     cameras, _, model = found_by_features(generator, fraction=0.3)
     better = refine_tracks(ball.photographs(cameras), model, 1)
     assert len(better.observation_point) > 1.3 * len(model.observation_point)
@@ -49,11 +49,11 @@ def test_views_that_missed_a_point_are_found_to_show_it(generator):
     assert observation_errors(better).median() < 0.15
 
 
-def test_a_view_that_shows_nothing_of_the_others_keeps_its_features_and_place(generator):
+def test_a_view_without_overlap_keeps_its_features_and_pose(generator):
     cameras, _, model = found_by_features(generator)
     views = ball.photographs(cameras)
     images = views.images.clone()
-    images[4] = 0.2  # blank: no patch is found in it
+    images[4] = 0.2  # blank: no patch is observed
     better = refine_tracks(views.replace(images=images), model, 1)
     assert (better.observation_view == 4).sum() > 60
     others = [0, 1, 2, 3, 5]
@@ -62,14 +62,14 @@ def test_a_view_that_shows_nothing_of_the_others_keeps_its_features_and_place(ge
     assert (transferred[4] - before[4]).norm() < 0.1
 
 
-def test_without_texture_everything_stays_as_it_was(generator):
+def test_without_texture_nothing_changes(generator):
     cameras, _, model = found_by_features(generator)
     views = ball.photographs(cameras)
     plain = views.replace(images=torch.full_like(views.images, 0.3))
     assert refine_tracks(plain, model, 1) is model
 
 
-def test_bundling_leads_exact_observations_back_to_the_truth(generator):
+def test_bundle_adjustment_of_exact_observations_recovers_the_truth(generator):
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(100, generator)
     exact = ball.model_of(cameras, points, generator, noise_px=0.0)
@@ -84,14 +84,14 @@ def test_bundling_leads_exact_observations_back_to_the_truth(generator):
     found = bundle(moved, 0.5)
     assert observation_errors(found).max() < 1e-3
     assert shape_error(found.points_world, points) < 1e-4
-    # Of points alone: cameras stay where they are.
+    # Points only: cameras are fixed.
     found = bundle(exact.replace(points_world=points + 0.02), 0.5, cameras=False)
     torch.testing.assert_close(found.cam_from_world, exact.cam_from_world, rtol=0, atol=1e-12)
     assert found.lenses == exact.lenses
     torch.testing.assert_close(found.points_world, points, rtol=0, atol=1e-5)
 
 
-def test_without_observations_their_points_go_and_the_rest_keeps_its_order(generator):
+def test_points_without_observations_are_removed_in_order(generator):
     model = ball.model_of(
         ball.cameras_on_an_arc(), ball.points_on_the_ball(20, generator), generator, 0.0
     )

@@ -1,4 +1,4 @@
-"""Which pairs are matched again, and how often the mapper starts."""
+"""Pairs of guided matching, and restarts of the mapper."""
 
 from dataclasses import replace
 
@@ -18,14 +18,14 @@ from pimper_torch.runtime.errors import PimperWarning
 SETTINGS = ReconstructConfig(guided_pairs=1, starts=2, seed=5, threads=1)
 
 RIGID = StaticBackground(features=(), static_fraction=0.0, moving_pairs=0, violating_fraction=0.0)
-ROOM = RIGID.replace(features=5 * (torch.tensor([True, False]),), violating_fraction=0.5)
+BACKGROUND = RIGID.replace(features=5 * (torch.tensor([True, False]),), violating_fraction=0.5)
 
 NOTHING = torch.zeros(3, 2).double()
 MOVED = (VerifiedPair(views=(0, 1), first=NOTHING, second=NOTHING),)
 
 
-class Told:
-    """What matcher and mapper are told; what the mapper and the judge answer, run by run."""
+class Scripted:
+    """Calls of matcher and mapper, with scripted results of mapper and verification."""
 
     def __init__(self, models, misplaced=(), inlier_ratio=()):
         self.models, self.misplaced = list(models), list(misplaced)
@@ -51,11 +51,11 @@ class Told:
 
 
 @pytest.fixture
-def told(model, monkeypatch):
+def scripted(model, monkeypatch):
     """Five photographs whose neighbours share most matches."""
 
     def note(numbers, misplaced=(), inlier_ratio=(), rest=RIGID, around=()):
-        answers = Told([select_views(model, some) for some in numbers], misplaced, inlier_ratio)
+        answers = Scripted([select_views(model, some) for some in numbers], misplaced, inlier_ratio)
 
         def leave_out(database, settings):
             answers.asked.append(database.name)
@@ -103,13 +103,15 @@ EVERY = range(5)
     ("models", "misplaced", "guided", "seeds"),
     [
         ([EVERY], [], [], [5]),  # a complete first model is the last
-        # Pairs of missing photographs, and the mapper starts again.
+        # Pairs of missing photographs, then a restart of the mapper.
         ([[0, 1, 2, 4]] * 2 + [EVERY], [], [[(0, 3), (1, 3), (2, 3), (3, 4)]], [5, 5, 6]),
         ([EVERY, EVERY], [{"d.jpg": 0.1}], [all_pairs(5)], [5, 5]),  # every pair
     ],
 )
-def test_the_mapper_starts_until_all_are_there(told, space, models, misplaced, guided, seeds):
-    answers = told(models, misplaced)
+def test_the_mapper_restarts_until_all_views_are_registered(
+    scripted, space, models, misplaced, guided, seeds
+):
+    answers = scripted(models, misplaced)
     assert register(space, SETTINGS).complete
     assert answers.matched == [
         (False, all_pairs(5)),
@@ -119,25 +121,25 @@ def test_the_mapper_starts_until_all_are_there(told, space, models, misplaced, g
     assert answers.mapped == [(seed, False) for seed in seeds]
 
 
-def test_points_of_two_views_count_last_and_the_best_of_all_is_kept(told, space):
+def test_two_view_points_are_used_last_and_the_best_model_is_kept(scripted, space):
     some = [[0, 1, 2], [0, 1, 2, 4], EVERY, [0, 1, 2]]
-    answers = told(some, [{}, {}, {"a.jpg": 0.1, "d.jpg": 0.2}, {}])
+    answers = scripted(some, [{}, {}, {"a.jpg": 0.1, "d.jpg": 0.2}, {}])
     found = register(space, SETTINGS)
     assert answers.mapped == [(5, False), (5, False), (6, False), (5, True)]
-    # Four views, none misplaced, are better than five of which two are.
+    # Four well-placed views are better than five of which two are misplaced.
     assert found.missing == ("d.jpg",)
     assert not found.misplaced
 
 
-def test_without_starts_the_first_model_is_kept_as_it_is(told, space):
-    answers = told([[0, 1, 2]])
+def test_without_starts_the_first_model_is_kept(scripted, space):
+    answers = scripted([[0, 1, 2]])
     settings = replace(SETTINGS, guided_pairs=0, starts=0)
     assert register(space, settings).missing == ("d.jpg", "ü.tif")
     assert answers.matched == [(False, all_pairs(5))]
 
 
-def test_a_model_whose_views_all_see_too_few_points_is_none(told, space, monkeypatch):
-    told(4 * [[0, 1]])
+def test_a_model_without_views_of_enough_points_is_rejected(scripted, space, monkeypatch):
+    scripted(4 * [[0, 1]])
     monkeypatch.setattr(registration, "count_views_with_depth", count_views_with_depth)
     monkeypatch.setattr(registration, "MIN_POINTS", 1000)
     found = register(space, SETTINGS)
@@ -145,33 +147,33 @@ def test_a_model_whose_views_all_see_too_few_points_is_none(told, space, monkeyp
     assert found.missing == tuple(space.files)
 
 
-def test_a_plain_model_that_explains_the_matches_is_taken_before_a_room_is_looked_for(told, space):
-    answers = told([EVERY], inlier_ratio=[0.95], rest=ROOM, around=MOVED)
+def test_a_plain_model_with_enough_inliers_skips_the_background_search(scripted, space):
+    answers = scripted([EVERY], inlier_ratio=[0.95], rest=BACKGROUND, around=MOVED)
     found = register(space, SETTINGS)
     assert answers.asked == []
     assert not found.background
     assert found.around == ()
 
 
-def test_another_explanation_is_taken_where_it_explains_clearly_more(told, space):
-    answers = told([EVERY, EVERY], inlier_ratio=[0.7, 0.98], around=MOVED)
+def test_linked_sessions_are_used_if_they_have_clearly_more_inliers(scripted, space):
+    answers = scripted([EVERY, EVERY], inlier_ratio=[0.7, 0.98], around=MOVED)
     assert register(space, SETTINGS).around == MOVED
     assert answers.databases == ["database.db", "other.db"]
     assert (space.folder / "other.db").read_bytes() == b"features and matches"
-    told([EVERY, EVERY], inlier_ratio=[0.85, 0.94], around=MOVED)
+    scripted([EVERY, EVERY], inlier_ratio=[0.85, 0.94], around=MOVED)
     assert register(space, SETTINGS).around == ()
 
 
-def test_an_explanation_that_loses_photographs_does_not_beat_the_plain_one(told, space):
+def test_a_model_that_loses_photographs_is_not_preferred(scripted, space):
     some = [EVERY, *4 * [[0, 1, 2]]]
-    told(some, inlier_ratio=[0.7, *4 * [0.5]], around=MOVED)
+    scripted(some, inlier_ratio=[0.7, *4 * [0.5]], around=MOVED)
     found = register(space, SETTINGS)
     assert not found.missing
     assert found.around == ()
 
 
-def test_a_room_is_left_out_where_the_plain_model_is_doubtful(told, space, monkeypatch):
-    told([EVERY, EVERY], rest=ROOM)
+def test_a_background_is_removed_if_the_plain_model_is_unreliable(scripted, space, monkeypatch):
+    scripted([EVERY, EVERY], rest=BACKGROUND)
     doubts = ["follows a camera in its place", ""]
     monkeypatch.setattr(registration, "diagnose", lambda model, count: doubts.pop(0))
     with pytest.warns(PimperWarning, match="5 of 10 features are static"):
@@ -180,8 +182,8 @@ def test_a_room_is_left_out_where_the_plain_model_is_doubtful(told, space, monke
     assert found.inlier_ratio == 1
 
 
-def test_of_many_photographs_likely_pairs_are_matched_first(told, space, monkeypatch):
-    answers = told([[0, 1, 2, 4], EVERY], [{"c 1.png": 0.1}, {}])
+def test_likely_pairs_of_many_photographs_are_matched_first(scripted, space, monkeypatch):
+    answers = scripted([[0, 1, 2, 4], EVERY], [{"c 1.png": 0.1}, {}])
     monkeypatch.setattr(registration, "MOST_PAIRED", 4)
     monkeypatch.setattr(registration, "pairs_to_match", lambda space: NEIGHBOURS[1])
     found = register(space, SETTINGS)

@@ -4,7 +4,7 @@ from pimper_torch.method.sfm.retrieval import global_descriptors, nearest_pairs,
 
 
 def walk(count, generator, seen=40):
-    """Descriptors of photographs once round a wall: neighbours share most of its points."""
+    """Return descriptors of photographs once around a wall; neighbours share most points."""
     wall = torch.nn.functional.normalize(torch.rand(5 * count, 128, generator=generator), dim=1)
     each = []
     for number in range(count):
@@ -14,19 +14,19 @@ def walk(count, generator, seen=40):
     return each
 
 
-def test_neighbours_round_a_wall_are_found_and_pairs_grow_with_photographs(generator):
+def test_neighbours_are_retrieved_and_pairs_grow_with_photographs(generator):
     counts = []
     for count in (100, 200):
         pairs = nearest_pairs(global_descriptors(walk(count, generator).__getitem__, count), 6)
         steps = [min(second - first, first + count - second) for first, second in pairs]
         assert sum(step <= 7 for step in steps) >= 0.95 * len(steps)  # 7 steps share 5 of 40
-        assert sum(step == 1 for step in steps) == count  # neighbours all
+        assert sum(step == 1 for step in steps) == count  # all are neighbours
         counts.append(len(pairs))
         assert len(pairs) <= 6 * count
     assert counts[1] <= 2.2 * counts[0]
 
 
-def test_photographs_have_the_same_vectors_again_and_none_without_features(generator):
+def test_global_descriptors_are_reproducible_and_zero_without_features(generator):
     some = walk(70, generator)
     some[3] = some[3][:0]
     first, second = (global_descriptors(some.__getitem__, 70) for _ in range(2))
@@ -36,7 +36,7 @@ def test_photographs_have_the_same_vectors_again_and_none_without_features(gener
     assert (lengths - 1).abs().max() < 1e-5  # rounding of 16,384 squares in float32
 
 
-def test_every_pair_is_listed_once_where_there_are_few():
+def test_every_pair_of_few_photographs_is_listed_once():
     assert nearest_pairs(torch.eye(4), 20) == [(a, b) for a in range(4) for b in range(a + 1, 4)]
 
 

@@ -15,7 +15,7 @@ from tests.sfm.moved import K, bodies, poses
 
 
 def model_of(counts, generator, *, moved=True):
-    """Give a model in the table's frame; points are seen by views within 50 degrees."""
+    """Return a model in the table's frame; points are seen by views within 50 degrees."""
     own, table = bodies(generator, num_object=400, num_table=400)
     cameras = torch.cat([poses(count) for count in counts])
     sessions = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
@@ -33,7 +33,7 @@ def model_of(counts, generator, *, moved=True):
     return observed(rig, torch.cat(placed), torch.cat(seen))
 
 
-def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generator):
+def test_sessions_follow_from_table_matches_under_the_cameras(generator):
     model = model_of((6, 6), generator)
     own, table = bodies(generator, num_object=400, num_table=80)
     pixels = project(table, model.cam_from_world, K.expand(12, 3, 3))[0]
@@ -43,7 +43,7 @@ def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generato
     pairs = [(a, b) for a, b in combinations(range(12), 2) if (b - a) % 6 < 2]
     around = [VerifiedPair(views=(a, b), first=pixels[a], second=pixels[b]) for a, b in pairs]
     assert sessions_in(model, model.names, around).tolist() == [0] * 6 + [1] * 6
-    names = (*model.names[6:], "other.jpg", *model.names[:6])  # numbers are of all photographs
+    names = (*model.names[6:], "other.jpg", *model.names[:6])  # indices refer to all photographs
     moved = [
         one.replace(views=tuple(names.index(model.names[view]) for view in one.views))
         for one in around
@@ -51,7 +51,7 @@ def test_series_are_told_by_what_the_cameras_say_of_the_table_s_matches(generato
     assert sessions_in(model, names, moved).tolist() == [0] * 6 + [1] * 6
 
 
-def test_series_are_noted_and_named_and_views_of_a_series_that_is_hardly_there_left_out(generator):
+def test_sessions_are_reported_and_views_of_tiny_ones_excluded(generator):
     model = model_of((12, 10), generator)
     with pytest.warns(PimperWarning, match=r"between 2 capture sessions.*12 \(0.png.*10 \(12.png"):
         noted = with_sessions(model, torch.tensor([0] * 12 + [1] * 10), model.names)

@@ -31,12 +31,12 @@ def test_writing_a_model_and_reading_it_gives_the_same_scene(scene, views, tmp_p
 
 
 def test_reprojection_errors_are_mean_distances_and_infinite_behind_a_camera(model):
-    # The fixture's noise has 0.3 px a coordinate: its length averages 0.3 * sqrt(pi / 2).
+    # The fixture's noise is 0.3 px per coordinate: its mean length is 0.3 * sqrt(pi / 2).
     errors = reprojection_errors(model)
     assert 0.30 < errors.mean() < 0.45
     first = (model.observation_point == 0).nonzero()[:, 0]
     pixels = model.observation_pixels.clone()
-    for row in first:  # exact but for 5 px in one view
+    for row in first:  # exact except for 5 px in one view
         view = int(model.observation_view[row])
         point = transform(model.cam_from_world[view], model.points_world[:1])
         pixels[row] = distort(model.lenses[view], point)[0]
@@ -51,7 +51,7 @@ def test_reprojection_errors_are_mean_distances_and_infinite_behind_a_camera(mod
     assert errors[1:].isfinite().all()
 
 
-def test_points_take_the_color_that_the_views_show(scene):
+def test_points_have_the_color_of_their_views(scene):
     red = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     images = red[:, None, None].expand(5, 3, 60, 80)
     colored = scene.replace(views=scene.views.replace(images=images))
@@ -79,7 +79,7 @@ def moved(model, offset):
 
 @pytest.mark.parametrize("offset", FAR)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_model_far_from_its_origin_gives_the_scene_of_the_plain_one(views, model, offset, dtype):
+def test_a_model_far_from_the_origin_gives_the_same_scene(views, model, offset, dtype):
     views = views.to(dtype)
     plain, far = assemble_scene(views, model), assemble_scene(views, moved(model, offset))
     assert plain.offset_world == NO_OFFSET
@@ -90,16 +90,16 @@ def test_a_model_far_from_its_origin_gives_the_scene_of_the_plain_one(views, mod
     assert_close(far.cameras.centers_world, centers.to(dtype), rtol=0, atol=4e-6)
     assert_close(
         far.reprojection_errors_px, plain.reprojection_errors_px, rtol=0, atol=1e-4
-    )  # 3e7 in double precision, 20 px a unit
+    )  # 3e7 in double precision, 20 px per unit
     assert torch.equal(far.views.images, plain.views.images)
 
 
 @pytest.mark.parametrize("offset", FAR)
-def test_a_far_scene_is_written_where_its_model_was(views, model, offset, tmp_path):
+def test_a_scene_far_from_the_origin_is_written_in_the_model_frame(views, model, offset, tmp_path):
     far = moved(model, offset)
     write_model(assemble_scene(views.to(torch.float32), far), tmp_path)
     read = read_model(tmp_path)
-    # The scene is in single precision, its model in the person's frame is not.
+    # The scene is in single precision, its model in the user's frame is not.
     assert_close(read.points_world, far.points_world, rtol=0, atol=1e-6)
     centers = [
         -(one.cam_from_world[:, :3, :3].mT @ one.cam_from_world[:, :3, 3:])[..., 0]

@@ -9,10 +9,10 @@ from pimper_torch.method.sfm.static_background import moving_matches
 from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable
 
 
-# The violating share is smaller the nearer the camera is to the table's plane: all moves sideways,
-# as before a camera that only shifts.
+# The violating fraction is smaller the closer the camera is to the plane of the table: all points
+# move sideways, as under a camera that only shifts.
 @pytest.mark.parametrize(("elevation_deg", "fraction"), [(2.0, 0.2), (25.0, 0.7)])
-def test_a_room_is_at_rest_and_what_turns_is_not(elevation_deg, fraction, generator):
+def test_the_background_is_static_and_the_turning_object_is_not(elevation_deg, fraction, generator):
     scene = turntable(generator, elevation_deg=elevation_deg)
     rest = scene.rest()
     assert rest.detected
@@ -32,7 +32,7 @@ def test_a_room_is_at_rest_and_what_turns_is_not(elevation_deg, fraction, genera
     assert kept > 0.98 * right > 1000
 
 
-def test_far_points_that_do_not_move_before_a_camera_that_shifts_belong_to_the_scene(generator):
+def test_distant_points_under_a_shifting_camera_are_not_background(generator):
     cameras = orbit(8, 330.0)
     shift = torch.linspace(-1, 1, 8, dtype=torch.float64)
     poses = cameras.cam_from_world[:1].repeat(8, 1, 1)
@@ -45,9 +45,9 @@ def test_far_points_that_do_not_move_before_a_camera_that_shifts_belong_to_the_s
     scene = Captured(generator, torch.cat([near, far], dim=1))
     ends = [pixels_of(scene.keypoints, pair, rows) for pair, rows in scene.pairs.items()]
     still = [((first - second).norm(dim=1) < 1).sum() for first, second in ends]
-    assert min(still) > 100  # the far ones lie still
+    assert min(still) > 100  # the distant ones are static
     rest = scene.rest()
-    assert rest.moving_pairs == 24  # all that are verified first; they end the search
+    assert rest.moving_pairs == 24  # all that are verified first, which ends the search
     assert rest.violating_fraction < 0.01
     assert not rest.detected
     assert not any(resting.any() for resting in rest.features)
@@ -67,7 +67,7 @@ def test_a_flat_object_that_hardly_moves_keeps_its_features(generator):
     assert not rest.detected
 
 
-def test_photographs_that_are_there_twice_leave_nothing_out(generator):
+def test_duplicate_photographs_have_no_static_background(generator):
     cameras = orbit(6, 90.0)
     once = seen_of_ball(generator, 400, cameras)
     scene = Captured(generator, once.repeat_interleave(3, dim=0))
@@ -79,7 +79,7 @@ def test_photographs_that_are_there_twice_leave_nothing_out(generator):
 
 
 @pytest.mark.parametrize("shaken", [0, 100])
-def test_where_all_is_at_rest_nothing_moves_though_features_are_found_inexactly(generator, shaken):
+def test_a_static_scene_has_no_motion_despite_noisy_features(generator, shaken):
     detected = torch.rand(300, 2, generator=generator, dtype=torch.float64) * 400
     detected = detected.repeat(5, 1, 1)
     noise = torch.randn(5, shaken, 2, generator=generator, dtype=torch.float64)
@@ -90,7 +90,7 @@ def test_where_all_is_at_rest_nothing_moves_though_features_are_found_inexactly(
     assert rest.moving_pairs == 0
 
 
-def test_one_geometry_is_shared_where_there_is_one_and_none_hides_a_contradiction(generator):
+def test_a_shared_geometry_is_found_only_for_consistent_matches(generator):
     cameras = orbit(2, 20.0)
     pixels = seen_of_ball(generator, 400, cameras)
     first, second = pixels[:, pixels.isfinite().all(dim=-1).all(dim=0)]
@@ -102,7 +102,7 @@ def test_one_geometry_is_shared_where_there_is_one_and_none_hides_a_contradictio
     assert (sampson_errors(geometry, first, second) > 2).double().mean() > 0.5
 
 
-def test_the_error_of_a_match_is_how_far_it_must_move(generator):
+def test_the_error_of_a_match_is_its_distance_to_a_consistent_one(generator):
     cameras = orbit(2, 20.0)
     points = torch.randn(30, 3, generator=generator, dtype=torch.float64)
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
@@ -111,7 +111,7 @@ def test_the_error_of_a_match_is_how_far_it_must_move(generator):
     line = torch.nn.functional.pad(pixels[0], (0, 1), value=1.0) @ geometry.mT
     across = line[:, :2] / line[:, :2].norm(dim=1, keepdim=True)
     shifted = pixels[1] + 3 * across
-    # Both photographs share the way: about 3 / sqrt(2) where both lines are as steep.
+    # Both photographs share the correction: about 3 / sqrt(2) for lines of equal slope.
     found = sampson_errors(geometry, pixels[0], shifted)
     assert ((found > 1.9) & (found < 2.4)).all()
     along = torch.stack([-across[:, 1], across[:, 0]], dim=1)

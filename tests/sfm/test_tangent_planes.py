@@ -17,7 +17,7 @@ def test_normals_of_points_on_a_ball_are_its_radii(generator):
     assert torch.rad2deg((found * points).sum(-1).clamp(-1, 1).acos()).median() < 2
 
 
-def test_a_point_alone_or_among_neighbours_across_its_rays_faces_the_cameras(generator):
+def test_an_isolated_or_edge_on_point_faces_the_cameras(generator):
     wall = torch.rand(50, 3, generator=generator, dtype=torch.float64)
     wall[:, 0] = 0  # its normal is x
     towards = torch.tensor([0.0, 0, -1]).double().expand_as(wall)
@@ -25,7 +25,7 @@ def test_a_point_alone_or_among_neighbours_across_its_rays_faces_the_cameras(gen
     assert torch.equal(plane_normals(wall[:1], towards[:1]), towards[:1])
 
 
-def test_steps_lie_in_the_plane_and_are_about_a_pixel_of_the_reference(generator):
+def test_steps_are_in_the_plane_and_about_a_pixel_of_the_reference(generator):
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(300, generator)
     planes = tangents(points, torch.ones(len(points), 6, dtype=torch.bool), cameras)
@@ -54,10 +54,10 @@ def test_the_reference_is_a_view_that_sees_the_point_and_never_a_candidate(gener
     assert not planes.candidates[each, planes.reference].any()
 
 
-def test_views_behind_the_plane_or_without_the_point_are_no_candidates(generator):
+def test_views_behind_the_plane_or_without_the_point_are_not_candidates(generator):
     cameras = ball.cameras_on_an_arc()
     along, up = torch.rand(2, 40, generator=generator, dtype=torch.float64) - 0.5
-    tilt = torch.tensor(torch.pi / 3).double()  # the wall's normal leans to x by that
+    tilt = torch.tensor(torch.pi / 3).double()  # tilt of the wall's normal towards x
     wall = torch.stack([along * tilt.cos(), up, along * tilt.sin()], dim=1)
     points = torch.cat([wall, torch.tensor([[90.0, 0, 0]]).double()])
     by_side = cameras.centers_world[:, 0].argsort()
@@ -69,7 +69,7 @@ def test_views_behind_the_plane_or_without_the_point_are_no_candidates(generator
     assert not planes.candidates[-1].any()
 
 
-def test_homographies_carry_steps_of_the_plane_to_pixels(generator):
+def test_homographies_map_steps_of_the_plane_to_pixels(generator):
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(20, generator)
     planes = tangents(points, torch.ones(20, 6, dtype=torch.bool), cameras)
@@ -83,7 +83,7 @@ def test_homographies_carry_steps_of_the_plane_to_pixels(generator):
     torch.testing.assert_close(homogeneous[:, :2] / homogeneous[:, 2:], expected)
 
 
-def test_views_are_kept_evenly_and_all_where_they_are_few(generator):
+def test_views_are_kept_evenly_or_all_if_few(generator):
     candidates = torch.rand(200, 90, generator=generator) < torch.rand(200, 1, generator=generator)
     kept = evenly(candidates, torch.full((200, 1), 24))
     assert not (kept & ~candidates).any()

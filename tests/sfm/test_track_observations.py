@@ -27,14 +27,14 @@ def errors(found, pixels):
 
 
 @pytest.mark.parametrize("lit", [False, True], ids=["one light", "another light each"])
-def test_points_are_found_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
+def test_points_are_observed_in_all_views_to_a_twentieth_of_a_pixel(scene, lit):
     cameras, planes, pixels = scene
     found = observe_points(pictures(ball.photographs(cameras, lit=lit, wall=True)), cameras, planes)
     assert len(found.point) > 0.85 * 6 * 150
     assert errors(found, pixels).median() < (0.05 if lit else 0.02)
 
 
-def test_a_part_of_the_points_at_a_time_gives_the_same_bits(scene):
+def test_chunks_of_points_give_bitwise_equal_results(scene):
     cameras, planes, _ = scene
     shown = pictures(ball.photographs(cameras, wall=True))
     at_once = observe_points(shown, cameras, planes)
@@ -43,7 +43,7 @@ def test_a_part_of_the_points_at_a_time_gives_the_same_bits(scene):
         assert torch.equal(getattr(at_once, name), getattr(in_parts, name))
 
 
-def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
+def test_observations_correct_misprojected_points(scene):
     cameras, planes, _ = scene
     rotated = cameras.cam_from_world.clone()
     rotated[3, 0, 3] += 2 * 4.0 / ball.FOCAL  # two pixels
@@ -51,7 +51,7 @@ def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
     shown = pictures(ball.photographs(cameras, lit=False, wall=True))
     found = observe_points(shown, wrong, planes)
     mine = (found.view == 3) & (planes.reference[found.point] != 3)
-    # The reference's pixel is where the wrong camera has it, so its own points are left out.
+    # Pixels in the reference follow the wrong camera, so its own points are excluded.
     right, _ = project(planes.points_world, cameras.cam_from_world[3], cameras.intrinsics[3])
     assert mine.sum() > 60
     assert (found.pixels[mine] - right[found.point[mine]]).norm(dim=1).median() < 0.05
@@ -59,7 +59,7 @@ def test_points_that_cameras_put_beside_are_found_where_they_are_shown(scene):
     assert not ((near.view == 3) & (planes.reference[near.point] != 3)).any()
 
 
-def test_what_stands_before_the_point_is_not_taken_for_it(scene):
+def test_occluders_are_not_observed_as_the_point(scene):
     cameras, planes, _ = scene
     views = ball.photographs(cameras, wall=True)
     images = views.images.clone()
@@ -70,7 +70,7 @@ def test_what_stands_before_the_point_is_not_taken_for_it(scene):
 
 
 @pytest.mark.parametrize("how", ["masked", "saturated", "not finite"])
-def test_patches_that_a_view_does_not_have_are_not_found(scene, how):
+def test_patches_missing_from_a_view_are_not_observed(scene, how):
     cameras, planes, pixels = scene
     views = ball.photographs(cameras, wall=True)
     left = torch.zeros(6, ball.HEIGHT, ball.WIDTH, dtype=torch.bool)
@@ -87,7 +87,7 @@ def test_patches_that_a_view_does_not_have_are_not_found(scene, how):
     assert errors(found, pixels)[here].median() < 0.05
 
 
-def test_without_texture_or_along_a_stripe_nothing_is_found(scene):
+def test_untextured_and_striped_patches_are_not_observed(scene):
     cameras, planes, _ = scene
     views = ball.photographs(cameras, wall=True)
     plain = torch.full_like(views.images, 0.3)
@@ -99,7 +99,7 @@ def test_without_texture_or_along_a_stripe_nothing_is_found(scene):
     assert len(found.point) < 0.05 * 6 * 150
 
 
-def test_sightings_are_sorted_and_the_reference_sees_what_others_found(scene):
+def test_observations_are_sorted_and_include_the_reference(scene):
     cameras, planes, pixels = scene
     found = observe_points(pictures(ball.photographs(cameras, wall=True)), cameras, planes)
     key = found.point * 6 + found.view
@@ -111,7 +111,7 @@ def test_sightings_are_sorted_and_the_reference_sees_what_others_found(scene):
     )
 
 
-def test_pictures_are_logarithms_of_gray_above_a_fiftieth_of_the_median():
+def test_log_images_are_offset_by_a_fiftieth_of_the_median_gray():
     wide = torch.full((3, 8, 12), 0.5, dtype=torch.float64)
     wide[0] = 0.2
     wide[:, 0, 0] = torch.tensor([0.1, 1.0, 0.1])  # saturated in one channel

@@ -1,4 +1,4 @@
-"""Points of known cameras, on a ball whose surface is known."""
+"""Points of known cameras on a known ball."""
 
 import json
 import warnings
@@ -39,7 +39,7 @@ def bare(generator) -> SparseModel:
 
 @pytest.fixture
 def small(views, bare) -> tuple[Views, SparseModel]:
-    """Four of the photographs, of half the size: features take an eighth of the time."""
+    """Return four photographs at half size: features take an eighth of the time."""
     images, (f, x, y, k) = avg_pool2d(views.images, 2), bare.lenses[0].params
     lens = CameraModel(
         camera=1, model="SIMPLE_RADIAL", params=(f / 2, x / 2, y / 2, k), width=240, height=180
@@ -48,7 +48,7 @@ def small(views, bare) -> tuple[Views, SparseModel]:
     return half.take(list(range(4))), select_views(bare.replace(lenses=(lens,) * 6), range(4))
 
 
-def test_points_lie_on_the_surface_and_cameras_come_back_bit_for_bit(views, bare):
+def test_points_are_on_the_surface_and_cameras_are_bitwise_equal(views, bare):
     assert lacks_points(bare)
     with pytest.warns(PimperWarning, match=r"model: hardly any.*points were triangulated.*px"):
         found = triangulate(views, bare, SETTINGS, "The model")
@@ -64,7 +64,7 @@ def test_points_lie_on_the_surface_and_cameras_come_back_bit_for_bit(views, bare
     assert bool((torch.bincount(found.observation_point) >= 2).all())
 
 
-def test_the_number_of_threads_changes_no_bit(small):
+def test_the_result_is_bitwise_equal_on_any_number_of_threads(small):
     found = []
     for threads in (1, 2):
         settings = ReconstructConfig(threads=threads)
@@ -75,7 +75,7 @@ def test_the_number_of_threads_changes_no_bit(small):
 
 
 def bent(views: Views, lens: CameraModel) -> Views:
-    """Show what the lens would have taken of what a pinhole of its focal length took."""
+    """Distort photographs of a pinhole by the camera model."""
     K = pinhole_of(lens)
     pixels = pixel_centers(lens.width, lens.height, like=K)
     seen = undistort_pixels(lens, pixels.reshape(-1, 2)) * K.diagonal()[:2] + K[:2, 2]
@@ -84,7 +84,7 @@ def bent(views: Views, lens: CameraModel) -> Views:
     return views.replace(images=grid_sample(views.images, grid, align_corners=False))
 
 
-def test_matches_follow_the_lens(views, bare):
+def test_matches_follow_the_camera_model(views, bare):
     lens = bare.lenses[0].replace(params=(*bare.lenses[0].params[:3], 0.3))  # 10 px in the corners
     model = bare.replace(lenses=(lens,) * bare.num_views)
     with pytest.warns(PimperWarning, match="were triangulated"):
@@ -94,7 +94,7 @@ def test_matches_follow_the_lens(views, bare):
     assert float(observation_errors(found).median()) < 0.3
 
 
-def test_georeferenced_cameras_give_the_points_of_those_near_the_origin(views, bare):
+def test_georeferenced_cameras_give_the_points_of_local_ones(views, bare):
     offset = torch.tensor([448231.25, 5411923.5, 312.125], dtype=torch.float64)
     far = bare.replace(cam_from_world=from_local(bare.cam_from_world, tuple(offset.tolist())))
     with pytest.warns(PimperWarning, match="were triangulated"):
@@ -118,15 +118,15 @@ def axes(*signs: int) -> torch.Tensor:
         lambda pose: pose[[3, 0, 1, 2]],
     ],
 )
-def test_cameras_that_photographs_contradict_are_refused(small, wrong):
+def test_cameras_that_contradict_the_photographs_are_rejected(small, wrong):
     views, bare = small
     model = bare.replace(cam_from_world=wrong(bare.cam_from_world))
     with pytest.raises(InputError, match=r"The model: these cameras.*at least 50%.*x right"):
         triangulate(views, model, SETTINGS, "The model")
 
 
-def test_photographs_that_show_nothing_or_a_few_pixels_give_no_points_and_a_warning(views, bare):
-    """COLMAP's features end the process where there are a few pixels."""
+def test_blank_or_tiny_photographs_give_no_points_and_a_warning(views, bare):
+    """COLMAP's feature extraction ends the process on images of a few pixels."""
     blank = views.replace(images=torch.full_like(views.images, 0.3))
     tiny = views.replace(images=views.images[..., :6, :8], sizes_px=torch.tensor([[8, 6]] * 6))
     for some in (blank, tiny):
@@ -134,7 +134,7 @@ def test_photographs_that_show_nothing_or_a_few_pixels_give_no_points_and_a_warn
             assert triangulate(some, bare, SETTINGS, "The model") is bare
 
 
-def test_points_that_there_are_stay_where_no_more_are_found(small, generator):
+def test_existing_points_are_kept_if_no_more_are_found(small, generator):
     few = model_of(cameras_on_an_arc(), points_on_the_ball(5, generator), generator, 0.2)
     views, bare = small
     few = select_views(few, range(4)).replace(lenses=bare.lenses)
@@ -148,7 +148,7 @@ def test_points_that_there_are_stay_where_no_more_are_found(small, generator):
     assert len(more.points_world) > 10 * len(few.points_world)
 
 
-def test_a_match_is_explained_on_the_line_and_before_both_cameras(generator):
+def test_inliers_are_on_the_epipolar_line_in_front_of_both_cameras(generator):
     model = model_of(cameras_on_an_arc(2), points_on_the_ball(30, generator), generator, 0.0)
     cameras = pinholes_of(model)
     pixels = [model.observation_pixels[model.observation_view == view] for view in (0, 1)]
@@ -162,16 +162,16 @@ def test_a_match_is_explained_on_the_line_and_before_both_cameras(generator):
     assert bool(inliers(cameras, swapped, 1e-6).all())
 
 
-def test_no_warning_is_left_out_where_settings_leave_tracks_as_features_found_them(small):
+def test_the_warning_is_emitted_without_track_refinement(small):
     settings = replace(SETTINGS, track_iterations=0)
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         found = triangulate(*small, settings, "The model")
-    assert [str(one.message).count("points were triangulated") for one in told] == [1]
+    assert [str(one.message).count("points were triangulated") for one in caught] == [1]
     assert torch.equal(found.cam_from_world, small[1].cam_from_world)
 
 
-def test_a_file_that_has_no_camera_of_the_photographs_is_refused(views, tmp_path):
+def test_a_file_without_cameras_of_the_photographs_is_rejected(views, tmp_path):
     pose = torch.eye(4).tolist()
     frames = [{"file_path": "../../etc/passwd", "transform_matrix": pose}]
     whole = {"w": 80, "h": 60, "fl_x": 90.0, "frames": frames}

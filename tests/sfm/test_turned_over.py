@@ -10,7 +10,7 @@ from tests.sfm.test_turntable import center_errors, photographs
 
 
 @pytest.mark.slow
-def test_series_between_which_an_object_was_turned_over_are_registered_on_it_without_masks():
+def test_sessions_of_a_turned_object_are_registered_without_masks():
     settings = {"num_views": 24, "width": 320, "height": 240, "path": "turntable"}
     scene = build_scene(
         "mug", SceneConfig(**settings, elevation_deg=20.0, table="patterned", turned_over=True)

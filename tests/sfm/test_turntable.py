@@ -31,7 +31,7 @@ def solid(tmp_path_factory):
 
 
 def photographs(scene, chosen):
-    """Take some of a scene's photographs as a camera of 8 bits does."""
+    """Return some photographs of a scene in 8 bits."""
     taken = []
     for view in chosen:
         stage = TracedObjects(scene.objects_in(view))
@@ -50,7 +50,7 @@ def furnished(solid, **changes):
 
 
 def center_errors(found, scene):
-    """Give how far each camera's centre is off, in distances of the camera."""
+    """Return the error of each camera centre relative to its distance."""
     rows = torch.tensor([scene.names.index(name) for name in found.views.names])
     true = scene.cameras.replace(
         intrinsics=scene.cameras.intrinsics[rows],
@@ -63,8 +63,8 @@ def center_errors(found, scene):
 
 
 def compare(views, scene):
-    """Give median errors of the cameras, without and with the object's masks."""
-    with pytest.warns(PimperWarning, match="features are static .* removed"):
+    """Return median errors of the cameras, without and with masks of the object."""
+    with pytest.warns(PimperWarning, match="features lie still .* are left out"):
         without = Reconstruct(QUICK)(views.replace(masks=None))
     masked = Reconstruct(QUICK)(views)  # a warning would be an error
     assert without.unregistered == masked.unregistered == ()
@@ -72,16 +72,16 @@ def compare(views, scene):
 
 
 @pytest.mark.slow
-def test_cameras_before_a_room_and_a_table_at_rest_are_those_of_the_object(solid):
+def test_cameras_follow_the_object_despite_a_static_background(solid):
     scene = furnished(solid, fixed_table=True)
     without, masked = compare(photographs(scene, list(range(6))), scene)
     assert masked < 0.003
-    assert without < 1.5 * masked  # the same features, but for those that the masks' rims cut
+    assert without < 1.5 * masked  # the same features, except those at mask borders
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jitter", [{"pan_jitter_px": 30.0}, {"crop_jitter_px": 30.0}])
-def test_before_a_room_that_shifts_cameras_are_those_of_the_object(solid, jitter):
+def test_cameras_follow_the_object_despite_a_shifting_background(solid, jitter):
     larger = {"width": 480, "height": 360, "num_views": 36}
     scene = furnished(solid, fixed_table=True, **larger, **jitter)
     views = photographs(scene, list(range(6))).replace(masks=None)
@@ -91,7 +91,7 @@ def test_before_a_room_that_shifts_cameras_are_those_of_the_object(solid, jitter
     assert center_errors(found, scene).median() < 0.005
 
 
-def test_photographs_of_one_place_are_refused_with_what_to_do(solid):
+def test_photographs_of_one_position_are_rejected_with_advice(solid):
     scene = furnished(solid)
     (image,) = photographs(scene, [3]).images
     generator = torch.Generator().manual_seed(4)

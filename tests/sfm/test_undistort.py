@@ -17,7 +17,7 @@ def bent(width: int, height: int, strength: float) -> CameraModel:
 
 
 def ramp_views(sizes: list[tuple[int, int]]) -> Views:
-    # Radiance is the photograph's own pixel coordinate, scaled: a ramp before undistortion.
+    # Radiance is the scaled pixel coordinate of the photograph: a ramp before undistortion.
     width, height = (max(side) for side in zip(*sizes, strict=True))
     images = torch.zeros(len(sizes), 2, height, width, dtype=torch.float64)
     for index, (w, h) in enumerate(sizes):
@@ -39,7 +39,7 @@ def test_a_ramp_of_the_photograph_shows_where_each_pinhole_pixel_came_from(stren
         assert_close(intrinsics[index, :2, 2], center)
         x = (pixel_centers(w, h, like=views.images) - center) / (zoom * f)
         source = f * (1 + k * x.square().sum(-1, keepdim=True)) * x + center
-        # Half a pixel from the rim the ramp itself ends; interpolation is exact inside.
+        # The ramp ends half a pixel from the border; interpolation is exact inside.
         size = torch.tensor([w, h])
         exact = ((source >= 0.5) & (source <= size - 0.5)).all(-1)
         outside = ((source < 0) | (source > size)).any(-1)
@@ -57,7 +57,7 @@ def test_a_ramp_of_the_photograph_shows_where_each_pinhole_pixel_came_from(stren
         assert undistorted.masks is None
 
 
-def test_a_pinhole_zooms_in_just_enough_to_see_no_edge():
+def test_a_pinhole_zooms_in_just_enough_to_exclude_edges():
     lens = bent(50, 40, 0.3)
     f, cx, cy, k = lens.params
     K = pinhole_for(lens)
@@ -82,7 +82,7 @@ def test_the_padding_of_a_smaller_photograph_never_leaks_in():
     assert_close(undistorted.images, ones.images)
 
 
-def test_a_drawn_mask_moves_with_the_photograph():
+def test_masks_are_undistorted_like_the_photograph():
     views = ramp_views([(50, 40)])
     drawn = views.images[:, 0] * 100 < 11.0  # left of a straight line in the photograph
     undistorted, _ = undistort(views.replace(masks=drawn), (bent(50, 40, -0.2),))
@@ -91,8 +91,8 @@ def test_a_drawn_mask_moves_with_the_photograph():
     assert (undistorted.masks[0] == (source[..., 0] < 11.0))[clear].all()
 
 
-def test_pixels_of_a_large_photograph_are_those_that_the_lens_images():
-    lens = bent(500, 400, 0.02)  # more pixels than are distorted at a time
+def test_large_photographs_are_undistorted_in_chunks():
+    lens = bent(500, 400, 0.02)  # more pixels than are processed per chunk
     K = pinhole_for(lens)
     pixels = pixel_centers(500, 400, like=K).reshape(-1, 2)
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[:, :1])], dim=1)
@@ -100,7 +100,7 @@ def test_pixels_of_a_large_photograph_are_those_that_the_lens_images():
     torch.testing.assert_close(photograph_pixels(lens).reshape(-1, 2), expected, equal_nan=True)
 
 
-def test_undistortion_lets_gradients_through():
+def test_undistortion_is_differentiable():
     views = ramp_views([(6, 5)])
     lens = bent(6, 5, 0.3)
 
@@ -111,7 +111,7 @@ def test_undistortion_lets_gradients_through():
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"])
-def test_a_lens_and_its_inverse_undo_each_other(model):
+def test_distortion_and_its_inverse_cancel(model):
     params = {
         "SIMPLE_RADIAL": (60.0, 25.0, 20.0, 0.1),
         "OPENCV": (60.0, 62.0, 25.0, 20.0, 0.05, -0.01, 1e-3, 2e-3),
@@ -125,7 +125,7 @@ def test_a_lens_and_its_inverse_undo_each_other(model):
     assert_close(distort(lens, 3 * rays), pixels, rtol=0, atol=1e-6)
 
 
-def test_what_touches_a_saturated_pixel_is_saturated():
+def test_pixels_that_touch_a_saturated_one_are_saturated():
     views = ramp_views([(50, 40)])
     images = views.images.clone()
     images[0, 0, 17, 23] = 1.0
@@ -148,7 +148,7 @@ STRAIGHT = sorted({*COUNTS} - {*FISHEYES, "EUCM", "EQUIRECTANGULAR"})
 
 
 def without_coefficients(model: str, focal_px: float) -> CameraModel:
-    """Give a lens whose coefficients are all zero."""
+    """Return a camera model with zero coefficients."""
     focal = (focal_px,) * (1 if model.startswith(("SIMPLE_", "RADIAL")) else 2)
     zeros = (0.0,) * (COUNTS[model] - len(focal) - 2)
     return CameraModel(
@@ -172,7 +172,7 @@ def test_a_fisheye_without_coefficients_is_equidistant_and_undistorted(model):
 
 
 @pytest.mark.parametrize("model", STRAIGHT)
-def test_a_perspective_lens_without_coefficients_stays_bit_for_bit(model):
+def test_a_perspective_lens_without_coefficients_is_bitwise_unchanged(model):
     lens = without_coefficients(model, 36.0)
     views = ramp_views([(50, 40)])
     undistorted, intrinsics = undistort(views, (lens,))
@@ -182,7 +182,7 @@ def test_a_perspective_lens_without_coefficients_stays_bit_for_bit(model):
     assert_close(intrinsics[0], torch.tensor([[36.0, 0, 25], [0, 36, 20], [0, 0, 1]]).double())
 
 
-def test_the_last_coefficient_alone_makes_a_lens_bend():
+def test_the_last_coefficient_alone_distorts():
     for model in (*FISHEYES, *STRAIGHT):
         plain = without_coefficients(model, 36.0)
         bends = plain.params[-1] == 0

@@ -19,7 +19,7 @@ SIZE = 60, 40
 BARREL = CameraModel(
     camera=1, model="SIMPLE_RADIAL", params=(90.0, 31.0, 19.0, -0.2), width=60, height=40
 )
-PINCUSHION = BARREL.replace(params=(40.0, 31.0, 19.0, 2.0))  # looks past the edge
+PINCUSHION = BARREL.replace(params=(40.0, 31.0, 19.0, 2.0))  # extends beyond the edge
 
 
 @pytest.fixture
@@ -35,13 +35,13 @@ def placed(scene, *priors):
 
 
 def of_one(kind, size=SIZE, name="a.png", **maps):
-    """A prior of one photograph."""
+    """Return a prior of one photograph."""
     return kind(names=(name,), sizes_px=torch.tensor([size]), **maps)
 
 
 @pytest.mark.parametrize("size", [(60, 40), (30, 20), (90, 80)])
-def test_maps_of_any_size_move_with_the_photograph(scene, size):
-    """A ramp shows where every pixel came from; both ends count in pixels of the map."""
+def test_maps_of_any_size_are_undistorted_like_the_photograph(scene, size):
+    """A ramp gives the source of every pixel; both ends are in pixels of the map."""
     width, height = size
     ramp = pixel_centers(width, height, like=torch.zeros(()))
     raster = torch.full((1, height + 3, width + 5), torch.nan)
@@ -53,7 +53,7 @@ def test_maps_of_any_size_move_with_the_photograph(scene, size):
     whole = photograph_pixels(BARREL)
     if size == (60, 40):
         assert_close(expected, whole)
-    # The lens itself, in pixels of the photograph: f (1 + k r^2) x + c.
+    # The camera model, in pixels of the photograph: f (1 + k r^2) x + c.
     f, cx, cy, k = BARREL.params
     plane = (ramp.double() * factor - torch.tensor([cx, cy])) / f
     lens = f * (1 + k * plane.square().sum(-1, keepdim=True)) * plane + torch.tensor([cx, cy])
@@ -63,12 +63,12 @@ def test_maps_of_any_size_move_with_the_photograph(scene, size):
     got = found.depth[0, :height, :width].double()
     assert_close(got[inner], expected[..., 0][inner], rtol=0, atol=1e-4)
     assert (found.sizes_px == prior.sizes_px).all()
-    # Of a ramp, neighbours differ by 1 at most: a quarter of that squared is added.
+    # Neighbours on a ramp differ by at most 1: a quarter of its square is added.
     assert (found.variance[0, :height, :width] >= 0.01 - 1e-6).all()
     assert (found.variance[0, :height, :width] <= 0.26 + 1e-6).all()
 
 
-def test_what_looks_past_the_edge_is_unknown(scene):
+def test_pixels_beyond_the_edge_are_unknown(scene):
     ones = torch.ones(1, 40, 60)
     depth, inside, inlier = placed(
         scene,
@@ -86,8 +86,8 @@ def test_what_looks_past_the_edge_is_unknown(scene):
         assert_close(probability[0][~past], ones[0][~past])
 
 
-def test_values_count_by_their_precision(scene):
-    """A column that is not known counts for nothing; one that is hardly known, for hardly more."""
+def test_values_are_weighted_by_their_precision(scene):
+    """An unknown column has no weight; a column of large variance has little more."""
     columns = torch.arange(60.0).expand(1, 40, 60)
     odd = (columns % 2 == 1) & (columns > 0)
     values = torch.where(odd, 7.0, 3.0)
@@ -104,13 +104,13 @@ def test_values_count_by_their_precision(scene):
     assert (variance[known] >= 0.04 - 1e-6).all()
     (vague, _), (evenly, mixed) = resampled(4.0), resampled(0.04)
     assert ((vague - 3).abs() <= (evenly - 3).abs() + 1e-5).all()
-    # In the middle between 3 and 7, which is nowhere, the mean is 2 off either of them.
+    # Midway between 3 and 7, the mean is 2 off both.
     middle = (evenly - 5).abs() < 0.05
     assert middle.any()
     assert_close(mixed[middle], torch.full_like(mixed[middle], 4.04), rtol=0.01, atol=0)
 
 
-def test_normals_stay_unit_and_their_spread_counts(scene, generator):
+def test_normals_stay_unit_and_their_spread_adds_variance(scene, generator):
     normals = torch.randn(2, 20, 30, 3, generator=generator)
     normals = normalize(normals, dim=-1)
     prior = NormalPrior(
@@ -120,9 +120,9 @@ def test_normals_stay_unit_and_their_spread_counts(scene, generator):
         variance=torch.full((2, 20, 30), 0.01),
     )
     (found,) = placed(scene, prior)
-    assert found.names == ("c.png",)  # of a photograph that is not in the scene there is nothing
+    assert found.names == ("c.png",)  # photographs outside the scene are dropped
     found.check("test")
-    # Of unit vectors that are merged, the mean square about the mean is 1 - |mean|^2.
+    # The mean square of unit vectors about their mean is 1 - |mean|^2.
     at = photograph_pixels(BARREL, 30, 20)[9, 14] - 0.5
     column, row = (int(value) for value in at.floor())
     part = at - at.floor()
@@ -134,7 +134,7 @@ def test_normals_stay_unit_and_their_spread_counts(scene, generator):
     assert_close(found.variance[0, 9, 14].double(), expected, rtol=0, atol=1e-5)
 
 
-def test_a_photograph_without_distortion_keeps_its_map_bit_for_bit(reconstruction, generator):
+def test_maps_of_undistorted_photographs_are_bitwise_unchanged(reconstruction, generator):
     depth = torch.rand(1, 13, 17, generator=generator)
     prior = of_one(DepthPrior, (17, 13), depth=depth, variance=depth + 1)
     for lenses in (reconstruction.scene.lenses, ()):
@@ -143,7 +143,7 @@ def test_a_photograph_without_distortion_keeps_its_map_bit_for_bit(reconstructio
         assert torch.equal(found.variance, depth + 1)
 
 
-def test_maps_of_undistorted_photographs_and_lights_stay(scene):
+def test_undistorted_maps_and_lights_are_unchanged(scene):
     inside = of_one(SilhouettePrior, (4, 4), inside=torch.ones(1, 4, 4), undistorted=True)
     lights = LightPrior(lights=torch.ones(1, 4), variance=torch.ones(1), names=("a.png",))
     given = scene.replace(views=scene.views.replace(priors=(inside, lights)))
@@ -163,7 +163,7 @@ def test_gradients_reach_values_and_variances(scene):
     normals = torch.randn(1, 5, 6, 3, generator=generator).double().requires_grad_()
     variance = torch.rand(1, 5, 6, generator=generator).double() + 1
     assert torch.autograd.gradcheck(resampled, (normals, variance.requires_grad_()))
-    # An unknown value, even one that is no number, sends none back.
+    # Unknown values, even NaN, have no gradient.
     hole = variance.detach().clone()
     hole[0, 2, 3] = torch.inf
     broken = normals.detach().clone()

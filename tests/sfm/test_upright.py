@@ -17,7 +17,7 @@ def generator():
 
 
 def standing(num_views=12, span_deg=330.0, elevation_deg=25.0, **more):
-    """Give cameras round an object whose up is y."""
+    """Return cameras around an object whose up is y."""
     return arc_cameras(
         num_views,
         width=80,
@@ -32,7 +32,7 @@ def standing(num_views=12, span_deg=330.0, elevation_deg=25.0, **more):
 
 
 def rolled(poses, angles):
-    """Turn cameras about their optical axes, radians."""
+    """Roll cameras about their optical axes, in radians."""
     roll = torch.eye(4).double().repeat(len(poses), 1, 1)
     roll[:, 0, 0] = roll[:, 1, 1] = angles.cos()
     roll[:, 1, 0], roll[:, 0, 1] = angles.sin(), -angles.sin()
@@ -40,7 +40,7 @@ def rolled(poses, angles):
 
 
 def model_of(cameras, points, world_from_true):
-    """Put a model in a frame of its own; every view sees every point."""
+    """Return a model in the given frame; every view sees every point."""
     placed = cameras.cam_from_world.double() @ invert_rigid(world_from_true)
     return observed(
         cameras.to(torch.float64).replace(cam_from_world=placed),
@@ -60,31 +60,31 @@ def off_deg(direction, truth=(0.0, 1.0, 0.0)):
 
 @pytest.mark.parametrize("span_deg", [330.0, 60.0])
 @pytest.mark.parametrize("elevation_deg", [-10.0, 75.0])
-def test_cameras_that_are_held_level_tell_which_way_is_up(span_deg, elevation_deg):
-    # Along an arc of 60 degrees, the y axes' lean counts a little against the x axes'.
+def test_level_cameras_give_the_up_direction(span_deg, elevation_deg):
+    # Along an arc of 60 degrees, the tilt of the y axes has a small weight against the x axes.
     poses = standing(span_deg=span_deg, elevation_deg=elevation_deg).cam_from_world
     assert off_deg(level_up(poses)) < (0.01 if span_deg > 300 else 1.0)
 
 
-def test_cameras_that_are_held_by_hand_tell_it_to_a_degree(generator):
+def test_handheld_cameras_give_the_up_direction_to_a_degree(generator):
     roll = math.radians(3.0) * torch.randn(24, generator=generator, dtype=torch.float64)
     poses = rolled(standing(24, elevation_deg=30.0).cam_from_world, roll)
     assert off_deg(level_up(poses)) < 1.5
 
 
-def test_a_third_of_the_cameras_turned_by_a_quarter_does_not_matter():
+def test_quarter_turns_of_a_third_of_the_cameras_do_not_matter():
     poses = standing(12).cam_from_world
     poses = torch.stack([turned_pose(one, view % 3 == 0) for view, one in enumerate(poses)])
     assert off_deg(level_up(poses)) < 1.0
 
 
-def test_without_motion_sideways_up_is_where_cameras_have_it():
+def test_without_lateral_motion_up_is_that_of_the_cameras():
     poses = standing(3, span_deg=1e-6, elevation_deg=0.0).cam_from_world
     assert off_deg(level_up(poses)) < 0.01
 
 
-def test_a_model_stands_on_its_plane(generator):
-    # Cameras lean by 5 degrees, all the same way, as before a turntable; the table does not.
+def test_up_is_the_normal_of_the_supporting_plane(generator):
+    # Cameras are tilted by 5 degrees, all equally, as at a turntable; the table is not.
     cameras = standing(12, elevation_deg=30.0)
     leaning = rolled(cameras.cam_from_world, torch.full((12,), math.radians(5.0)).double())
     table = torch.rand(200, 3, generator=generator).double() * 2 - 1
@@ -97,7 +97,7 @@ def test_a_model_stands_on_its_plane(generator):
     assert bool((invert_rigid(found.cam_from_world)[:, 1, 3] > found.points_world[300, 1]).all())
 
 
-def test_a_wall_is_not_taken_for_the_ground(generator):
+def test_a_wall_is_not_mistaken_for_the_ground(generator):
     cameras = standing(9, span_deg=60.0, elevation_deg=0.0)
     wall = torch.rand(300, 3, generator=generator).double() * 2 - 1
     wall[:, 2] = -0.2
@@ -106,7 +106,7 @@ def test_a_wall_is_not_taken_for_the_ground(generator):
     assert_close(found.points_world[:, 2].std(), torch.tensor(0.0).double(), atol=1e-3, rtol=0)
 
 
-def test_cameras_stand_on_the_side_of_z_and_a_model_is_only_turned(generator):
+def test_cameras_are_on_the_side_of_z_and_a_model_is_only_rotated(generator):
     cameras = standing(9, span_deg=60.0)
     points, frame = torch.randn(50, 3, generator=generator), any_frame(generator)
     model = model_of(cameras, points, frame)
