@@ -194,7 +194,7 @@ def test_facets_without_data_are_dropped_except_in_small_holes(generator):
     assert boundary_vertices(found.mesh.faces, len(found.mesh.vertices_world)).any()
 
 
-def test_points_are_reassigned_and_moved_vertices_are_no_points(generator):
+def test_points_are_reassigned_and_moved_vertices_are_not_points(generator):
     coarse = sheet(generator, side=9)
     count = 300
     facet = torch.randint(len(coarse.mesh.faces), (count,), generator=generator)

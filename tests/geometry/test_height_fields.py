@@ -29,7 +29,7 @@ def test_lookup_reproduces_a_bilinear_function_off_the_samples(generator):
     assert_close(found, torch.stack([1 + 2 * px - 3 * py + px * py, px - py], dim=1))
 
 
-def test_lookup_puts_columns_along_x_and_honours_each_patch_origin():
+def test_lookup_has_columns_along_x_from_the_origin_of_each_patch():
     values = torch.arange(12.0, dtype=torch.float64).reshape(1, 1, 3, 4).repeat(2, 1, 1, 1)
     origin = torch.tensor([[0.0, 0.0], [10.0, -5.0]], dtype=torch.float64)
     spacing = torch.tensor([1.0, 0.5], dtype=torch.float64)

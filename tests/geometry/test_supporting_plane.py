@@ -18,7 +18,7 @@ def cameras(elevation_deg=40.0):
     )
 
 
-def test_points_on_a_table_lie_on_the_supporting_plane(generator):
+def test_the_supporting_plane_of_a_table_is_found(generator):
     table = torch.rand(200, 3, generator=generator).double() * 4 - 2
     table[:, 1] = 0.002 * torch.randn(200, generator=generator)
     above = torch.randn(300, 3, generator=generator).double() * 0.2 + torch.tensor([0, 0.8, 0])
@@ -34,7 +34,7 @@ def test_points_without_a_plane_have_none(generator):
     assert supporting_plane(points, cameras().centers_world, 3.0) is None
 
 
-def test_a_plane_with_points_below_it_supports_nothing(generator):
+def test_a_plane_with_points_below_it_is_not_supporting(generator):
     table = torch.rand(300, 3, generator=generator).double() * 2 - 1
     table[:, 1] = 0.0
     points = torch.cat([table, table - torch.tensor([0, 0.5, 0])])
@@ -43,7 +43,7 @@ def test_a_plane_with_points_below_it_supports_nothing(generator):
     assert_close(found.offset, torch.tensor(-0.5).double(), atol=1e-6, rtol=0)  # the lower one
 
 
-def test_a_plane_with_few_of_the_points_supports_nothing(generator):
+def test_a_plane_with_few_of_the_points_is_not_supporting(generator):
     points = torch.randn(500, 3, generator=generator).double()
     points[:, 1] = points[:, 1].abs() + 0.1
     for count, is_found in ((30, False), (60, True)):  # 6 and 11 % of all points

@@ -114,7 +114,7 @@ def test_facets_under_points_of_an_image():
     assert facets_under(pixels, corners).tolist() == [0, 1, -1, 0]
 
 
-def test_points_of_another_layer_and_stray_points_disagree_with_their_neighbours(generator):
+def test_points_of_a_different_layer_and_stray_points_disagree_with_neighbours(generator):
     lateral = uniform(generator, 300, 2)
     depth = 5 + 0.3 * lateral[:, :1]
     depth[:10] += 2.0  # another layer
@@ -125,7 +125,7 @@ def test_points_of_another_layer_and_stray_points_disagree_with_their_neighbours
     assert agree[20:].float().mean() > 0.98
 
 
-def test_neighbours_across_a_depth_edge_agree_each_with_its_own_side():
+def test_points_at_a_depth_edge_agree_with_their_own_side():
     lateral = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0)).double()
     depth = torch.where(lateral[:, :1] < 9.5, 100.0, 160.0).double()
     points_cam = torch.cat([lateral, depth], dim=1)
