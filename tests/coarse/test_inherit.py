@@ -55,9 +55,7 @@ def test_inherited_normals_are_a_weighted_least_squares_fit(generator):
     own = vertex_normals(fine, split.faces)
     weight = (surface.confidence + 0.05)[:, None]  # confidence plus a twentieth
     matrix = blend.mT @ (weight * blend)
-    damping = (
-        0.01 * matrix.diagonal().mean()
-    )  # normals of the facets, with a hundredth of the data's weight
+    damping = 0.01 * matrix.diagonal().mean()  # weight of the facets' own normals
     damped = matrix + damping * torch.eye(len(fine)).double()
     right = blend.mT @ (weight * surface.normals_world) + damping * own
     assert_close(found, normalize(torch.linalg.solve(damped, right), dim=1))

@@ -14,7 +14,7 @@ def shape_error(points, truth):
 
 
 def camera_error(model, points):
-    """Map points by the error of the model's cameras, to where they see exact pixels."""
+    """Return the shape error of points triangulated from exact pixels by the model's cameras."""
     truth = ball.cameras_on_an_arc()
     pixels, _ = project(points, truth.cam_from_world, truth.intrinsics)
     each = torch.cartesian_prod(torch.arange(len(points)), torch.arange(6))

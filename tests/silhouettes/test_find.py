@@ -183,7 +183,7 @@ def test_masks_are_asked_for_and_missing(staged):
 
 
 def test_silhouettes_that_contradict_each_other_are_not_trusted(staged):
-    """Photographs with permuted cameras have no common hull."""
+    """Photographs shifted against their cameras have no common hull."""
     views = staged.scene.views
     shifted = [image.roll(90 * (view % 2) - 45, 2) for view, image in enumerate(views.images)]
     scene = staged.scene.replace(views=views.replace(images=torch.stack(shifted)))

@@ -36,7 +36,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def scene(truth):
-    """Return points on and around the balls, observed by views that they face."""
+    """Return points of the balls, observed by views they face, and unoccluded points around."""
     generator, cameras = torch.Generator().manual_seed(3), all_round()
     outward = normalize(torch.randn(900, 3, generator=generator).double(), dim=1)
     ball = torch.arange(600) % 3

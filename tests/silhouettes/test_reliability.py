@@ -19,7 +19,7 @@ def disc(center=(50.0, 40.0), radius=25.0):
 MARGINS = disc().expand(VIEWS, 80, 100)
 CAST = disc((72.0, 52.0), 9.0) > 0
 SHADOWED = (disc() > 0) | CAST
-"""The disc, and what it casts on the ground beside it."""
+"""The disc and its cast shadow on the ground."""
 
 
 def cuts_of(changed):
@@ -29,7 +29,7 @@ def cuts_of(changed):
 
 
 def with_dark(where):
-    """Return views with a twentieth of the radiance in a region."""
+    """Return log radiance that falls to a twentieth in a region, in all views."""
     return (-3.0 * where).expand(VIEWS, 80, 100)
 
 
