@@ -91,9 +91,8 @@ def test_creases_in_the_near_null_space_cost_few_cycles(generator):
     rows = torch.cat([one, other, one, other, pixel.flatten()])
     cols = torch.cat([one, other, other, one, pixel.flatten()])
     system = Multigrid(rows, cols, torch.cat([a * a, b * b, -a * b, -a * b, anchor]), side * side)
-    assert (
-        system.iterate(random(generator, side * side))[1] <= 40
-    )  # 90 if the prolongation keeps constants
+    # 90 if the prolongation keeps constants.
+    assert system.iterate(random(generator, side * side))[1] <= 40
 
 
 def test_a_matrix_solved_by_smoothing_needs_no_levels(generator):

@@ -101,9 +101,8 @@ def with_masks(scene, masks):
 
 def test_given_masks_are_trusted(staged):
     drawn = staged.truth.clone()
-    drawn[:, :90] &= (
-        pixel_centers(240, 180, like=torch.ones(()))[:90, :, 0] < 120
-    )  # only part of the ball
+    # Only part of the ball.
+    drawn[:, :90] &= pixel_centers(240, 180, like=torch.ones(()))[:90, :, 0] < 120
     for masks in (staged.truth, drawn):
         scene = with_masks(staged.scene, masks)
         silhouettes = FindSilhouettes()(scene)
