@@ -65,11 +65,11 @@ def test_srgb_images_are_warned_of_and_linear_ones_are_not(given, recwarn):
 @pytest.mark.parametrize(
     ("mistaken", "message"),
     [
-        (torch.linalg.inv, r"by `torch.linalg.inv\(poses\)`: they seem to be camera-to-world;"),
-        (lambda poses: FLIP @ poses, r"by `flip @ poses`, with `flip = .*y up and z backward"),
+        (torch.linalg.inv, r"with `torch.linalg.inv\(poses\)`: the poses seem .* camera-to-world;"),
+        (lambda poses: FLIP @ poses, r"with `flip @ poses`, where `flip = .*y up and z backward"),
         (
             lambda poses: torch.linalg.inv(FLIP @ poses),
-            r"by `flip @ torch.linalg.inv\(poses\)`, with `flip = .*camera-to-world, y up",
+            r"with `flip @ torch.linalg.inv\(poses\)`, where `flip = .*camera-to-world, y up",
         ),
     ],
 )

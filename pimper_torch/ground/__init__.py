@@ -1,1 +1,1 @@
-"""Geometry, linear algebra, radiometry and compiled kernels: nothing of the method."""
+"""Geometry, linear algebra, radiometry and compiled kernels, independent of the method."""

@@ -1,7 +1,6 @@
-"""Types of tensors that signatures name most often: dtype and axes, which are bound as written.
+"""Aliases of the most frequent tensor types in signatures: dtype and named axes.
 
-An axis of one name has one length in all arguments of a call, whether an alias or its long form
-names it.
+An axis name has the same length in all arguments of a call, whether in an alias or written out.
 """
 
 from jaxtyping import Bool, Float, Int

@@ -166,7 +166,7 @@ def test_without_points_masks_warn_of_a_different_frame(scene, masks, true_mesh)
     bare = without_points(scene)
     _, figures = prepared(true_mesh, bare, masks)
     assert set(figures) == {"faces", "overlap", "observations"}
-    with pytest.warns(PimperWarning, match=r"is off .*overlap with the masks by 38%"):
+    with pytest.warns(PimperWarning, match=r"deviates .*overlap with the masks by 38%"):
         prepared(exchanged(true_mesh, 0, 2, 1), bare, masks)
 
 
@@ -183,7 +183,7 @@ def test_a_wrong_mesh_is_rejected_and_a_rough_one_warned_of(scene, unknown, true
     prepared(scaled(0.97), scene, unknown)  # no warning
     box = trimesh.creation.box(bounds=[(PLACE - 1).tolist(), (PLACE + 1).tolist()])
     rough = Mesh(vertices_world=torch.tensor(box.vertices), faces=torch.tensor(box.faces).long())
-    with pytest.warns(PimperWarning, match="is off what the photographs show"):
+    with pytest.warns(PimperWarning, match="mesh deviates from the photographs"):
         prepared(rough, scene, unknown)
 
 

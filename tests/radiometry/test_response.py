@@ -91,8 +91,11 @@ def broken(change):
         (lambda x, y: (x[:16], y[:, :16]), "16 entries; needed: at least 17"),
         (lambda x, y: (x, y.expand(2, -1)), "2 colours; needed: 1 or 3"),
         (lambda x, y: (x, y.where(x != 9, torch.nan)), "not finite"),
-        (lambda x, y: (x, y.where(x != 9, 64.0)), r"radiance does not rise after level 8 \(64, "),
-        (lambda x, y: (x.where(x != 9, 20.0), y), "the levels do not rise after level 20"),
+        (
+            lambda x, y: (x, y.where(x != 9, 64.0)),
+            r"radiance does not increase after level 8 \(64, ",
+        ),
+        (lambda x, y: (x.where(x != 9, 20.0), y), "the levels do not increase after level 20"),
         (lambda x, y: (x + 1, y), "first level is 1; needed: 0"),
         (lambda x, y: (x, y - 5), "radiance of -5; needed: 0 or more"),
         (lambda x, y: (x / 2, y), "last level is 127.5; needed: 1 .*255"),

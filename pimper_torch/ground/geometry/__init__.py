@@ -1,1 +1,1 @@
-"""Pure functions on tensors: frames, pinholes, pixels, surfaces, visibility."""
+"""Geometry: frames, cameras, pixels, silhouettes, surfaces, visibility."""

@@ -1,4 +1,4 @@
-"""COLMAP's library, loaded so that it harms nothing else."""
+"""Loading of pycolmap without side effects on signals, zlib and logs."""
 
 import signal
 import sys
@@ -12,16 +12,16 @@ from pimper_torch.runtime.errors import caution
 
 
 def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    """Load pycolmap, and take SIGTERM back from its log, which would abort with a stack trace.
+    """Return the module pycolmap, without its handler of SIGTERM, which prints a stack trace.
 
-    Pillow is loaded before it: both carry zlib, and where pycolmap's comes first, Pillow damages
-    its memory as soon as it writes a PNG.
+    Pillow is loaded first: both contain zlib, and with that of pycolmap loaded first, Pillow
+    corrupts memory as soon as it writes a PNG.
     """
-    fresh = "pycolmap" not in sys.modules
+    first_import = "pycolmap" not in sys.modules
     import PIL.Image  # noqa: F401 - see above
     import pycolmap
 
-    if fresh and threading.current_thread() is threading.main_thread():
+    if first_import and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     _warn_of_import_order()
     return pycolmap
@@ -29,18 +29,18 @@ def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
 
 @cache
 def _warn_of_import_order() -> None:
-    """Warn, once, where a script has loaded pycolmap before Pillow."""
+    """Warn, once, if a script has loaded pycolmap before Pillow."""
     names = list(sys.modules)  # in the order of loading
     if names.index("pycolmap") < names.index("PIL._imaging"):
         caution(
-            "pycolmap was imported before Pillow: both carry zlib, and writing a PNG will end this "
-            "process. Put `import PIL.Image` before `import pycolmap`."
+            "pycolmap was imported before Pillow: both contain zlib, and writing a PNG will crash "
+            "this process. Put `import PIL.Image` before `import pycolmap`."
         )
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep COLMAP's log off stderr; what matters comes back as results or exceptions."""
+    """Suppress COLMAP's log on stderr; its results and exceptions remain."""
     pycolmap = loaded()
 
     level = pycolmap.logging.minloglevel

@@ -1,7 +1,7 @@
-"""Constraints of the silhouettes on the surface.
+"""Constraints of the silhouettes on the surface: contour rays and contour points.
 
-Pixels of the silhouettes become rays that the surface is tangent to, with its normal there. Where a
-ray touches the surface follows from the surface, as far as it is known.
+Points of the silhouettes become rays to which the surface is tangent, with its normal there. The
+tangent point on a ray is computed from a previous estimate of the surface.
 """
 
 import math
@@ -26,60 +26,59 @@ from pimper_torch.runtime.parallel import num_workers, side_by_side
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 
-# Variance of a place that is known to a pixel: that of the uniform distribution over it.
+# Variance of a position known to one pixel: that of the uniform distribution over it.
 _PIXEL = 1 / 12
 
-# Variance that reading a slope between pixels adds: a difference over one pixel (1/12) of
-# values interpolated linearly (1/6).
+# Variance added by measuring a slope between pixels: a difference over one pixel (1/12) of linearly
+# interpolated values (1/6).
 _READING = 1 / 12 + 1 / 6
 
 
-# Which points of the silhouettes become rays; choices, in pixels of the probability maps.
-_BLUR_PX = 1.0  # standard deviation of the Gaussian that the maps are smoothed with
+# Selection of the points that become rays; choices, in pixels of the probability maps.
+_BLUR_PX = 1.0  # standard deviation of the Gaussian that smooths the maps
 _TANGENT_PX = 3.0  # the same along the silhouette, for its tangents
-_BORDER_PX = 3.0  # rays keep so far from the photograph's border
+_BORDER_PX = 3.0  # minimum distance of rays from the photograph's border
 _MIN_LENGTH_PX = 24.0  # shorter silhouettes are specks
-_CORNER_PX = 6  # a corner is where the tangent turns too far from so far before to so far after
-_MAX_CONVEX_DEG = 90.0  # turn of a silhouette that bends around the object
-# The same of one that bends into it: where one part of the surface hides another, the silhouette
-# has a concave corner, and no normal.
+_CORNER_PX = 6  # a corner is a turn of the tangent between this far behind and this far ahead
+_MAX_CONVEX_DEG = 90.0  # maximum turn where the silhouette bends around the object
+# Maximum turn where it bends into the object: a silhouette has a concave corner, without a normal,
+# where one part of the surface occludes another.
 _MAX_CONCAVE_DEG = 40.0
 
 
 def contour_rays(silhouettes: Silhouettes, cameras: Cameras, per_view: int = 300) -> ContourRays:
-    r"""Cast rays through the silhouettes, and find the surface's normal on each.
+    r"""Compute rays through the silhouettes, with the surface normal on each.
 
-    A surface that ends in the picture is tangent there to the ray, and its contour to the
-    silhouette: its normal is :math:`\pm r \times \dot r`, with :math:`r` the ray and
-    :math:`\dot r` its change along the silhouette (Cipolla & Blake, IJCV 9(2), 1992). Silhouettes
-    are where the smoothed probability is a half; read as the distribution of the silhouette's
-    place, it has there a slope of :math:`1 / (\sigma \sqrt{2 \pi})`.
+    At its outline the surface is tangent to the ray, and its contour to the silhouette. The normal
+    is :math:`\pm r \times \dot r`, with :math:`r` the ray and :math:`\dot r` its change along the
+    silhouette (Cipolla & Blake, IJCV 9(2), 1992). The silhouette is where the smoothed probability
+    is a half. As the distribution of the silhouette's position, the probability has a slope of
+    :math:`1 / (\sigma \sqrt{2 \pi})` there.
 
     Args:
-        silhouettes: Probabilities that pixels show the object; views that are not reliable get
-            no rays.
+        silhouettes: Probabilities that pixels show the object; unreliable views get no rays.
         per_view: Approximate number of rays a view, evenly spaced, at least a pixel apart.
 
     Returns:
-        Rays of all reliable views. Corners, where the surface has no single normal, specks,
-        and points at the photograph's border have none. A constant to autograd.
+        Rays of all reliable views, except at corners, where the surface has no single normal, on
+        specks, and at the photograph's border. Not differentiable.
     """
 
     def of_view(view: int) -> ContourRays:
         return _of_view(silhouettes.inside[view], cameras, view, per_view)
 
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
-    return ContourRays.cat([_nothing(cameras), *side_by_side(of_view, views)])
+    return ContourRays.cat([_no_rays(cameras), *side_by_side(of_view, views)])
 
 
-def _nothing(cameras: Cameras) -> ContourRays:
-    none = cameras.intrinsics.new_zeros(0, 3)
+def _no_rays(cameras: Cameras) -> ContourRays:
+    empty = cameras.intrinsics.new_zeros(0, 3)
     return ContourRays(
-        view=torch.zeros(0, dtype=torch.long, device=none.device),
-        pixels=none[:, :2],
-        rays_world=none,
-        normals_world=none,
-        sigma_px=none[:, 0],
+        view=torch.zeros(0, dtype=torch.long, device=empty.device),
+        pixels=empty[:, :2],
+        rays_world=empty,
+        normals_world=empty,
+        sigma_px=empty[:, 0],
     )
 
 
@@ -113,21 +112,21 @@ def _of_view(inside: Map, cameras: Cameras, view: int, per_view: int) -> Contour
 
 
 def _resampled(corners: Array) -> tuple[Array, bool]:
-    """Return points ``(u, v)``, about a pixel apart from 0 on, and whether their line is closed."""
+    """Resample a line about a pixel apart; return points ``(u, v)`` and whether it is closed."""
     steps = np.linalg.norm(np.diff(corners, axis=0), axis=1)
     length = np.concatenate([[0.0], np.cumsum(steps)])
     closed = bool((corners[0] == corners[-1]).all())
-    wanted = np.linspace(0, length[-1], round(length[-1]), endpoint=not closed)
-    points = [np.interp(wanted, length, corners[:, axis]) for axis in (1, 0)]
+    positions = np.linspace(0, length[-1], round(length[-1]), endpoint=not closed)
+    points = [np.interp(positions, length, corners[:, axis]) for axis in (1, 0)]
     return np.stack(points, axis=1), closed
 
 
 def _samples(points: Array, closed: bool, smooth: Array, stride: float) -> Array:
-    """Return rows of place, tangent and outward direction, two numbers each, and slope."""
-    how: Literal["wrap", "nearest"] = "wrap" if closed else "nearest"
-    tangent = gaussian_filter1d(points, _TANGENT_PX, axis=0, order=1, mode=how)
+    """Return rows of position, tangent and outward direction, two numbers each, and slope."""
+    mode: Literal["wrap", "nearest"] = "wrap" if closed else "nearest"
+    tangent = gaussian_filter1d(points, _TANGENT_PX, axis=0, order=1, mode=mode)
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
-    # The probability falls outward; its slope is the difference over half a pixel to either side.
+    # The probability falls outward; its slope is the difference over half a pixel on either side.
     across = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     inner, outer = (
         map_coordinates(smooth, (points + shift * across).T[::-1], order=1, mode="nearest")
@@ -141,10 +140,10 @@ def _samples(points: Array, closed: bool, smooth: Array, stride: float) -> Array
     )
     rotation = np.degrees(np.arccos((behind * ahead).sum(axis=1).clip(-1, 1)))
     convex = ((ahead - behind) * outward).sum(axis=1) < 0
-    most = np.where(convex, _MAX_CONVEX_DEG, _MAX_CONCAVE_DEG)
+    limit = np.where(convex, _MAX_CONVEX_DEG, _MAX_CONCAVE_DEG)
     size = np.array([smooth.shape[1], smooth.shape[0]]) - 1.0
     margin = np.minimum(points, size - points).min(axis=1) + 0.5
-    good = (rotation <= most) & (margin >= _BORDER_PX) & (rise != 0)
+    good = (rotation <= limit) & (margin >= _BORDER_PX) & (rise != 0)
     chosen = np.arange(0, len(points), stride).astype(int)
     chosen = chosen[chosen < len(points)]  # rounding may add one
     chosen = chosen[good[chosen]]
@@ -152,15 +151,15 @@ def _samples(points: Array, closed: bool, smooth: Array, stride: float) -> Array
     return np.asarray(rows[chosen])
 
 
-# Cosine between the offset from the nearest point's disc and its normal, from which on a place
-# is below the surface: next to the border of the known surface, no place is.
+# Minimum cosine between the normal of the nearest point's disc and the offset from it, for a
+# position below the surface: no position is below it next to its boundary.
 _ALONG_NORMAL = 0.9
 
-# How far outside the visual hull a ray may touch the surface.
+# Distance outside the visual hull at which a ray may touch the surface.
 _TOLERANCE_PX = 1.5
 
-# Points, itself included, to the last of which a point's disc reaches: those around it in a
-# triangle mesh.
+# A point's disc reaches to the last of this many nearest points, itself included: its neighbours in
+# a triangle mesh.
 _NEIGHBOURS = 7
 
 
@@ -168,24 +167,23 @@ _NEIGHBOURS = 7
 def contour_points(
     rays: ContourRays, cameras: Cameras, hull: Hull, points_world: Points, normals_world: Points
 ) -> ContourPoints:
-    """Find where each contour ray touches a surface, of which points with normals are given.
+    """Find the tangent points of contour rays on a surface given by points with normals.
 
-    It touches where, of all positions inside the visual hull, the ray runs deepest below the
-    surface or, if it passes the surface by, nearest to it. The place may be off along the ray:
-    the surface is tangent there, so that this matters little across it.
+    A tangent point is the position inside the visual hull at which the ray is deepest below the
+    surface or, if it misses the surface, nearest to it. An error along the ray matters little,
+    because the surface is tangent to it.
 
     Args:
-        points_world: Of the surface as far as it is known: a cloud or a mesh's vertices. Without
-            any, positions are in the centre of what is in the hull.
+        points_world: Of the surface where it is known: a cloud, or the vertices of a mesh. Without
+            points, the result is the centre of the ray's part inside the hull.
 
     Returns:
-        At most one place a ray. A ray has none where it does not meet the hull, and where
-        two surfaces, one behind the other, are as near to it: parts that hide each other.
-        A constant to autograd.
+        At most one point a ray. Rays that miss the hull have none, nor have rays equally near to
+        two surfaces, one behind the other, where parts occlude each other. Not differentiable.
     """
     centers = cameras.centers_world[rays.view]
     focal = cameras.intrinsics[rays.view, 0, 0]
-    # The depths at which rays enter and leave the ball around the hull's grid.
+    # Depths at which rays enter and leave the bounding sphere of the hull's grid.
     corners = hull.corners_world.to(rays.rays_world)
     middle, radius = corners.mean(dim=0), (corners[1] - corners[0]).norm() / 2
     square = rays.rays_world.square().sum(dim=1, keepdim=True)
@@ -195,32 +193,31 @@ def contour_points(
     steps = 128
     depth = low + torch.linspace(0, 1, steps).to(low) * (high - low)
     pixel = depth.mean(dim=1) / focal
-    known = len(points_world) > 0 and len(rays.view) > 0
-    surface = _SignedDistance(points_world, normals_world) if known else None
+    usable = len(points_world) > 0 and len(rays.view) > 0
+    surface = _SignedDistance(points_world, normals_world) if usable else None
     cost = _costs(rays, centers, depth, hull, _TOLERANCE_PX * pixel, surface)
-    # Places nearer to each other than that do not show which surface a ray touches.
     clear = ~ambiguous(cost, 2.0 * pixel)
-    (met,) = torch.nonzero(cost.isfinite().any(dim=1) & clear, as_tuple=True)
-    best = depth[met].gather(1, cost[met].argmin(dim=1, keepdim=True))
+    (ray,) = torch.nonzero(cost.isfinite().any(dim=1) & clear, as_tuple=True)
+    best = depth[ray].gather(1, cost[ray].argmin(dim=1, keepdim=True))
     offset = torch.linspace(-1, 1, 25).to(low)
-    fine = best + offset * (high - low)[met] / (steps - 1)
-    tolerance = _TOLERANCE_PX * pixel[met]
-    cost = _costs(rays.take(met), centers[met], fine, hull, tolerance, surface)
-    found = fine.gather(1, cost.argmin(dim=1, keepdim=True))
-    sigma = rays.sigma_px[met] * found[:, 0] / focal[met]
+    fine = best + offset * (high - low)[ray] / (steps - 1)
+    tolerance = _TOLERANCE_PX * pixel[ray]
+    cost = _costs(rays.take(ray), centers[ray], fine, hull, tolerance, surface)
+    tangent = fine.gather(1, cost.argmin(dim=1, keepdim=True))
+    sigma = rays.sigma_px[ray] * tangent[:, 0] / focal[ray]
     return ContourPoints(
-        points_world=centers[met] + found * rays.rays_world[met],
-        normals_world=rays.normals_world[met],
+        points_world=centers[ray] + tangent * rays.rays_world[ray],
+        normals_world=rays.normals_world[ray],
         variance=sigma.square(),
-        view=rays.view[met],
-        ray=met,
+        view=rays.view[ray],
+        ray=ray,
     )
 
 
 class _SignedDistance:
-    """Distance to the surface around some of its points, negative below it.
+    """Signed distance to a surface given by points with normals, negative below it.
 
-    A point represents a disc of its tangent plane that reaches to its neighbours.
+    Each point represents a disc in its tangent plane that reaches to its neighbours.
     """
 
     def __init__(self, points: Points, normals: Points) -> None:
@@ -228,18 +225,18 @@ class _SignedDistance:
         self._points, self._normals, self._tree = points, normals, cKDTree(positions)
 
     def __call__(self, positions: Float[Tensor, "place 3"]) -> Float[Tensor, " place"]:
-        asked = positions.detach().cpu().double().numpy()
-        _, nearest = self._tree.query(asked, workers=num_workers())
+        queries = positions.detach().cpu().double().numpy()
+        _, nearest = self._tree.query(queries, workers=num_workers())
         index = torch.from_numpy(nearest).to(self._points.device)
         offset, normals = positions - self._points[index], self._normals[index]
         height = (offset * normals).sum(dim=1)
-        some, place = torch.unique(index, return_inverse=True)
+        used, disc = torch.unique(index, return_inverse=True)
         count = min(_NEIGHBOURS, len(self._points))
-        chosen = self._points[some].detach().cpu().double().numpy()
-        reach, _ = self._tree.query(chosen, k=[count], workers=num_workers())
-        radii = torch.from_numpy(np.asarray(reach)[:, 0]).to(self._points)[place]
-        beside = (offset - height[:, None] * normals).norm(dim=1) - radii
-        distance = torch.hypot(height, beside.clamp_min(0))
+        centers = self._points[used].detach().cpu().double().numpy()
+        reach, _ = self._tree.query(centers, k=[count], workers=num_workers())
+        radii = torch.from_numpy(np.asarray(reach)[:, 0]).to(self._points)[disc]
+        outside = (offset - height[:, None] * normals).norm(dim=1) - radii
+        distance = torch.hypot(height, outside.clamp_min(0))
         return torch.where(height < -_ALONG_NORMAL * distance, -distance, distance)
 
 
@@ -253,7 +250,7 @@ def _costs(
 ) -> Float[Tensor, "ray step"]:
     """Return the signed distance to the surface along the rays; infinite outside the hull.
 
-    Without a surface it is the distance to the centre of what is in the hull.
+    Without a surface it is the distance to the centre of the ray's part inside the hull.
     """
     positions = centers[:, None] + depth[..., None] * rays.rays_world[:, None]
     inside = hull.depth_of(positions.to(hull.distance)) >= -tolerance[:, None].to(hull.distance)
@@ -269,19 +266,18 @@ def _costs(
 def ambiguous(
     cost: Float[Tensor, "ray step"], tolerance: Float[Tensor, " ray"]
 ) -> Bool[Tensor, " ray"]:
-    """Report rays that come equally near to two surfaces, one behind the other.
+    """Return whether each ray is equally near to two surfaces, one behind the other.
 
     Args:
-        cost: Signed distance to the surface along the rays; infinite where they cannot
-            touch it.
-        tolerance: Difference of distances that does not count. Places are on two surfaces if the
-            distance between them rises by more.
+        cost: Signed distance to the surface along the rays; infinite where they cannot touch it.
+        tolerance: Distances that differ by less are equal. Two near positions are on different
+            surfaces if the distance exceeds the smallest one by twice this between them.
     """
     margin = tolerance[:, None]
-    # Below the surface, or on it, is all the same: thick and thin parts are alike near.
+    # Positions below the surface count as on it, so the thickness of a part does not matter.
     lowest = cost.amin(dim=1, keepdim=True).clamp_min(0)
     near, far = cost <= lowest + margin, cost > lowest + 2 * margin
-    # A new stretch begins where positions are near again after some that are far.
+    # Near positions in different stretches have a far one between them.
     stretch = far.cumsum(dim=1)
     first = torch.where(near, stretch, cost.shape[1] + 1).amin(dim=1)
     last = torch.where(near, stretch, -1).amax(dim=1)
@@ -290,7 +286,7 @@ def ambiguous(
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Contours(Record):
-    """Rays that the surface is tangent to, and the hull that it is inside of.
+    """Contour rays, to which the surface is tangent, and the visual hull that contains it.
 
     Attributes:
         rays: Through the silhouettes of all reliable views.
@@ -303,7 +299,7 @@ class Contours(Record):
 
     @classmethod
     def none(cls, silhouettes: Silhouettes, cameras: Cameras) -> "Contours":
-        """Return contours without rays; the hull holds everything, or what is above planes."""
+        """Return contours without rays; the hull is all space, or all space above the planes."""
         like, planes = cameras.cam_from_world, silhouettes.planes_world
         hull = UnboundedHull(
             origin_world=like.new_zeros(3),
@@ -312,13 +308,13 @@ class Contours(Record):
             normals_world=planes[:, :3].to(like),
             offsets=-planes[:, 3].to(like),
         )
-        return cls(silhouettes=silhouettes, rays=_nothing(cameras), cameras=cameras, hull=hull)
+        return cls(silhouettes=silhouettes, rays=_no_rays(cameras), cameras=cameras, hull=hull)
 
     @property
     def confine(self) -> bool:
-        """Whether silhouettes give a hull that the object is inside of."""
+        """Whether the hull is bounded by silhouettes."""
         return not isinstance(self.hull, UnboundedHull)
 
     def touching(self, points_world: Points, normals_world: Points) -> ContourPoints:
-        """Find where the rays touch a surface; see :func:`.contour_points`."""
+        """Return the tangent points of the rays on a surface; see :func:`.contour_points`."""
         return contour_points(self.rays, self.cameras, self.hull, points_world, normals_world)

@@ -1,4 +1,4 @@
-"""Directions spread over the sphere."""
+"""Unit directions distributed over the sphere."""
 
 import math
 
@@ -10,7 +10,7 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def even_directions(count: int) -> Float[Tensor, "direction 3"]:
-    """Spread unit directions evenly over the sphere, along a Fibonacci spiral; float64."""
+    """Return unit directions evenly distributed on the sphere, by a Fibonacci spiral; float64."""
     step = torch.arange(count, dtype=torch.float64)
     height = 1 - (2 * step + 1) / count
     radius = (1 - height**2).sqrt()

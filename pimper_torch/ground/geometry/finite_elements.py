@@ -1,9 +1,9 @@
 r"""Linear finite elements on triangle meshes: Laplacian and mass.
 
-A function is its values at the vertices, linear on every face. With :math:`G` its gradient,
-:math:`A` the areas of the faces and :math:`w` a weight of each, the Laplacian is
-:math:`L = G^T A\, w\, G`: that of a graph whose edges weigh half the cotangents of the angles
-opposite to them. The least-squares fit of heights to slopes :math:`p`,
+A function is given by its values at the vertices and linear on every face. With :math:`G` its
+gradient, :math:`A` the areas of the faces and :math:`w` their weights, the Laplacian is
+:math:`L = G^T A\, w\, G`: a graph Laplacian in which an edge weighs half the cotangents of its
+opposite angles. The least-squares fit of heights to slopes :math:`p`,
 :math:`\min \int w |\nabla z - p|^2`, is :math:`L z = G^T A\, w\, p`.
 
 Source: Dziuk, in Partial Differential Equations and Calculus of Variations, 1988.
@@ -21,11 +21,12 @@ from pimper_torch.ground.shapes import Faces, PerVertex, Vertices
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Elements:
-    """The faces of a mesh as its functions see them.
+    """Linear elements on the faces of a mesh.
 
     Attributes:
-        opposite: To each corner, the edge; turned into the face, the gradient of the function that
-            is 1 there and 0 at the other two, times twice the area.
+        opposite: Edge opposite to each corner. Rotated by 90 degrees into the face, it is the
+            gradient of the function with 1 there and 0 at the other corners, times twice the area.
+        count: Number of vertices.
     """
 
     faces: Faces
@@ -35,7 +36,7 @@ class Elements:
 
 
 def elements(vertices: Vertices, faces: Faces) -> Elements:
-    """Measure the faces of a mesh; differentiable, and in the dtype of the vertices."""
+    """Compute the elements of a mesh; differentiable, in the dtype of the vertices."""
     corners = vertices[faces]
     opposite = corners.roll(-2, dims=1) - corners.roll(-1, dims=1)
     area = face_normals(vertices, faces).norm(dim=-1) / 2
@@ -48,13 +49,13 @@ def cotangent_laplacian(
     r"""Return the entries of :math:`\int w \nabla \varphi_i \cdot \nabla \varphi_j`.
 
     Args:
-        min_shape: A needle's area is taken as at least this fraction of its longest edge
-            squared: its cotangents would otherwise spoil the condition of the whole matrix.
+        min_shape: Lower bound of a face's area, as a fraction of its longest edge squared: the
+            cotangents of needles would otherwise dominate the condition number.
 
     Returns:
-        Rows, columns and values; entries named twice add up. Positive semidefinite: constants
-        of a component are free. Differentiable in the weights and, through the elements, in
-        the vertices.
+        Rows, columns and values; duplicate entries add up. Positive semidefinite: a constant on a
+        connected component is in the null space. Differentiable in the weights and, through the
+        elements, in the vertices.
     """
     longest = mesh.opposite.square().sum(-1).amax(dim=1)
     shape = torch.maximum(mesh.area, min_shape * longest)
@@ -65,6 +66,6 @@ def cotangent_laplacian(
 
 
 def lumped_mass(mesh: Elements, density: Float[Tensor, " face"]) -> PerVertex:
-    """Assign each vertex a third of the mass of every face round it."""
+    """Return the mass of each vertex: a third of that of every face around it."""
     fraction = (mesh.area * density / 3)[:, None].expand(-1, 3)
     return fraction.new_zeros(mesh.count).index_add(0, mesh.faces.flatten(), fraction.flatten())

@@ -1,9 +1,9 @@
-"""Height fields on templates: looking values up, and where rays meet the height field.
+"""Height fields on templates: interpolation, and intersection with rays.
 
 A height field is a depth z for every sample of a raster in the patch frame. Sample (row i,
-column j) lies at ``x = origin_x + j spacing``, ``y = origin_y + i spacing``, so counting
-from the first sample's centre is :func:`~pimper_torch.ground.geometry.pixels.indices_from_pixels`
-already undone. Rasters have at least two samples a side.
+column j) is at ``x = origin_x + j spacing``, ``y = origin_y + i spacing``: indices count from the
+centre of the first sample, unlike pixels (:mod:`~pimper_torch.ground.geometry.pixels`). Rasters
+have at least two samples a side.
 """
 
 import torch
@@ -17,8 +17,8 @@ PerPatch = Float[Tensor, " patch"]
 Origins = Float[Tensor, "patch 2"]
 PerRay = Float[Tensor, "patch ray"]
 
-# A neighbour that carries less of the blend than this may be invalid: a point that lies on
-# a row of samples must not miss because rounding put it a hair off the row.
+# A neighbour with less interpolation weight than this may be invalid: rounding must not make a
+# point on a row of samples miss.
 _NEGLIGIBLE_WEIGHT = 1e-4
 
 
@@ -29,17 +29,16 @@ def sample_raster(
     spacing: PerPatch,
     valid: PatchMask | None = None,
 ) -> Float[Tensor, "patch channel ray"]:
-    """Look values up between the samples of a template, bilinearly.
+    """Interpolate the samples of templates bilinearly.
 
     Args:
-        values: Anything kept on the raster: depth, normals, albedo, confidence.
-        xy: Where, patch frame. Outside the raster the nearest border answers.
-        valid: Samples that are false stay out of the blend and the others share their
-            weight; where no neighbour is valid the answer is zero. ``None`` trusts all.
+        values: Any quantity on the raster: depth, normals, albedo, confidence.
+        xy: Positions, patch frame. Outside the raster, values of its border are returned.
+        valid: False samples are excluded and the other neighbours share their weight; without a
+            valid neighbour the result is zero. ``None`` uses all samples.
 
-    Differentiable in ``values``, and in ``xy`` inside each cell. Blended unit normals are
-    not unit. To learn whether the answer rests on valid samples only, look up
-    ``valid[:, None].to(values)`` as well.
+    Differentiable in ``values``, and in ``xy`` inside each cell. Interpolated unit normals are not
+    unit. To check whether all neighbours are valid, interpolate ``valid[:, None].to(values)`` too.
 
     >>> ramp = torch.arange(3.0).expand(1, 1, 2, 3)
     >>> zero = torch.zeros(1, 2)
@@ -51,10 +50,10 @@ def sample_raster(
     corners = _gather(values, neighbours)
     if valid is None:
         return (corners * weights[:, None]).sum(dim=-1)
-    known = _gather(valid[:, None], neighbours)
-    weights = weights[:, None] * known
+    valid_corners = _gather(valid[:, None], neighbours)
+    weights = weights[:, None] * valid_corners
     total = weights.sum(dim=-1)
-    blend = (torch.where(known, corners, 0) * weights).sum(dim=-1)
+    blend = (torch.where(valid_corners, corners, 0) * weights).sum(dim=-1)
     return torch.where(total > 0, blend / torch.where(total > 0, total, 1), 0)
 
 
@@ -67,28 +66,28 @@ def intersect_height_field(
     ray_directions: Float[Tensor, "patch ray 3"],
     steps: int = 3,
 ) -> tuple[Float[Tensor, "patch ray 3"], Bool[Tensor, "patch ray"]]:
-    r"""Find where rays meet the height field ``z = depth(x, y)``, bilinear between samples.
+    r"""Intersect rays with the height field ``z = depth(x, y)``, bilinear between samples.
 
-    From the point on the plane z = 0, Newton's steps on
-    :math:`f(t) = o_z + t d_z - \mathrm{depth}(o_{xy} + t d_{xy})`, with the slope of the
-    bilinear cell. One step is exact on a plane; three bring a smooth height field to rounding
-    for rays within some 60 degrees of the z axis. Rays that would cross the height field several
-    times find the crossing Newton leads to, usually the one nearest to the plane.
+    Newton steps on :math:`f(t) = o_z + t d_z - \mathrm{depth}(o_{xy} + t d_{xy})` from the point on
+    the plane z = 0, with the slope of the bilinear cell. One step is exact on a plane. On a smooth
+    height field, three steps converge to rounding for rays within some 60 degrees of the z axis. If
+    a ray crosses the height field several times, the result is usually the crossing nearest to the
+    plane.
 
     Args:
-        depth: z, patch frame; what invalid samples hold does not matter.
-        ray_origins: Patch frame; any point of the ray. Their dtype is that of the answer:
-            float64 rays meet a float32 height field in float64.
-        ray_directions: Any length and sign; the ray is the whole line.
+        depth: z, patch frame; values of invalid samples are ignored.
+        ray_origins: Patch frame; any point of the ray. Their dtype is that of the result: float64
+            rays are intersected with a float32 height field in float64.
+        ray_directions: Any length and sign; the ray is the complete line.
 
     Returns:
-        The points, and whether each is on the height field: all neighbours it is blended from
-        are valid, and the line passes it within a fiftieth of the spacing. A miss gives a
-        point on the ray that means nothing, though it is finite.
+        The points, and whether each is on the height field: all samples that it is interpolated
+        from are valid, and the distance along z is at most a fiftieth of the spacing. The point of
+        a miss is finite and on the ray, without a meaning.
 
-    Differentiable in ``depth``, ``ray_origins`` and ``ray_directions`` by the implicit
-    function: only the last step carries gradients, with its slope held, which is exact once
-    the steps before it have converged.
+    Differentiable in ``depth``, ``ray_origins`` and ``ray_directions`` by the implicit function
+    theorem: only the last step has gradients, with its slope held constant, which is exact if the
+    previous steps have converged.
     """
     x, y, z = ray_origins.unbind(dim=-1)
     dx, dy, dz = ray_directions.unbind(dim=-1)
@@ -96,8 +95,8 @@ def intersect_height_field(
     raster = continued_level(depth, valid).to(ray_origins).reshape(count, -1)
     per_sample = (1 / spacing)[:, None]
 
-    def gap_at(distance: PerRay) -> tuple[PerRay, PerRay]:
-        """Return the ray's height over the height field along z, and its derivative."""
+    def gap_of(distance: PerRay) -> tuple[PerRay, PerRay]:
+        """Return the distance from the height field to the ray along z, and its derivative."""
         column = ((x + distance * dx - origin[:, :1]) * per_sample).clamp(0, width - 1)
         row = ((y + distance * dy - origin[:, 1:]) * per_sample).clamp(0, height - 1)
         left = column.detach().floor().clamp_max(width - 2)
@@ -113,22 +112,22 @@ def intersect_height_field(
         climb = (slope_x * dx + slope_y * dy) * per_sample
         return z + distance * dz - upper - down * slope_y, dz - climb
 
-    normal_enough = 1e-3 * ray_directions.norm(dim=-1)
-    distance = -z / _away_from_zero(dz, normal_enough)
+    min_rate = 1e-3 * ray_directions.norm(dim=-1)
+    distance = -z / _away_from_zero(dz, min_rate)
     with torch.no_grad():
         for _ in range(steps - 1):
-            gap, rate = gap_at(distance)
-            distance = distance - gap / _away_from_zero(rate, normal_enough)
+            gap, rate = gap_of(distance)
+            distance = distance - gap / _away_from_zero(rate, min_rate)
     distance = distance.detach()
-    gap, rate = gap_at(distance)
-    distance = distance - gap / _away_from_zero(rate.detach(), normal_enough)
+    gap, rate = gap_of(distance)
+    distance = distance - gap / _away_from_zero(rate.detach(), min_rate)
     points = ray_origins + distance[..., None] * ray_directions
 
     with torch.no_grad():
-        gap, rate = gap_at(distance)
+        gap, rate = gap_of(distance)
         neighbours, across, down = _cell(points[..., :2], origin, spacing, depth.shape[-2:])
-        known = _gather(valid[:, None], neighbours)[:, 0]
-        supported = (_bilinear_weights(across, down) * known).sum(dim=-1)
+        valid_corners = _gather(valid[:, None], neighbours)[:, 0]
+        supported = (_bilinear_weights(across, down) * valid_corners).sum(dim=-1)
         index = (points[..., :2] - origin[:, None]) / spacing[:, None, None]
         last = index.new_tensor([depth.shape[2] - 1, depth.shape[1] - 1])
         slack = _NEGLIGIBLE_WEIGHT
@@ -136,24 +135,24 @@ def intersect_height_field(
             (supported >= 1 - slack)
             & ((index >= -slack) & (index <= last + slack)).all(dim=-1)
             & (gap.abs() <= 0.02 * spacing[:, None])
-            & (rate.abs() > normal_enough)
+            & (rate.abs() > min_rate)
         )
     return points, hit
 
 
 def continued_level(depth: PatchRaster, valid: PatchMask) -> PatchRaster:
-    """Assign invalid samples the mean of the valid ones among their eight neighbours.
+    """Fill invalid samples with the mean of the valid ones among their eight neighbours.
 
-    Rays that pass over the rim of the height field on their way are then not thrown off by what
-    lies beyond it. A sample without valid neighbours becomes 0, the facet's plane.
+    Newton steps near the rim of the height field then do not depend on invalid values. A sample
+    without valid neighbours becomes 0, the facet's plane.
     """
-    known = torch.where(valid, depth, 0)
+    masked = torch.where(valid, depth, 0)
     count = _sum_of_nine(valid.to(depth)).clamp_min(1)
-    return torch.where(valid, depth, _sum_of_nine(known) / count)
+    return torch.where(valid, depth, _sum_of_nine(masked) / count)
 
 
 def _sum_of_nine(raster: PatchRaster) -> PatchRaster:
-    """Add up every sample and its eight neighbours; avg_pool2d takes ten times as long."""
+    """Sum every sample and its eight neighbours; avg_pool2d takes ten times as long."""
     wide = pad(raster, (1, 1, 1, 1))
     columns = wide[:, :, :-2] + wide[:, :, 1:-1] + wide[:, :, 2:]
     return columns[:, :-2] + columns[:, 1:-1] + columns[:, 2:]
@@ -162,7 +161,7 @@ def _sum_of_nine(raster: PatchRaster) -> PatchRaster:
 def _cell(
     xy: Float[Tensor, "patch ray 2"], origin: Origins, spacing: PerPatch, size: torch.Size
 ) -> tuple[Int[Tensor, "patch ray 4"], PerRay, PerRay]:
-    """Return the four samples around each point, and its place between them in [0, 1]."""
+    """Return the four samples around each point, and its position in their cell in [0, 1]."""
     height, width = size
     index = (xy - origin[:, None]) / spacing[:, None, None]
     column = index[..., 0].clamp(0, width - 1)
@@ -185,12 +184,12 @@ def _gather(
     neighbours: Int[Tensor, "patch ray 4"],
 ) -> Float[Tensor, "patch channel ray 4"] | Bool[Tensor, "patch channel ray 4"]:
     channels = raster.shape[1]
-    where = neighbours.flatten(1)[:, None].expand(-1, channels, -1)
-    return raster.flatten(2).gather(2, where).reshape(*raster.shape[:2], *neighbours.shape[1:])
+    index = neighbours.flatten(1)[:, None].expand(-1, channels, -1)
+    return raster.flatten(2).gather(2, index).reshape(*raster.shape[:2], *neighbours.shape[1:])
 
 
 def _away_from_zero(value: PerRay, least: PerRay) -> PerRay:
-    """Keep a divisor's sign but not a size below ``least``; 1 for a ray without direction."""
+    """Clamp the magnitude of a divisor to ``least``, keeping its sign; 1 where ``least`` is 0."""
     sign = torch.where(value < 0, -1.0, 1.0).to(value)
     pushed = torch.where(value.abs() < least, sign * least, value)
     return torch.where(least > 0, pushed, 1)

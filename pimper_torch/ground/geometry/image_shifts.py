@@ -1,4 +1,4 @@
-"""Translations between photographs by the correlation of their texture."""
+"""Translations between images by phase correlation of their texture."""
 
 import torch
 from jaxtyping import Float
@@ -8,14 +8,14 @@ from pimper_torch.ground.shapes import Map
 
 
 def shift_between(texture: Map, other: Map) -> tuple[Float[Tensor, "2"], Float[Tensor, ""]]:
-    """Find the whole pixels that bring one photograph's texture onto another's.
+    """Estimate the integer shift in pixels from one texture to another.
 
     Args:
-        texture: Mean zero, 0 where nothing is known; and of ``other``.
+        texture: Mean zero, 0 where unknown; the same holds for ``other``.
 
     Returns:
-        The shift to add to ``(u, v)``, pixels, and the correlation of the overlap's known pixels; 0
-        where these are less than a tenth of the raster. A constant to autograd.
+        The shift to add to ``(u, v)``, pixels, and the correlation over the pixels known in both; 0
+        if these are less than a tenth of the raster. Not differentiable.
 
     Source: of the peak, Kuglin & Hines, The phase correlation image alignment method, 1975.
     """
@@ -25,18 +25,17 @@ def shift_between(texture: Map, other: Map) -> tuple[Float[Tensor, "2"], Float[T
     peak = int(torch.fft.irfft2(spectrum, s=(height, width)).argmax())
     down, across = peak // width, peak % width
     down, across = (
-        at - size if at > size // 2 else at for at, size in ((down, height), (across, width))
+        shift - size if shift > size // 2 else shift
+        for shift, size in ((down, height), (across, width))
     )
     rows = slice(max(0, -down), height - max(0, down)), slice(max(0, down), height + min(0, down))
     columns = (
         slice(max(0, -across), width - max(0, across)),
         slice(max(0, across), width + min(0, across)),
     )
-    here, there = texture[rows[0], columns[0]], other[rows[1], columns[1]]
-    known = (here != 0) & (there != 0)
-    product, own, others = (
-        (a * b)[known].sum() for a, b in ((here, there), (here, here), (there, there))
-    )
-    correlation = product / (own * others).sqrt().clamp_min(1e-12)
+    a, b = texture[rows[0], columns[0]], other[rows[1], columns[1]]
+    known = (a != 0) & (b != 0)
+    product, square_a, square_b = (values[known].sum() for values in (a * b, a * a, b * b))
+    correlation = product / (square_a * square_b).sqrt().clamp_min(1e-12)
     enough = known.sum() >= 0.1 * texture.numel()
     return texture.new_tensor([across, down]), torch.where(enough, correlation, 0)

@@ -1,4 +1,4 @@
-"""Lenses as COLMAP's camera models have them."""
+"""Projection, distortion and conversion of COLMAP's camera models."""
 
 from typing import Any
 
@@ -14,27 +14,27 @@ from pimper_torch.records import CameraModel, Cameras, SparseScene
 
 
 def pinhole_of(lens: CameraModel) -> Matrix3:
-    """Return ``K`` with the lens's focal length and principal point, in float64."""
+    """Return ``K`` with the focal lengths and principal point of a camera model, in float64."""
     return torch.from_numpy(np.array(camera_of(lens).calibration_matrix(), dtype=np.float64))
 
 
 def is_pinhole(lens: CameraModel) -> bool:
     """Return whether the lens images straight lines as straight lines.
 
-    COLMAP calls a lens undistorted whose coefficients are all zero; of a fisheye that is the
-    equidistant one, ``r = f theta``.
+    COLMAP calls a lens undistorted if its coefficients are all zero; for a fisheye this is the
+    equidistant projection, ``r = f theta``.
     """
     return "FISHEYE" not in lens.model and bool(camera_of(lens).is_undistorted())
 
 
 def distort(lens: CameraModel, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 2"]:
-    """Find where the lens images directions, in pixels of the photograph.
+    """Project directions through the lens to pixels of the photograph.
 
     Args:
         rays_cam: Camera frame, any length.
 
     Returns:
-        NaN for directions that the lens cannot image. A constant to autograd.
+        NaN for directions that the lens cannot image. Not differentiable.
     """
     rays = np.ascontiguousarray(rays_cam.detach().cpu().double().numpy())
     pixels = np.array(camera_of(lens).img_from_cam(rays), dtype=np.float64).reshape(-1, 2)
@@ -44,21 +44,21 @@ def distort(lens: CameraModel, rays_cam: Float[Tensor, "ray 3"]) -> Float[Tensor
 def undistort_pixels(
     lens: CameraModel, pixels: Float[Tensor, "pixel 2"]
 ) -> Float[Tensor, "pixel 2"]:
-    """Return ``(x, y)`` of the direction ``(x, y, 1)`` behind each pixel, as :func:`distort`."""
-    columns = np.ascontiguousarray(pixels.detach().cpu().double().numpy())
-    found = np.array(camera_of(lens).cam_from_img(columns), dtype=np.float64).reshape(-1, 2)
-    return torch.from_numpy(found).to(pixels)
+    """Return ``(x, y)`` of each pixel's direction ``(x, y, 1)``; inverse of :func:`distort`."""
+    points = np.ascontiguousarray(pixels.detach().cpu().double().numpy())
+    rays = np.array(camera_of(lens).cam_from_img(points), dtype=np.float64).reshape(-1, 2)
+    return torch.from_numpy(rays).to(pixels)
 
 
 def rescale_lens(lens: CameraModel, width: int, height: int) -> CameraModel:
-    """Follow a resize of the photograph."""
+    """Return the camera model of a resized photograph."""
     camera = camera_of(lens)
     camera.rescale(width, height)
     return lens_of(camera)
 
 
 def camera_of(lens: CameraModel) -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    """Return a lens as COLMAP has it."""
+    """Return the COLMAP camera of a camera model."""
     pycolmap = loaded()
     camera = pycolmap.Camera.create_from_model_name(
         lens.camera, lens.model, 1.0, lens.width, lens.height
@@ -68,7 +68,7 @@ def camera_of(lens: CameraModel) -> Any:  # noqa: ANN401 - pycolmap has no types
 
 
 def pinhole_lenses(cameras: Cameras) -> tuple[CameraModel, ...]:
-    """Assign every view its pinhole; views with equal ones share a camera."""
+    """Return the pinhole camera model of every view; views with equal ones share a camera."""
     numbers: dict[tuple[float, ...], int] = {}
     lenses = []
     for K, (width, height) in zip(
@@ -85,19 +85,19 @@ def pinhole_lenses(cameras: Cameras) -> tuple[CameraModel, ...]:
 def photographed(
     scene: SparseScene, pixels: Float[Tensor, "pixel 2"], view: Int[Tensor, " pixel"]
 ) -> Float[Tensor, "pixel 2"]:
-    """Return where the photographs, before undistortion, have pixels of the undistorted ones."""
-    found = pixels.clone()
+    """Map pixels of the undistorted photographs to those of the original ones."""
+    result = pixels.clone()
     pinholes = pinhole_lenses(scene.cameras)
-    for index, (own, pinhole) in enumerate(zip(scene.lenses, pinholes, strict=True)):
-        if own.replace(camera=pinhole.camera) != pinhole:
-            here = view == index
-            ends = homogeneous(undistort_pixels(pinhole, pixels[here]))
-            found[here] = distort(own, ends)
-    return found
+    for index, (lens, pinhole) in enumerate(zip(scene.lenses, pinholes, strict=True)):
+        if lens.replace(camera=pinhole.camera) != pinhole:
+            in_view = view == index
+            rays = homogeneous(undistort_pixels(pinhole, pixels[in_view]))
+            result[in_view] = distort(lens, rays)
+    return result
 
 
 def lens_of(camera: Any) -> CameraModel:  # noqa: ANN401 - see camera_of
-    """Return a lens of COLMAP's as a record."""
+    """Return the camera model of a COLMAP camera."""
     return CameraModel(
         camera=int(camera.camera_id),
         model=str(camera.model_name),

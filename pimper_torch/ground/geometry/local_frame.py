@@ -1,7 +1,7 @@
-"""The frame that a scene far from its origin is computed in: shifted, neither turned nor scaled.
+"""The local frame of a scene far from its origin: shifted, neither rotated nor scaled.
 
-Georeferenced models have coordinates of 1e5 units and more, of which single precision keeps
-hundredths. A scene's own frame has its origin among what is photographed.
+Georeferenced models have coordinates of 1e5 units and more, which single precision rounds to
+hundredths. The local frame has its origin near the object.
 """
 
 import math
@@ -17,10 +17,10 @@ NO_OFFSET: Offset = (0.0, 0.0, 0.0)
 
 
 def local_origin(cam_from_world: Poses, points_world: Points) -> Offset:
-    """Choose the origin of a scene's own frame, a round number; zero where its own will do.
+    """Choose the origin of a scene's local frame, in round numbers; zero if no shift is needed.
 
-    It is the median of the cloud, or of the cameras where there is none, so that points far out
-    change nothing.
+    It is the rounded median of the cloud, or of the cameras without a cloud; the median ignores
+    outliers.
 
     Args:
         points_world: The cloud; may be empty.
@@ -39,9 +39,9 @@ def local_origin(cam_from_world: Poses, points_world: Points) -> Offset:
         return NO_OFFSET
     middle = (points if len(points) else centers).median(dim=0).values
     radius = float((centers - middle).norm(dim=1).median())
-    if radius == 0:  # cameras that all stand there
+    if radius == 0:  # most cameras are at the median
         radius = float((centers - middle).norm(dim=1).max())
-    # From here on single precision moves points by a thousandth of a pixel of 2000.
+    # Beyond this, rounding to single precision moves points by a thousandth of a pixel of 2000.
     if radius == 0 or float(middle.norm()) <= 10.0 * radius:
         return NO_OFFSET
     digits = -math.floor(math.log10(radius))
@@ -50,16 +50,16 @@ def local_origin(cam_from_world: Poses, points_world: Points) -> Offset:
 
 
 def to_local(cam_from_world: Poses, offset: Offset) -> Poses:
-    """Return the poses that see points of which ``offset`` was subtracted; differentiable."""
+    """Return the poses for points with ``offset`` subtracted; differentiable."""
     rotation, translation = cam_from_world[:, :3, :3], cam_from_world[:, :3, 3]
     return rigid(rotation, translation + rotation @ rotation.new_tensor(offset))
 
 
 def from_local(cam_from_local: Poses, offset: Offset) -> Poses:
-    """Undo :func:`to_local`, in float64.
+    """Invert :func:`to_local`, in float64.
 
-    Rotations are made exact first: those of single precision would carry their rounding times the
-    offset into the cameras' centres.
+    Rotations are orthogonalized first: their rounding times the offset would otherwise shift the
+    cameras' centres.
     """
     if offset == NO_OFFSET:
         return cam_from_local.double()

@@ -1,8 +1,7 @@
-"""The nearest point of a surface.
+"""Nearest points on a surface.
 
-The one place that talks to fcpw. It searches on the CPU in float32 whatever the device of the
-tensors; the distance to the face that it names is then computed in float64. Answers are
-constants to autograd.
+The only module that calls fcpw, which searches on the CPU in float32 whatever the device of the
+tensors. The distance to the face found is then computed in float64. Not differentiable.
 """
 
 from dataclasses import dataclass
@@ -21,10 +20,10 @@ from pimper_torch.runtime.errors import InputError
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Nearest(Record):
-    """Where surfaces are nearest to points.
+    """Nearest points on a surface.
 
     Attributes:
-        face: Which contains them; of a point cloud, the index of the point.
+        face: Index of the face that contains each; for a point cloud, of the point.
     """
 
     distance: Float[Tensor, " point"]
@@ -33,11 +32,11 @@ class Nearest(Record):
 
 
 class NearestSurface:
-    """A mesh prepared for questions about its nearest point; a point cloud without faces.
+    """A mesh prepared for nearest-point queries; without faces, a point cloud.
 
-    Degenerate faces count as the edges or points they have shrunk to. Vertices without a
-    face are no part of a mesh that has faces. Of faces whose distances differ by less than a
-    millionth of the extent of mesh and points, any may be taken for the nearest.
+    Degenerate faces count as the edges or points they have shrunk to. Vertices without a face are
+    not part of a mesh with faces. If distances of faces differ by less than a millionth of the
+    extent of mesh and points, any of these faces may be returned.
 
     >>> square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> mesh = Mesh(vertices_world=square, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
@@ -63,20 +62,20 @@ class NearestSurface:
         self._scene.build(fcpw.aggregate_type.bvh_surface_area, True)
 
     def query(self, points: Points) -> Nearest:
-        """Find the nearest place of the surface for every point."""
-        asked = points.detach().cpu().double()
+        """Return the nearest point of the surface for every point."""
+        queries = points.detach().cpu().double()
         if len(self._faces):
-            found = fcpw.interaction_3D_list()
-            anywhere = np.full(len(asked), np.inf, dtype=np.float32)
-            self._scene.find_closest_points(self._columns(asked), anywhere, found)
-            face = torch.tensor([one.primitive_index for one in found], dtype=torch.long)
-            place = closest_on_triangles(asked, self._vertices[self._faces[face]])
+            hits = fcpw.interaction_3D_list()
+            unlimited = np.full(len(queries), np.inf, dtype=np.float32)
+            self._scene.find_closest_points(self._columns(queries), unlimited, hits)
+            face = torch.tensor([hit.primitive_index for hit in hits], dtype=torch.long)
+            nearest = closest_on_triangles(queries, self._vertices[self._faces[face]])
         else:
-            face = torch.from_numpy(np.asarray(self._tree.query(asked.numpy())[1])).long()
-            place = self._vertices[face]
+            face = torch.from_numpy(np.asarray(self._tree.query(queries.numpy())[1])).long()
+            nearest = self._vertices[face]
         return Nearest(
-            distance=(asked - place).norm(dim=1).to(points),
-            points=place.to(points),
+            distance=(queries - nearest).norm(dim=1).to(points),
+            points=nearest.to(points),
             face=face.to(points.device),
         )
 
@@ -87,10 +86,10 @@ class NearestSurface:
 def closest_on_triangles(
     points: Float[Tensor, "pair 3"], corners: Float[Tensor, "pair 3 3"]
 ) -> Float[Tensor, "pair 3"]:
-    """Return the point of each triangle that is nearest to its partner.
+    """Return the point of each triangle nearest to its point of ``points``.
 
-    It is the foot of the perpendicular where that is inside, else on the nearest edge. A
-    degenerate triangle has edges only.
+    It is the foot of the perpendicular if that is inside, else the nearest point of the edges. A
+    degenerate triangle has only edges.
     """
     a, b, c = corners.unbind(dim=1)
     ab, ac, ap = b - a, c - a, points - a
@@ -106,13 +105,13 @@ def closest_on_triangles(
         edge = end - start
         length = _dot(edge, edge)
         along = _dot(points - start, edge) / torch.where(length > 0, length, 1)
-        place = start + along.clamp(0, 1)[:, None] * edge
-        square = (place - points).square().sum(dim=1)
+        candidate = start + along.clamp(0, 1)[:, None] * edge
+        square = (candidate - points).square().sum(dim=1)
         nearer = square < least
-        best = torch.where(nearer[:, None], place, best)
+        best = torch.where(nearer[:, None], candidate, best)
         least = torch.where(nearer, square, least)
     return best
 
 
-def _dot(one: Float[Tensor, "pair 3"], other: Float[Tensor, "pair 3"]) -> Float[Tensor, " pair"]:
-    return (one * other).sum(dim=1)
+def _dot(a: Float[Tensor, "pair 3"], b: Float[Tensor, "pair 3"]) -> Float[Tensor, " pair"]:
+    return (a * b).sum(dim=1)

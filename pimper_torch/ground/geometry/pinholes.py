@@ -1,4 +1,4 @@
-"""Pinholes that look at a point."""
+"""Pinhole cameras from a viewpoint, a target and a focal length."""
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from pimper_torch.records import Cameras
 def look_at(
     eyes_world: ViewVectors, target_world: Float[Tensor, " 3"], up_world: Float[Tensor, " 3"]
 ) -> Poses:
-    """Return ``cam_from_world`` of cameras that look at one point and are held upright."""
+    """Return ``cam_from_world`` of upright cameras that look at one point."""
     forward = normalize(target_world - eyes_world, dim=-1)
     right = normalize(torch.linalg.cross(forward, up_world.expand_as(forward)), dim=-1)
     down = torch.linalg.cross(forward, right)
@@ -22,7 +22,7 @@ def look_at(
 
 
 def pinholes(cam_from_world: Poses, focal_px: float, width: int, height: int) -> Cameras:
-    """Return cameras of one focal length whose axis meets the centre of the image."""
+    """Return cameras with one focal length and the principal point in the image centre."""
     K = cam_from_world.new_tensor([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
     num_views = len(cam_from_world)
     return Cameras(

@@ -1,6 +1,6 @@
-"""COLMAP's surfaces: screened Poisson reconstruction, and meshes of few faces.
+"""COLMAP's screened Poisson reconstruction and mesh simplification.
 
-Both run on one thread: on several, sums in another order give another surface in each run.
+Both run on one thread: with several, the order of sums and so the surface differ between runs.
 """
 
 import tempfile
@@ -23,25 +23,24 @@ from pimper_torch.records import Mesh
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import ReconstructionError
 
-# COLMAP's octree is dense down to this depth, or to the least that any call of the process asked
-# for: a call with less would change the surfaces of all calls after it.
+# COLMAP's octree is dense down to this depth, or to the least depth of any call in the process:
+# a call with less would change the surfaces of all later calls.
 _DENSE_DEPTH = 5
 
 
 def poisson_surface(
     points: Points, normals: Points, *, depth: int, point_weight: float
 ) -> tuple[Vertices, Faces]:
-    """Put a closed surface through oriented points by screened Poisson reconstruction.
+    """Fit a closed surface to oriented points by screened Poisson reconstruction.
 
     Args:
-        depth: Of the octree: the longest side of the points' box is at most ``2 ** depth``
-            cells; 5 at least.
-        point_weight: Of the points against the smoothness.
+        depth: Of the octree, at least 5: the longest side of the points' bounding box has at most
+            ``2 ** depth`` cells.
+        point_weight: Weight of the points relative to the smoothness.
 
     Returns:
-        Vertices and faces, counter-clockwise from outside; without faces if there is no
-        surface. It closes where there are no points, too: what is not borne out is the
-        caller's to cut off.
+        Vertices and faces, counter-clockwise from outside; no faces if there is no surface. It is
+        closed even where there are no points: the caller removes parts without support.
 
     Raises:
         ReconstructionError: COLMAP cannot make a surface of the points.
@@ -59,21 +58,21 @@ def poisson_surface(
     with tempfile.TemporaryDirectory() as folder:
         cloud, surface = Path(folder) / "cloud.ply", Path(folder) / "surface.ply"
         cloud.write_bytes(f"{start}{properties}end_header\n".encode("ascii") + rows.tobytes())
-        return _made(surface, "Poisson", pycolmap.poisson_meshing, cloud, surface, options)
+        program = pycolmap.poisson_meshing
+        return _mesh_from(surface, "Poisson reconstruction", program, cloud, surface, options)
 
 
 def reduced(mesh: Mesh, num_faces: int) -> Mesh:
-    """Merge vertices where that changes the planes of faces least, until few faces are left.
+    """Simplify a mesh to about ``num_faces`` faces by merging vertices, least error first.
 
-    Borders count ten times as much as the surface. Normals, albedo, confidence and expected error
-    are those of the nearest place of the former surface, blended over its face. A constant to
-    autograd.
+    Boundaries count ten times as much as the surface. Normals, albedo, confidence and expected
+    error are interpolated at the nearest point of the original surface. Not differentiable.
 
     Args:
-        num_faces: Of the result at most; a few more are left where nothing else can be merged.
+        num_faces: Maximum; a few more remain if no other vertices can be merged.
 
     Raises:
-        ConfigError: Fewer than 4 faces are asked for.
+        ConfigError: ``num_faces`` is less than 4.
         ReconstructionError: COLMAP cannot simplify the mesh.
 
     Source: Garland & Heckbert, Surface simplification using quadric error metrics,
@@ -89,44 +88,42 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
     options.target_face_ratio = num_faces / len(mesh.faces)
     options.boundary_weight, options.num_threads = 10.0, 1
     options.interpolate_colors = False
-    # COLMAP works in single precision: a mesh far from the origin is brought there.
-    places = mesh.vertices_world.detach().cpu().double()
-    centre = places.median(dim=0).values
+    # COLMAP works in single precision, which is finest near the origin.
+    vertices_world = mesh.vertices_world.detach().cpu().double()
+    centre = vertices_world.median(dim=0).values
     with tempfile.TemporaryDirectory() as folder:
         before, after = Path(folder) / "before.ply", Path(folder) / "after.ply"
-        moved = trimesh.Trimesh((places - centre).numpy(), mesh.faces.cpu().numpy(), process=False)
-        moved.export(before, vertex_normal=False)
-        vertices, faces = _made(
-            after, "simplification", pycolmap.simplify_mesh, before, after, options
-        )
+        shifted = (vertices_world - centre).numpy(), mesh.faces.cpu().numpy()
+        trimesh.Trimesh(*shifted, process=False).export(before, vertex_normal=False)
+        program = pycolmap.simplify_mesh
+        vertices, faces = _mesh_from(after, "simplification", program, before, after, options)
     used, faces = torch.unique(_oriented(faces), return_inverse=True)
     points = vertices[used].double() + centre
-    known = [one.name for one in fields(Mesh) if getattr(mesh, one.name) is not None][2:]
+    names = [field.name for field in fields(Mesh) if getattr(mesh, field.name) is not None][2:]
     return Mesh(
         vertices_world=points.to(mesh.vertices_world),
         faces=faces.to(mesh.faces),
-        **(_nearest_values(mesh, known, points) if known else {}),
+        **(_nearest_values(mesh, names, points) if names else {}),
     )
 
 
 def _nearest_values(mesh: Mesh, names: list[str], points: Points) -> dict[str, Tensor]:
-    places = mesh.vertices_world.detach().cpu().double()
     nearest = NearestSurface(mesh).query(points)
     corners = mesh.faces.cpu()[nearest.face]
-    weights = barycentric(nearest.points, places[corners])
+    weights = barycentric(nearest.points, mesh.vertices_world.detach().cpu().double()[corners])
 
-    def blended(values: Tensor) -> Tensor:
+    def interpolate(values: Tensor) -> Tensor:
         rows = values.detach().cpu().double()[corners].reshape(len(corners), 3, -1)
         return (weights[..., None] * rows).sum(dim=1).reshape(-1, *values.shape[1:])
 
-    found = {name: blended(getattr(mesh, name)).to(getattr(mesh, name)) for name in names}
-    if "normals_world" in found:
-        found["normals_world"] = normalize(found["normals_world"], dim=-1)
-    return found
+    result = {name: interpolate(getattr(mesh, name)).to(getattr(mesh, name)) for name in names}
+    if "normals_world" in result:
+        result["normals_world"] = normalize(result["normals_world"], dim=-1)
+    return result
 
 
 def _oriented(faces: Faces) -> Int[Tensor, "kept 3"]:
-    """Drop faces that run along an edge the way that an earlier face does."""
+    """Drop faces that traverse an edge in the same direction as an earlier face."""
     ends = half_edges(faces)
     _, label = torch.unique(ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], return_inverse=True)
     number = torch.arange(len(faces)).repeat_interleave(3)
@@ -134,10 +131,10 @@ def _oriented(faces: Faces) -> Int[Tensor, "kept 3"]:
     return faces[(first[label] == number).reshape(-1, 3).all(dim=1)]
 
 
-def _made(
-    path: Path, what: str, program: Callable[..., object], *arguments: object
+def _mesh_from(
+    path: Path, name: str, program: Callable[..., object], *arguments: object
 ) -> tuple[Vertices, Faces]:
-    """Run a program of COLMAP's that writes a mesh, and read that; float32."""
+    """Run a function of COLMAP's that writes a mesh, and read the mesh; float32 vertices."""
     import trimesh
 
     try:
@@ -146,8 +143,8 @@ def _made(
         mesh = trimesh.load_mesh(path, process=False)
     except (ValueError, RuntimeError, OSError) as error:
         raise ReconstructionError(
-            f"surface: COLMAP's {what} made no mesh ({error}). Take more photographs of "
-            "textured surface, or bring a mesh of your own."
+            f"surface: COLMAP's {name} produced no mesh ({error}). Take more photographs of "
+            "textured surface, or provide a mesh."
         ) from error
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float32).reshape(-1, 3))
     return vertices, torch.from_numpy(np.array(mesh.faces, dtype=np.int64).reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""The pinhole: points to pixels, pixels to rays, rays to points."""
+"""Pinhole projection: points to pixels, pixels to rays, rays to points."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,7 +10,7 @@ from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.ground.shapes import Points, ViewVectors
 from pimper_torch.records import Cameras
 
-_POINTS = 2048  # at once: 72 MB of angles between the rays of 66 views
+_POINTS = 2048  # in a block: 72 MB of angles between the rays of 66 views
 
 
 def project(
@@ -18,11 +18,11 @@ def project(
     cam_from_world: Float[Tensor, "*#batch 4 4"],
     intrinsics: Float[Tensor, "*#batch 3 3"],
 ) -> tuple[Float[Tensor, "*batch point 2"], Float[Tensor, "*batch point"]]:
-    """Find where points appear in an image, and how deep they lie.
+    """Project points into an image.
 
     Returns:
-        Pixels, and depth along the camera's z. Behind the camera (depth <= 0) the pixels
-        mean nothing, and the caller masks them. Differentiable where depth is not 0.
+        Pixels, and depth along the camera's z. Pixels of points behind the camera (depth <= 0) are
+        meaningless; the caller masks them. Differentiable where depth is not 0.
     """
     points_cam = transform(cam_from_world, points_world)
     depth = points_cam[..., 2]
@@ -38,8 +38,7 @@ def rays_through(
 ) -> Float[Tensor, "*batch pixel 3"]:
     """Return the world direction of the ray through each pixel.
 
-    Not unit: its length is chosen so that ``center + depth * ray`` is the point at that
-    depth along the camera's z.
+    Not unit: ``center + depth * ray`` is the point at that depth along the camera's z.
     """
     rays_cam = torch.linalg.solve(intrinsics, homogeneous(pixels).mT).mT
     return rays_cam @ cam_from_world[..., :3, :3]
@@ -48,33 +47,33 @@ def rays_through(
 def triangulate_rays(
     cameras: Cameras, pixels: Float[Tensor, "point view 2"], seen: Bool[Tensor, "point view"]
 ) -> Points:
-    """Find the points nearest to their rays in the least-squares sense.
+    """Triangulate points: the nearest to their rays in the least-squares sense.
 
     Args:
-        seen: True where it does; by two views each point, from two places.
+        seen: Whether a view observes the point; at least two views with different centres do.
     """
     rays = rays_through(pixels.movedim(0, 1), cameras.cam_from_world, cameras.intrinsics)
     rays = (rays / rays.norm(dim=-1, keepdim=True)).movedim(0, 1)
     across = torch.eye(3).to(rays) - rays[..., :, None] * rays[..., None, :]
     across = across * seen[..., None, None]
     matrix = across.sum(dim=1)
-    right = (across @ cameras.centers_world[..., None]).sum(dim=1)
-    return torch.linalg.solve(matrix, right)[..., 0]
+    rhs = (across @ cameras.centers_world[..., None]).sum(dim=1)
+    return torch.linalg.solve(matrix, rhs)[..., 0]
 
 
 def triangulation_angles(
     points_world: Points, observed: Bool[Tensor, "point view"], centers_world: ViewVectors
 ) -> Float[Tensor, " point"]:
-    """Return each point's widest angle between two rays that saw it, in radians; 0 without two."""
+    """Return the largest angle between two rays of each point, radians; 0 with fewer than two."""
     count = observed.sum(dim=1)
-    widest = torch.zeros_like(points_world[:, 0])
-    for some in torch.split(count.argsort(stable=True), _POINTS):
-        longest = max(count[some].tolist(), default=0)
+    largest = torch.zeros_like(points_world[:, 0])
+    for block in torch.split(count.argsort(stable=True), _POINTS):
+        longest = max(count[block].tolist(), default=0)
         if longest < 2:
             continue
-        seen, views = observed[some].byte().topk(longest, dim=1)
-        rays = normalize(points_world[some, None] - centers_world[views], dim=-1)
-        both = (seen[:, :, None] * seen[:, None, :]).bool()
-        cosines = torch.where(both, rays @ rays.mT, 1).flatten(1).amin(dim=1)
-        widest[some] = cosines.clamp(-1, 1).acos()
-    return widest
+        seen, views = observed[block].byte().topk(longest, dim=1)
+        rays = normalize(points_world[block, None] - centers_world[views], dim=-1)
+        observed_pair = (seen[:, :, None] * seen[:, None, :]).bool()
+        cosines = torch.where(observed_pair, rays @ rays.mT, 1).flatten(1).amin(dim=1)
+        largest[block] = cosines.clamp(-1, 1).acos()
+    return largest

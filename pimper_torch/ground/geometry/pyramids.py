@@ -1,4 +1,4 @@
-"""Image pyramids, looked up at a sample's footprint, and the occluding surface, for all patches."""
+"""Image pyramids of photographs and priors, sampled at each sample's footprint."""
 
 import math
 from dataclasses import dataclass, field
@@ -34,10 +34,10 @@ from pimper_torch.runtime.parallel import side_by_side
 
 
 def halve(images: Float[Tensor, "view channels _ _"]) -> Float[Tensor, "view channels _ _"]:
-    """Blur and halve images as kornia's ``pyrdown`` does, in a sixth of the time.
+    """Blur and halve images as kornia's ``pyrdown``, in a sixth of the time.
 
-    Burt's binomial of five, then the mean of two: together six taps along rows and along
-    columns, at every other pixel. Sides that are odd go by ``pyrdown`` itself.
+    Burt's binomial filter of five taps and the mean of two pixels are one filter of six taps along
+    rows and along columns, at every other pixel. Images with an odd side use ``pyrdown``.
     """
     height, width = images.shape[-2:]
     if height % 2 or width % 2:
@@ -50,10 +50,10 @@ def halve(images: Float[Tensor, "view channels _ _"]) -> Float[Tensor, "view cha
 
 
 def pyramid_level(pixels: Float[Tensor, "patch height width 2"]) -> PatchRaster:
-    """Choose the pyramid level at which neighbouring samples are a pixel apart.
+    """Return the pyramid level at which neighbouring samples are one pixel apart.
 
-    The footprint is the square root of the area of a sample's parallelogram in the image:
-    a compromise for oblique facets between blur along one axis and aliasing along the other.
+    The footprint is the square root of the area of a sample's parallelogram in the image. For
+    oblique facets it balances blur along one axis and aliasing along the other.
     """
     du = _difference(pixels, dim=2)
     dv = _difference(pixels, dim=1)
@@ -66,10 +66,10 @@ def look_up(
     pixels: Float[Tensor, "sample 2"],
     level: Float[Tensor, " sample"],
 ) -> Float[Tensor, "sample channels"]:
-    """Look an image up, blending the two pyramid levels next to each sample's own.
+    """Sample an image, interpolated between the two pyramid levels nearest to each sample's.
 
-    Every level covers the same ``[0, width] x [0, height]`` of the finest, so one
-    normalised grid serves all. Differentiable in images and pixels.
+    Every level covers the same ``[0, width] x [0, height]`` of the finest, so one normalized grid
+    serves all. Differentiable in images and pixels.
     """
     finest = pyramid[0]
     grid = grid_from_pixels(pixels, width=finest.shape[-1], height=finest.shape[-2])
@@ -78,43 +78,40 @@ def look_up(
     total = finest.new_zeros(len(grid), len(finest))
     for index, image in enumerate(pyramid):
         weight = (1 - (level - index).abs()).clamp_min(0)
-        (some,) = torch.nonzero(weight > 0, as_tuple=True)
-        if len(some) > 0:
-            looked_up = grid_sample(
-                image[None],
-                grid[some][None, None],
-                mode="bilinear",
-                padding_mode="border",
-                align_corners=False,
+        (samples,) = torch.nonzero(weight > 0, as_tuple=True)
+        if len(samples) > 0:
+            positions = grid[samples][None, None]
+            values = grid_sample(
+                image[None], positions, padding_mode="border", align_corners=False
             )[0, :, 0].mT
-            total = total.index_add(0, some, weight[some, None] * looked_up)
+            total = total.index_add(0, samples, weight[samples, None] * values)
     return total
 
 
 def _difference(
     values: Float[Tensor, "patch height width 2"], dim: int
 ) -> Float[Tensor, "patch height width 2"]:
-    """Take forward differences, the last one repeated; zero along a single sample."""
+    """Return forward differences, the last one repeated; zero along a single sample."""
     steps = values.diff(dim=dim)
     if steps.shape[dim] == 0:
         return torch.zeros_like(values)
     return torch.cat([steps, steps.narrow(dim, steps.shape[dim] - 1, 1)], dim=dim)
 
 
-# Levels of a pyramid, down to an eighth of the photographs' size: templates of the coarsest scale
-# have a sample for every four pixels. A choice.
+# Number of pyramid levels, the coarsest at an eighth of the photographs' size: templates of the
+# coarsest scale have a sample for every four pixels. A choice.
 LEVELS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Pyramid(Record):
-    """Image pyramids, each level half the size of the one before.
+    """Image pyramids, each level half the size of the previous one.
 
-    The finest level is by itself, so that it can be the photographs, without a copy.
+    The finest level is separate, so that it can be the photographs without a copy.
 
     Attributes:
         finest: Floating point, or fractions in 255ths.
-        coarser: All further levels one after another, each of ``channel height width``.
+        coarser: All other levels, concatenated, each of ``channel height width``.
         sizes: Height and width of every level, the finest first.
     """
 
@@ -133,17 +130,17 @@ class Pyramid(Record):
 
     @property
     def pictures(self) -> PictureRows:
-        """The levels as kernels take them."""
+        """The levels as arguments of kernels."""
         return PictureRows(as_array(self.finest.flatten(1)), as_array(self.coarser))
 
     @property
     def fractions(self) -> FractionRows:
-        """Levels of fractions as kernels take them."""
+        """Levels of fractions as arguments of kernels."""
         return FractionRows(as_array(self.finest.flatten(1)), as_array(self.coarser))
 
     @property
     def table(self) -> Int[Tensor, "level 3"]:
-        """Height and width of every level, and where it starts in a channel of ``coarser``."""
+        """Height and width of every level, and its start in a channel of ``coarser``."""
         areas = torch.tensor([0, 0, *(height * width for height, width in self.sizes[1:])])
         sizes = torch.tensor(self.sizes)
         return torch.cat([sizes, areas.cumsum(0)[: len(sizes), None]], dim=1)
@@ -151,16 +148,15 @@ class Pyramid(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Sources(Record):
-    """Photographs at several sizes. It is not hashed in addition to the photographs.
+    """Pyramids of the photographs and of their priors. Excluded from hashes of the photographs.
 
     Attributes:
         images: Linear radiance; zero where it is not finite.
-        unusable: Fraction of every pixel that is unusable, in 255ths: outside the undistorted frame
-            or the mask, not finite, or saturated in any channel.
+        unusable: Unusable fraction of every pixel, in 255ths: outside the undistorted frame or the
+            mask, not finite, or saturated in any channel.
         gray: Mean over the channels.
-        priors: Guessed maps of the photographs, prepared like these.
-        lights: Guessed lights of the photographs, one a view, of infinite variance where none is
-            guessed.
+        priors: Pyramids of the prior maps.
+        lights: Prior lights, one a view, with infinite variance for views without one.
     """
 
     images: Pyramid = field(compare=False)
@@ -172,14 +168,15 @@ class Sources(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PriorMaps(Record):
-    """Guessed maps of some views, at several sizes.
+    """Pyramids of the maps of one prior.
 
     Attributes:
+        view: View of each map.
         zoom: Width and height of each map over those of its photograph.
         sizes_px: Width and height of each map.
         kind: Of the prior.
-        maps: Values times their inverse variance, and that; or probabilities.
-        in_world: Whether normals are in the world's frame, not the camera's.
+        maps: Values times their inverse variance, and the inverse variance; or probabilities.
+        in_world: Whether normals are in the world frame, not the camera frame.
     """
 
     view: Int[Tensor, " map"]
@@ -190,21 +187,22 @@ class PriorMaps(Record):
     in_world: bool = False
 
     def of(self, views: Int[Tensor, " view"]) -> "tuple[PriorMaps, Int[Tensor, ' row']]":
-        """Take the maps of some views, numbered among these, and their rows in ``maps``."""
+        """Return the maps of given views, renumbered to these, and their rows in ``maps``."""
         row, view = (self.view[:, None] == views).nonzero(as_tuple=True)
         return self.take(row).replace(view=view), row
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Return the pinholes that the maps were seen by."""
-        own = cameras.take(self.view)
-        zoom = torch.cat([self.zoom, torch.ones_like(self.zoom[:, :1])], dim=1).to(own.intrinsics)
-        return own.replace(intrinsics=zoom[:, :, None] * own.intrinsics, sizes_px=self.sizes_px)
+        """Return the pinhole cameras of the maps."""
+        views = cameras.take(self.view)
+        zoom = torch.cat([self.zoom, torch.ones_like(self.zoom[:, :1])], dim=1)
+        intrinsics = zoom.to(views.intrinsics)[:, :, None] * views.intrinsics
+        return views.replace(intrinsics=intrinsics, sizes_px=self.sizes_px)
 
 
 def image_from_patch(
     cameras: Cameras, patch_from_world: Float[Tensor, "patch 4 4"]
 ) -> Float[Tensor, "patch view 3 4"]:
-    """Return the projections of patches into views, in float64; differentiable."""
+    """Return the projection matrices from patch frames to views, in float64; differentiable."""
     exact = cameras.to(torch.float64)
     # The last row is a constant, not a parameter.
     intrinsics = torch.cat([exact.intrinsics[:, :2], exact.intrinsics[:, 2:].detach()], dim=1)
@@ -215,7 +213,7 @@ def image_from_patch(
 def centers_in_patches(
     cameras: Cameras, patch_from_world: Float[Tensor, "patch 4 4"]
 ) -> Float[Tensor, "patch view 3"]:
-    """Return centres of cameras in the frames of patches, in float64; differentiable."""
+    """Return camera centres in patch frames, in float64; differentiable."""
     return transform(patch_from_world.double(), cameras.to(torch.float64).centers_world)
 
 
@@ -226,10 +224,10 @@ def kernel_geometry(
     projections: Float[Tensor, "patch view 3 4"],
     centers: Float[Tensor, "patch view 3"],
 ) -> tuple[Projection, Samples]:
-    """Lay cameras and samples out for kernels; pixels are computed in float64.
+    """Return cameras and samples as arguments of kernels, which compute pixels in float64.
 
     Args:
-        rows: Where each camera's photograph is among the sources.
+        rows: Index of each camera's photograph among the sources.
         outward: Unit normals of the samples, patch frame.
         projections: See :func:`image_from_patch`.
         centers: See :func:`centers_in_patches`.
@@ -257,7 +255,7 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
     """
     images = views.images
     if not all(bool(image.isfinite().all()) for (image,) in each(images)):
-        # NaN times a weight of 0 is NaN; zeros are marked as unusable.
+        # NaN times a weight of 0 is NaN; these pixels are marked as unusable below.
         images = by_view(lambda image: torch.where(image.isfinite(), image, 0), images)
     count, _, height, width = images.shape
     shapes = [(height, width)]
@@ -266,13 +264,13 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
     sizes = tuple(shapes)
 
     def of_view(view: int) -> tuple[Tensor, ...]:
-        image, given = images[view][None], views.images[view]
+        image, original = images[view][None], views.images[view]
         wide, high = views.sizes_px[view].tolist()
-        lost = ~given.isfinite().all(dim=0) | (given.amax(dim=0) >= saturation_level)
-        lost[high:], lost[:, wide:] = True, True
+        unusable = ~original.isfinite().all(dim=0) | (original.amax(dim=0) >= saturation_level)
+        unusable[high:], unusable[:, wide:] = True, True
         if views.masks is not None:
-            lost = lost | ~views.masks[view]
-        coloured, fractions = [image], [lost[None, None].to(image)]
+            unusable = unusable | ~views.masks[view]
+        coloured, fractions = [image], [unusable[None, None].to(image)]
         for _ in sizes[1:]:
             coloured.append(halve(coloured[-1]))
             fractions.append(halve(fractions[-1]))
@@ -282,16 +280,16 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
             return torch.cat([level.reshape(-1) for level in levels[1:]] or [image.new_empty(0)])
 
         in_255ths = (255 * row(fractions)).round().to(torch.uint8)
-        finest = 255 * lost[None].to(torch.uint8)
+        finest = 255 * unusable[None].to(torch.uint8)
         return row(coloured), gray[0][None], row(gray), finest, in_255ths
 
-    parts = side_by_side(of_view, range(count), tracked=False)
-    first = next(parts)
-    filled = tuple(zeros((count, *part.shape), part.dtype, part.device) for part in first)
-    for view, found in enumerate(chain([first], parts)):
-        for whole, part in zip(filled, found, strict=True):
-            whole[view] = part
-    halved, gray, halved_gray, unusable, halved_unusable = filled
+    per_view = side_by_side(of_view, range(count), tracked=False)
+    first = next(per_view)
+    stacked = tuple(zeros((count, *layer.shape), layer.dtype, layer.device) for layer in first)
+    for view, layers in enumerate(chain([first], per_view)):
+        for stack, layer in zip(stacked, layers, strict=True):
+            stack[view] = layer
+    halved, gray, halved_gray, unusable, halved_unusable = stacked
     return Sources(
         images=Pyramid(finest=images, coarser=halved, sizes=sizes),
         gray=Pyramid(finest=gray, coarser=halved_gray, sizes=sizes),
@@ -309,41 +307,40 @@ def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEV
 def _prior_maps(
     prior: NormalPrior | DepthPrior | AlbedoPrior | InlierPrior, views: Views, levels: int
 ) -> PriorMaps:
-    """Prepare the maps of the photographs that there are.
+    """Build the pyramids of a prior's maps that belong to the views.
 
     Raises:
         InputError: Depth that is not along the camera's axis in scene units.
     """
-    there = [index for index, name in enumerate(prior.names) if name in views.names]
-    prior = prior.take(there)
+    prior = prior.take([index for index, name in enumerate(prior.names) if name in views.names])
     view = torch.tensor([views.names.index(name) for name in prior.names], dtype=torch.long)
     kind: Literal["normals", "depth", "albedo", "inlier"]
     if isinstance(prior, InlierPrior):
         kind, values = "inlier", prior.probability[:, None]
-        known = torch.ones_like(prior.probability, dtype=torch.bool)
+        valid = torch.ones_like(prior.probability, dtype=torch.bool)
     else:
-        known = prior.variance.isfinite()
-        precision = torch.where(known, 1 / prior.variance, 0)[:, None]
+        valid = prior.variance.isfinite()
+        precision = torch.where(valid, 1 / prior.variance, 0)[:, None]
         if isinstance(prior, NormalPrior):
             kind, layers = "normals", prior.normals.movedim(-1, 1)
         elif isinstance(prior, AlbedoPrior):
-            kind, gray = "albedo", torch.where(known, prior.albedo.mean(dim=1), torch.nan)
+            kind, gray = "albedo", torch.where(valid, prior.albedo.mean(dim=1), torch.nan)
             layers = gray[:, None] / gray.flatten(1).nanmedian(dim=1).values[:, None, None, None]
-            precision = precision * torch.where(known, gray, 0).square()[:, None]
+            precision = precision * torch.where(valid, gray, 0).square()[:, None]
         else:
             if prior.inverse or prior.along != "axis" or prior.gauge != "scene":
                 raise InputError(
-                    "a DepthPrior is not in scene units along the camera's axis; needed: "
+                    "a DepthPrior is not in scene units along the camera's axis. Convert it with "
                     "`pimper_torch.priors.conventions`, which fits it to the cloud."
                 )
             kind, layers = "depth", prior.depth[:, None]
-        layers = torch.where(known[:, None], layers, 0)
+        layers = torch.where(valid[:, None], layers, 0)
         values = torch.cat([precision * layers, precision], dim=1)
-    seen = Views(
+    as_views = Views(
         images=values.to(views.images),
         sizes_px=prior.sizes_px,
         names=prior.names,
-        masks=known,
+        masks=valid,
         focals_px=torch.full_like(prior.sizes_px[:, 0], torch.nan, dtype=views.images.dtype),
     )
     return PriorMaps(
@@ -351,19 +348,19 @@ def _prior_maps(
         zoom=prior.sizes_px / views.sizes_px[view],
         sizes_px=prior.sizes_px,
         kind=kind,
-        maps=prepare(seen, math.inf, levels),
+        maps=prepare(as_views, math.inf, levels),
         in_world=isinstance(prior, NormalPrior) and prior.frame == "world",
     )
 
 
 def _lights_of(views: Views) -> LightPrior | None:
-    given = next((prior for prior in views.priors if isinstance(prior, LightPrior)), None)
-    if given is None:
+    prior = next((other for other in views.priors if isinstance(other, LightPrior)), None)
+    if prior is None:
         return None
-    lights = given.lights.new_zeros(views.num_views, 4)
+    lights = prior.lights.new_zeros(views.num_views, 4)
     variance = torch.full_like(lights[:, 0], torch.inf)
-    for light, error, name in zip(given.lights, given.variance, given.names, strict=True):
+    for light, light_variance, name in zip(prior.lights, prior.variance, prior.names, strict=True):
         if name in views.names:
             view = views.names.index(name)
-            lights[view], variance[view] = light, error
-    return given.replace(lights=lights, variance=variance, names=views.names)
+            lights[view], variance[view] = light, light_variance
+    return prior.replace(lights=lights, variance=variance, names=views.names)

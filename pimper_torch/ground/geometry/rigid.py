@@ -10,7 +10,7 @@ from pimper_torch.ground.shapes import Vectors
 def transform(
     target_from_source: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch point 3"]
 ) -> Float[Tensor, "*batch point 3"]:
-    """Carry points from the source frame to the target frame."""
+    """Transform points from the source frame to the target frame."""
     rotation, translation = target_from_source[..., :3, :3], target_from_source[..., :3, 3]
     return points @ rotation.mT + translation[..., None, :]
 
@@ -18,12 +18,12 @@ def transform(
 def rotate(
     target_from_source: Float[Tensor, "*#batch 4 4"], vectors: Float[Tensor, "*#batch point 3"]
 ) -> Float[Tensor, "*batch point 3"]:
-    """Carry directions from the source frame to the target frame."""
+    """Rotate directions from the source frame to the target frame."""
     return vectors @ target_from_source[..., :3, :3].mT
 
 
 def invert_rigid(target_from_source: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Return ``source_from_target`` of a rotation and a translation."""
+    """Return ``source_from_target``, the inverse of a rotation and a translation."""
     rotation, translation = target_from_source[..., :3, :3], target_from_source[..., :3, 3]
     return rigid(rotation.mT, -(rotation.mT @ translation[..., None])[..., 0])
 
@@ -31,7 +31,7 @@ def invert_rigid(target_from_source: Float[Tensor, "*batch 4 4"]) -> Float[Tenso
 def rigid(
     rotation: Float[Tensor, "*batch 3 3"], translation: Vectors
 ) -> Float[Tensor, "*batch 4 4"]:
-    """Put a rotation and a translation in one matrix."""
+    """Return the matrix of a rotation and a translation."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = torch.zeros_like(top[..., :1, :])
     bottom[..., 3] = 1

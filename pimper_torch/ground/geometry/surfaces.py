@@ -9,23 +9,23 @@ from pimper_torch.ground.shapes import FaceMask, Faces, Vectors, Vertices
 
 
 def slopes_from_normals(normals: Vectors, steepest: float = 10.0) -> Float[Tensor, "*batch 2"]:
-    """Return ``(dz/dx, dz/dy)`` of the depth whose viewer-facing normals these are.
+    """Return the slopes ``(dz/dx, dz/dy)`` of depth from viewer-facing normals.
 
-    Slopes are limited to ``steepest`` (about 84 degrees by default), past which a normal
-    is as good as on the rim. Differentiable below the limit.
+    Slopes are limited to ``steepest`` (about 84 degrees by default): steeper normals are nearly at
+    the occluding contour. Differentiable below the limit.
     """
     nz = normals[..., 2:].clamp_max(-1 / steepest)
     return (-normals[..., :2] / nz).clamp(-steepest, steepest)
 
 
 def face_normals(vertices: Vertices, faces: Faces) -> Float[Tensor, "face 3"]:
-    """Return outward normals whose length is twice the area of the face."""
+    """Return outward normals with twice the area of the face as length."""
     a, b, c = vertices[faces].unbind(dim=1)
     return torch.linalg.cross(b - a, c - a)
 
 
 def unit_face_normals(vertices: Vertices, faces: Faces) -> Float[Tensor, "face 3"]:
-    """Return outward unit normals, whatever the unit of length; zero for a face without area."""
+    """Return outward unit normals, in any unit of length; zero for a face without area."""
     a, b, c = vertices[faces].unbind(dim=1)
     ab, ac = b - a, c - a
     longest = torch.stack([ab, ac]).detach().abs().amax(dim=(0, 2))
@@ -35,14 +35,14 @@ def unit_face_normals(vertices: Vertices, faces: Faces) -> Float[Tensor, "face 3
 
 
 def side_lengths(corners: Float[Tensor, "face 3 dim"]) -> Float[Tensor, "face 3"]:
-    """Return the lengths of the faces' sides: from the last corner to the first, then on."""
+    """Return the lengths of the sides that end at each corner: the first from the last corner."""
     return (corners - corners.roll(1, dims=1)).norm(dim=-1)
 
 
 def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
-    """Average the face normals around each vertex by area; unit."""
+    """Return unit vertex normals: area-weighted means of the face normals around each vertex."""
     per_face = face_normals(vertices, faces)
-    if len(per_face):  # areas in a large unit are too small for a length to be divided by
+    if len(per_face):  # in a large unit, areas are too small to be normalized
         largest = per_face.detach().abs().amax()
         per_face = per_face / largest.clamp_min(torch.finfo(per_face.dtype).tiny)
     total = torch.zeros_like(vertices)
@@ -54,7 +54,7 @@ def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
 def component_areas(
     vertices: Vertices, faces: Faces, label: Int[Tensor, " face"], counted: FaceMask | None = None
 ) -> Float[Tensor, " face"]:
-    """Sum the areas of all faces of each face's component, or of those that count; float64."""
+    """Return the area of each face's component, optionally of its counted faces; float64."""
     area = face_normals(vertices, faces).norm(dim=-1).double() / 2
     if counted is not None:
         area = area * counted
@@ -76,16 +76,16 @@ def barycentric_2d(
 def barycentric(
     points: Float[Tensor, "pair 3"], corners: Float[Tensor, "pair 3 3"]
 ) -> Float[Tensor, "pair 3"]:
-    """Return barycentric coordinates of the feet of perpendiculars from points to triangles.
+    """Return barycentric coordinates of the perpendicular projections of points onto triangles.
 
-    A triangle without area gives all to its first corner.
+    For a triangle without area they are those of its first corner.
     """
     a, b, c = corners.unbind(dim=1)
     normal = torch.linalg.cross(b - a, c - a)
-    square = normal.square().sum(dim=1)
-    flat = square == 0
-    square = torch.where(flat, 1, square)
-    beta = (torch.linalg.cross(points - a, c - a) * normal).sum(dim=1) / square
-    gamma = (torch.linalg.cross(b - a, points - a) * normal).sum(dim=1) / square
-    found = torch.stack([1 - beta - gamma, beta, gamma], dim=1)
-    return torch.where(flat[:, None], found.new_tensor([1.0, 0.0, 0.0]), found)
+    square_norm = normal.square().sum(dim=1)
+    flat = square_norm == 0
+    square_norm = torch.where(flat, 1, square_norm)
+    beta = (torch.linalg.cross(points - a, c - a) * normal).sum(dim=1) / square_norm
+    gamma = (torch.linalg.cross(b - a, points - a) * normal).sum(dim=1) / square_norm
+    weights = torch.stack([1 - beta - gamma, beta, gamma], dim=1)
+    return torch.where(flat[:, None], weights.new_tensor([1.0, 0.0, 0.0]), weights)

@@ -1,4 +1,4 @@
-"""Normals of templates: of the surface that they carry, or of the mesh."""
+"""Normals of templates: of the template's own surface, or of the coarse mesh."""
 
 import torch
 from torch.nn.functional import normalize
@@ -8,22 +8,22 @@ from pimper_torch.ground.geometry.surfaces import vertex_normals
 from pimper_torch.ground.shapes import PatchVectors, Vectors
 from pimper_torch.records import CoarseMesh, Templates
 
-# Cosine to the viewer that every normal keeps at least. A choice: 87 degrees.
+# Minimum cosine between a normal and the direction to the viewer. A choice: 87 degrees.
 MIN_FACING = 0.05
 
 
 def transferred_normals(coarse: CoarseMesh, templates: Templates) -> PatchVectors:
-    """Return the normals of a template, patch frame: of its surface, or else of the mesh."""
+    """Return the normals of a template, patch frame: its own, or else those of the mesh."""
     if templates.normals_patch is None:
         return coarse_normals(coarse, templates)
     return facing_viewer(templates.normals_patch)
 
 
 def coarse_normals(coarse: CoarseMesh, templates: Templates) -> PatchVectors:
-    """Blend the mesh's smoothed vertex normals over every template, patch frame.
+    """Interpolate the mesh's vertex normals over every template, patch frame.
 
-    Outside the facet barycentric coordinates are clamped to it, as the blend would
-    otherwise run away. All face the viewer.
+    Barycentric coordinates are clamped to the facet, to avoid extrapolation. All normals face the
+    viewer.
     """
     mesh = coarse.mesh
     per_vertex = mesh.normals_world
@@ -36,7 +36,7 @@ def coarse_normals(coarse: CoarseMesh, templates: Templates) -> PatchVectors:
 
 
 def facing_viewer(normals: Vectors) -> Vectors:
-    """Make normals unit, and rotate those that face away until they just face the viewer."""
+    """Normalize normals, and rotate those that face away until they just face the viewer."""
     unit = normalize(normals, dim=-1)
     aside = (1 - MIN_FACING**2) ** 0.5 * normalize(unit[..., :2], dim=-1)
     rotated = torch.cat([aside, torch.full_like(unit[..., 2:], -MIN_FACING)], dim=-1)

@@ -1,8 +1,8 @@
-"""Which points a camera sees: ray casting on triangle meshes.
+"""Visibility by ray casting on triangle meshes.
 
-The one place that talks to embree. It runs on the CPU in float32 whatever the device of the
-tensors, and which face a ray meets is a constant to autograd; where it meets that face is not, see
-:meth:`Hits.refined`.
+The only module that calls embree, which runs on the CPU in float32 whatever the device of the
+tensors. The face that a ray hits is a constant to autograd; the hit point on that face is
+differentiable by :meth:`Hits.refined`.
 """
 
 from dataclasses import dataclass
@@ -29,11 +29,12 @@ Rows = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Hits(Record):
-    """Where rays first meet a mesh.
+    """First intersections of rays with a mesh.
 
     Attributes:
-        face: Index of the face; -1 where the ray meets nothing.
+        face: Index of the face; -1 for a miss.
         distance: Along the ray in units of its direction's length; infinite for a miss.
+        barycentric: Coordinates of the hit point in its face; zero for a miss.
     """
 
     face: Int[Tensor, "*batch"]
@@ -43,30 +44,30 @@ class Hits(Record):
     def interpolate(
         self, per_vertex: Float[Tensor, "vertex channel"], faces: Faces
     ) -> Float[Tensor, "*batch channel"]:
-        """Blend values of the hit faces' vertices; zero for a miss."""
+        """Interpolate vertex values at the hit points; zero for a miss."""
         corners = per_vertex[faces[self.face.clamp_min(0)]]
-        blended = (self.barycentric[..., None] * corners).sum(dim=-2)
-        return torch.where((self.face >= 0)[..., None], blended, 0)
+        values = (self.barycentric[..., None] * corners).sum(dim=-2)
+        return torch.where((self.face >= 0)[..., None], values, 0)
 
     def refined(
         self, vertices: Vertices, faces: Faces, origins: Places, directions: Vectors
     ) -> "Hits":
-        """Meet the planes of the same faces again, in the dtype of the rays and with gradients.
+        """Recompute the intersections with the same faces, in the dtype of the rays.
 
-        Differentiable in vertices, origins and directions. A ray that lies in the plane of its
-        face keeps what ray casting gave.
+        Differentiable in vertices, origins and directions. A ray in the plane of its face keeps the
+        result of ray casting.
         """
         hit = self.face >= 0
         a, b, c = vertices[faces[self.face.clamp_min(0)]].unbind(dim=-2)
-        one, other = b - a, c - a
-        normal = torch.linalg.cross(one, other)
+        ab, ac = b - a, c - a
+        normal = torch.linalg.cross(ab, ac)
         rate = (directions * normal).sum(dim=-1)
         sound = hit & (rate != 0)
         distance = ((a - origins) * normal).sum(dim=-1) / torch.where(sound, rate, 1)
         along = origins + distance[..., None] * directions - a
         area = torch.where(sound, normal.square().sum(dim=-1), 1)
-        v = (torch.linalg.cross(along, other) * normal).sum(dim=-1) / area
-        w = (torch.linalg.cross(one, along) * normal).sum(dim=-1) / area
+        v = (torch.linalg.cross(along, ac) * normal).sum(dim=-1) / area
+        w = (torch.linalg.cross(ab, along) * normal).sum(dim=-1) / area
         barycentric = torch.stack([1 - v - w, v, w], dim=-1)
         return self.replace(
             distance=torch.where(sound, distance, self.distance),
@@ -88,28 +89,28 @@ class RayCaster:
         if len(vertices):
             low, high = vertices.detach().amin(dim=0), vertices.detach().amax(dim=0)
             middle = (low + high) / 2
-            # Single precision moves a mesh so far away by more than a millionth of its diagonal.
+            # Rounding to single precision moves a mesh this far away by over 1e-6 of its diagonal.
             if bool(middle.norm() > 16.0 * (high - low).norm()):
                 self._origin = middle
         triangles = self._near(vertices.detach())[faces].to("cpu", torch.float32)
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles.numpy()))
-        # The first ray builds the tree, and threads must not do so together.
+        # The first ray builds the tree, which is not thread-safe.
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
     def cast(self, origins: Places, directions: Vectors, reach: Lengths | None = None) -> Hits:
-        """Find the first face each ray meets.
+        """Return the first intersection of each ray.
 
         Args:
-            reach: How far each goes, in lengths of its direction; without, to infinity.
+            reach: Maximum distance of each, in lengths of its direction; infinite by default.
         """
         shape = directions.shape[:-1]
         far = None if reach is None else _reaches(reach, shape)
-        found = self._scene.run(*self._rays(origins, directions), dists=far, output=1)
-        face = torch.from_numpy(found["primID"].astype(np.int64))
+        result = self._scene.run(*self._rays(origins, directions), dists=far, output=1)
+        face = torch.from_numpy(result["primID"].astype(np.int64))
         hit = face >= 0
-        distance = torch.where(hit, torch.from_numpy(found["tfar"]), torch.inf)
-        v, w = torch.from_numpy(found["u"]), torch.from_numpy(found["v"])
+        distance = torch.where(hit, torch.from_numpy(result["tfar"]), torch.inf)
+        v, w = torch.from_numpy(result["u"]), torch.from_numpy(result["v"])
         barycentric = torch.stack([1 - v - w, v, w], dim=-1) * hit[:, None]
         return Hits(
             face=face.reshape(shape).to(directions.device),
@@ -121,18 +122,18 @@ class RayCaster:
         return points if self._origin is None else points - self._origin.to(points)
 
     def _rays(self, origins: Places, directions: Vectors) -> tuple[Rows, ...]:
-        both = self._near(origins).expand_as(directions), directions
-        rows = (one.detach().to("cpu", torch.float32).reshape(-1, 3).numpy() for one in both)
+        rays = self._near(origins).expand_as(directions), directions
+        rows = (part.detach().to("cpu", torch.float32).reshape(-1, 3).numpy() for part in rays)
         return tuple(map(np.ascontiguousarray, rows))
 
     def occluded(
         self, points: Vectors, center: Float[Tensor, " 3"], tolerance: float | Lengths
     ) -> Bool[Tensor, "*batch"]:
-        """Return whether the mesh hides points from a camera.
+        """Return whether the mesh occludes points from a camera.
 
         Args:
-            tolerance: A surface closer than this in front of the point does not count: it
-                is the surface that the point itself is on. Scene units.
+            tolerance: Distance in front of the point, scene units, within which surface is ignored:
+                it is the surface that the point is on.
         """
         directions = points - center
         length = directions.norm(dim=-1)
@@ -142,24 +143,24 @@ class RayCaster:
     def blocked(
         self, origins: Places, directions: Vectors, reach: Lengths
     ) -> Bool[Tensor, "*batch"]:
-        """Return whether a ray meets any face at all; several times as fast as its first one.
+        """Return whether each ray hits any face; several times as fast as :meth:`cast`.
 
         Args:
-            reach: How far each goes, in lengths of its direction; may be infinite.
+            reach: Maximum distance of each, in lengths of its direction; may be infinite.
         """
         shape = directions.shape[:-1]
         rays = self._rays(origins, directions)
-        found = self._scene.run(*rays, dists=_reaches(reach, shape), query="OCCLUDED")
-        return (torch.from_numpy(found) >= 0).reshape(shape).to(directions.device)
+        faces = self._scene.run(*rays, dists=_reaches(reach, shape), query="OCCLUDED")
+        return (torch.from_numpy(faces) >= 0).reshape(shape).to(directions.device)
 
 
-# Of meshes, while their vertices live: faces, and the caster.
+# Faces and caster of each mesh, while its vertices exist.
 _prepared: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 _preparing = Lock()
 
 
 def ray_caster(mesh: Mesh) -> RayCaster:
-    """Return a mesh prepared for ray casting, once until :func:`forget_casters` or its end."""
+    """Return the caster of a mesh, cached until :func:`forget_casters` or its vertices' end."""
     with _preparing:
         faces, caster = _prepared.get(mesh.vertices_world, (None, None))  # type: ignore[no-untyped-call]
         if faces is not mesh.faces:
@@ -169,16 +170,13 @@ def ray_caster(mesh: Mesh) -> RayCaster:
 
 
 def forget_casters() -> None:
-    """Let meshes be prepared anew: that of a last pass's surface takes some 200 MB."""
+    """Free all cached casters: that of the last pass's surface takes some 200 MB."""
     with _preparing:
         _prepared.clear()
 
 
 def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
     """Cast a ray through every pixel of a view.
-
-    Args:
-        mesh: Prepared for casting already where several views look at it.
 
     Returns:
         Hits of shape ``height width``; ``distance`` is depth along the camera's z.
@@ -193,5 +191,5 @@ def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
 
 def _reaches(reach: Lengths, shape: torch.Size) -> Rows:
     far = reach.detach().expand(shape).reshape(-1).to("cpu", torch.float32)
-    # embree's own word for infinity
+    # embree's infinity
     return far.clamp(0, 1e37).contiguous().numpy()

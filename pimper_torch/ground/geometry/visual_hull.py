@@ -1,7 +1,7 @@
-"""The visual hull: everywhere that the silhouettes allow the object to be.
+"""The visual hull: all space in which the silhouettes allow the object to be.
 
-A voxel holds a signed distance, so that the hull's border lies between voxels, and points and
-rays meet it more finely than the grid. Laurentini, PAMI 16(2), 1994, for the hull; views vote.
+Voxels store signed distances, so points and rays meet the hull's border with a finer resolution
+than that of the grid. Source: Laurentini, PAMI 16(2), 1994, for the hull; here the views vote.
 """
 
 from dataclasses import dataclass
@@ -20,24 +20,23 @@ from pimper_torch.records import Cameras, Record, Silhouettes
 from pimper_torch.runtime.mapped import parts
 from pimper_torch.runtime.parallel import side_by_side
 
-_STRIDE = 4  # pixels between rays; how deep they get is interpolated
-_UNSEEN = 1e9  # pixels; stands beyond the photograph's border, where a view abstains
+_STRIDE = 4  # pixels between rays; their greatest depths in the hull are interpolated
+_UNSEEN = 1e9  # pixels; marks the outside of the photograph, where a view abstains
 
-# How far outside, in voxels, surface of the object may be: silhouettes that are found are right to
-# a few pixels. The skull's cranium, borne out by points, lay up to 2.9 outside their hull.
+# Distance outside the hull, in voxels, at which the object's surface may be: estimated silhouettes
+# are accurate to a few pixels. The skull's cranium, confirmed by points, was up to 2.9 outside.
 _SLACK = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Hull(Record):
-    """Signed distance to the hull's border in a grid of voxels.
+    """Signed distance to the border of the hull on a voxel grid.
 
     Attributes:
         origin_world: Centre of the first voxel.
-        spacing: Between centres of neighbouring voxels, scene units.
-        distance: Positive inside the hull, scene units: how far its silhouette is, as the view sees
-            it in which it is nearest, those outvoted left out. Minus infinity where too few
-            views look.
+        spacing: Distance between the centres of neighbouring voxels, scene units.
+        distance: Positive inside the hull, scene units: the smallest distance to a silhouette over
+            the views that are not outvoted. Minus infinity where too few views see the voxel.
     """
 
     origin_world: Float[Tensor, "3"]
@@ -46,7 +45,7 @@ class Hull(Record):
 
     @property
     def occupied(self) -> Bool[Tensor, "x y z"]:
-        """True for voxels whose centre is inside."""
+        """Mask of the voxels with their centre inside the hull."""
         return self.distance > 0
 
     @property
@@ -56,7 +55,7 @@ class Hull(Record):
         return torch.stack([self.origin_world, self.origin_world + self.spacing * steps])
 
     def above(self, normal_world: Float[Tensor, "3"], offset: Scalar) -> "Hull":
-        """Keep what is above the plane where a normal's product with a point is ``offset``."""
+        """Return the part of the hull above the plane ``normal_world @ point = offset``."""
         steps = [torch.arange(count).to(self.distance) for count in self.distance.shape]
         slopes = self.spacing * normal_world
         height = (
@@ -68,27 +67,27 @@ class Hull(Record):
         return self.replace(distance=torch.minimum(self.distance, height))
 
     def holds(self, points_world: Vectors, tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
-        """Find points inside, or so little outside that silhouettes do not show it.
+        """Return whether points are inside, within the accuracy of silhouettes (3 voxels).
 
         Args:
-            tolerance: Scene units outside that do not count, if they are more than that.
+            tolerance: Accepted distance outside, scene units, if it is more than that.
         """
         return self.depth_of(points_world) > -max(tolerance, _SLACK * float(self.spacing))
 
     def depth_of(self, points_world: Vectors) -> Scalars:
-        """Return how deep points are inside the hull; negative outside.
+        """Return the depth of points inside the hull; negative outside.
 
-        Trilinear between voxels. Off the grid it is the value at its border less the distance
-        to it. Differentiable where a point is not level with the voxels' centres.
+        Trilinear between voxels. Outside the grid it is the value at its border minus the distance
+        to it. Differentiable except where a coordinate is that of a voxel centre.
         """
         low, high = self.corners_world
         within = torch.minimum(torch.maximum(points_world, low), high)
-        # grid_sample's last axis runs fastest and is named first.
-        place = 2 * (within - low) / (high - low) - 1
+        # grid_sample names the last axis, which runs fastest, first.
+        grid = 2 * (within - low) / (high - low) - 1
         field = self.distance.clamp_min(-float((high - low).detach().norm()))
         value = grid_sample(
             field[None, None],
-            place.flip(-1).reshape(1, -1, 1, 1, 3).to(field),
+            grid.flip(-1).reshape(1, -1, 1, 1, 3).to(field),
             padding_mode="border",
             align_corners=True,
         )
@@ -98,38 +97,38 @@ class Hull(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class UnboundedHull(Hull):
-    """The hull of silhouettes that exclude nothing: everything above planes, if there are any.
+    """Hull of silhouettes that exclude nothing: all space, or all space above given planes.
 
-    Points of the planes are as deep inside as all others, and shape the surface with them; surface
-    on a plane is not held.
+    Every point is infinitely deep inside. Points on the planes therefore shape the surface like all
+    others, but :meth:`holds` excludes surface on a plane.
 
     Attributes:
-        normals_world: Of the planes, unit, into the half spaces.
-        offsets: A plane is where its normal's product with a point is this.
+        normals_world: Unit normals of the planes, into the half spaces.
+        offsets: Dot product of each plane's normal with its points.
     """
 
     normals_world: Float[Tensor, "plane 3"]
     offsets: Float[Tensor, " plane"]
 
     def depth_of(self, points_world: Vectors) -> Scalars:
-        """Return infinity: a hull without bounds excludes nothing."""
+        """Return +inf: an unbounded hull excludes nothing."""
         return torch.full_like(points_world[..., 0], torch.inf)
 
     def holds(self, points_world: Vectors, tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
-        """Find points above the planes; the tolerance is of silhouettes."""
+        """Return whether points are above all planes; there is no tolerance for planes."""
         heights = points_world @ self.normals_world.to(points_world).mT
         return (heights > self.offsets.to(points_world)).all(dim=-1)
 
 
 def bounding_box(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
-    """Return the corners of a box that holds what the silhouettes show.
+    """Return the two corners of a cube around the object, from the reliable silhouettes.
 
-    Its centre is nearest to the rays through the centres of the silhouettes' bounding boxes; from
-    there it reaches as far as the largest of them, seen from its camera, and half as far again:
-    a silhouette may be cut by the photograph's border.
+    Its centre is the point nearest to the rays through the centres of the silhouettes' bounding
+    boxes. Half its side is 1.5 times the largest half diagonal of these boxes at the centre's
+    distance, because a silhouette may be cut by the photograph's border.
 
     Returns:
-        ``None`` where fewer than two reliable views show anything.
+        ``None`` if fewer than two reliable views have a silhouette.
     """
     masks = silhouettes.masks
     views = (silhouettes.reliable & masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist()
@@ -158,60 +157,62 @@ def visual_hull(
     disagreeing: float = 0.03,
     min_seen: float = 0.5,
 ) -> Hull | None:
-    r"""Build the hull by the vote of the reliable views.
+    r"""Compute the hull by a vote of the reliable views.
 
-    A pixel that shows the object with a probability :math:`p` below a half counts
-    :math:`1 - 2 p` against it; at a half, and outside its photograph, a view abstains. Of what
-    only such words leave inside, separate pieces are left out. Time and memory grow with
-    the voxels.
+    A pixel with a probability :math:`p` of the object below a half votes against a voxel with
+    weight :math:`1 - 2 p`. At a half, and outside its photograph, a view abstains. Separate pieces
+    that exist only because of these weights are removed. Time and memory grow with the voxels.
 
     Args:
-        box_world: Smallest and largest corner of the region to look in; the grid is fitted to
-            what it holds.
-        num_voxels: Of the whole grid; an arc of views gives a hull that is long along their rays.
-        disagreeing: Fraction of the views in sight of a voxel whose words together may say that it
-            is outside. What only a few views cut, such as the ends of an arc, needs a small one.
-        min_seen: Fraction of the reliable views that a voxel must be in sight of.
+        box_world: Smallest and largest corner of the search region; the grid is fitted to the hull
+            in it.
+        num_voxels: Of the complete grid; an arc of views gives a hull elongated along their rays.
+        disagreeing: Maximum sum of the weights against a voxel inside the hull, as a fraction of
+            the views that see it. Parts that only a few views cut, such as the ends of an arc, need
+            a small one.
+        min_seen: Minimum fraction of the reliable views that must see a voxel.
 
     Returns:
-        ``None`` where the silhouettes have nothing in common inside the box.
+        ``None`` if the silhouettes have no common volume inside the box.
     """
     views = silhouettes.reliable.nonzero()[:, 0].tolist()
     inside, hard = silhouettes.inside, silhouettes.source == "masks"
 
     def framed(view: int) -> Float[Tensor, "layer high_and_2 wide_and_2"]:
-        """Measure distances to the silhouette; unless it is a mask, with what pixels count."""
+        """Compute distances to the silhouette and, unless it is a mask, the pixels' weights."""
         width, height = cameras.sizes_px[view].tolist()
-        shown = inside[view, :height, :width]
-        known = signed_distance(shown > 0.5).masked_fill(shown == 0.5, _UNSEEN)
-        found = [known] if hard else [known, torch.where(shown > 0.5, 1, 1 - 2 * shown)]
-        return torch.stack([pad(one, (1, 1, 1, 1), value=_UNSEEN) for one in found])
+        probability = inside[view, :height, :width]
+        border = signed_distance(probability > 0.5).masked_fill(probability == 0.5, _UNSEEN)
+        weight = [] if hard else [torch.where(probability > 0.5, 1, 1 - 2 * probability)]
+        layers = (border, *weight)
+        return torch.stack([pad(layer, (1, 1, 1, 1), value=_UNSEEN) for layer in layers])
 
-    layers = 1 if hard else 2
-    sizes = [(layers, high + 2, wide + 2) for wide, high in cameras.sizes_px[views].tolist()]
+    count = 1 if hard else 2
+    sizes = [(count, high + 2, wide + 2) for wide, high in cameras.sizes_px[views].tolist()]
     maps = parts(sizes, inside.device)
-    for whole, found in zip(maps, side_by_side(framed, views, tracked=False), strict=True):
-        whole.copy_(found)
+    for target, framed_map in zip(maps, side_by_side(framed, views, tracked=False), strict=True):
+        target.copy_(framed_map)
     chosen = cameras.take(views)
     low, high = box_world.to(chosen.intrinsics)
-    first = _voted(maps, chosen, box_world, 64**3, (disagreeing, min_seen))
-    # A voxel whose border lies within half its diagonal may be met by a part of the hull.
-    where = (first.distance > -0.87 * first.spacing).nonzero()
-    if len(where) == 0:
+    coarse = _vote_on_grid(maps, chosen, box_world, 64**3, (disagreeing, min_seen))
+    # The hull may cut a voxel whose centre is within half a diagonal of it.
+    voxels = (coarse.distance > -0.87 * coarse.spacing).nonzero()
+    if len(voxels) == 0:
         return None
-    reach = first.spacing * torch.stack([where.amin(dim=0) - 1, where.amax(dim=0) + 1])
-    fitted = torch.maximum(torch.minimum(first.origin_world + reach, high), low)
-    hull = _voted(maps, chosen, fitted, num_voxels, (disagreeing, min_seen))
+    reach = coarse.spacing * torch.stack([voxels.amin(dim=0) - 1, voxels.amax(dim=0) + 1])
+    fitted = torch.maximum(torch.minimum(coarse.origin_world + reach, high), low)
+    hull = _vote_on_grid(maps, chosen, fitted, num_voxels, (disagreeing, min_seen))
     return hull if bool(hull.occupied.any()) else None
 
 
 def margins(
     hull: Hull, intrinsics: Matrix3, cam_from_world: Float[Tensor, "4 4"], size_px: tuple[int, int]
 ) -> Map:
-    """Return how far each pixel is inside the hull's projection, in pixels; negative outside.
+    """Return each pixel's distance inside the hull's projection, in pixels; negative outside.
 
-    It is how deep the ray gets into the hull, over the size of a pixel there: right to a fraction
-    of a pixel at the border, less so far from it. Rays are followed through every fourth pixel.
+    It is the greatest depth of the ray in the hull, over the size of a pixel there: accurate to a
+    fraction of a pixel at the border, less accurate far from it. Rays are cast through every fourth
+    pixel in each direction, and interpolated.
     """
     width, height = size_px
     columns, rows = -(-width // _STRIDE), -(-height // _STRIDE)
@@ -221,18 +222,18 @@ def margins(
     depth, along = _deepest(hull, eye, rays)
     focal = (intrinsics[0, 0] * intrinsics[1, 1]).sqrt()
     margin = (depth * focal / along).reshape(1, 1, rows, columns)
-    place = grid_from_pixels(
+    grid = grid_from_pixels(
         pixel_centers(width, height, like=intrinsics), _STRIDE * columns, _STRIDE * rows
     )
-    return grid_sample(margin, place[None], padding_mode="border", align_corners=False)[0, 0]
+    return grid_sample(margin, grid[None], padding_mode="border", align_corners=False)[0, 0]
 
 
 def _deepest(
     hull: Hull, eye: Float[Tensor, "3"], rays: Float[Tensor, "ray 3"]
 ) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-    """Return how deep each ray gets into the hull, and where on the ray that is.
+    """Return the greatest depth of each ray in the hull, and the position on the ray.
 
-    A ray that misses the grid is as far outside as the grid is long.
+    A ray that misses the grid has minus the grid's diagonal as depth.
     """
     low, high = hull.corners_world
     inverse = 1 / torch.where(rays.abs() > 1e-12, rays, 1e-12)
@@ -240,56 +241,56 @@ def _deepest(
     near = ends.amin(dim=0).amax(dim=-1).clamp_min(0)
     far = ends.amax(dim=0).amin(dim=-1)
     longest = float((high - low).norm())
-    depth, place = torch.full_like(near, -longest), torch.ones_like(near)
-    meets = (far > near).nonzero()[:, 0]
-    if len(meets) == 0:
-        return depth, place
+    depth, position = torch.full_like(near, -longest), torch.ones_like(near)
+    crossing = (far > near).nonzero()[:, 0]
+    if len(crossing) == 0:
+        return depth, position
     field = hull.distance.clamp_min(-longest)[None, None]
     start, step = 2 * (eye - low) / (high - low) - 1, 2 * rays / (high - low)
-    lengths = ((far - near) * rays.norm(dim=-1))[meets]
+    lengths = ((far - near) * rays.norm(dim=-1))[crossing]
     count = int(lengths.max() / hull.spacing) + 2
     fraction = torch.linspace(0, 1, count).to(rays)
-    for some in torch.split(meets, max(1, 2**18 // count)):
-        along = torch.addcmul(near[some, None], fraction, (far - near)[some, None])
-        grid = torch.addcmul(start, along[..., None], step[some, None]).flip(-1)
+    for block in torch.split(crossing, max(1, 2**18 // count)):
+        along = torch.addcmul(near[block, None], fraction, (far - near)[block, None])
+        grid = torch.addcmul(start, along[..., None], step[block, None]).flip(-1)
         depths = grid_sample(field, grid[None, None], padding_mode="border", align_corners=True)
-        depth[some], best = depths[0, 0, 0].max(dim=1)
-        place[some] = along.gather(1, best[:, None])[:, 0].clamp_min(float(hull.spacing))
-    return depth, place
+        depth[block], best = depths[0, 0, 0].max(dim=1)
+        position[block] = along.gather(1, best[:, None])[:, 0].clamp_min(float(hull.spacing))
+    return depth, position
 
 
-def _voted(
+def _vote_on_grid(
     maps: list[Float[Tensor, "layer _ _"]],
     cameras: Cameras,
     box_world: Float[Tensor, "2 3"],
     num_voxels: int,
     fractions: tuple[float, float],
 ) -> Hull:
-    """Fill a grid between two corners with about ``num_voxels`` voxels.
+    """Compute the hull on a grid of about ``num_voxels`` voxels between two corners.
 
     Args:
-        maps: Distances to the silhouettes in pixels, and what they count, one a view.
-        fractions: Of views that may disagree, and that must look.
+        maps: Of each view: distances to the silhouette in pixels, and weights of pixels.
+        fractions: ``disagreeing`` and ``min_seen``.
     """
     from pimper_torch.ground.kernels.hull_votes import vote
 
     low, high = box_world.to(cameras.intrinsics)
     spacing = ((high - low).prod() / num_voxels) ** (1 / 3)
     counts = ((high - low) / spacing).ceil().long().clamp_min(1) + 1
-    # Pixels are affine in the voxels' numbers before they are divided by depth.
+    # Homogeneous pixel coordinates are affine in the voxel indices.
     from_world = cameras.intrinsics @ cameras.cam_from_world[:, :3]
     first = from_world[..., :3] @ low + from_world[..., 3]
     steps = spacing * from_world[..., :3]
     reach = [torch.arange(count).to(low) for count in counts.tolist()]
-    # All views' distances to a slab take 8 MB.
+    # The distances of all views in a slab take 8 MB.
     slab = max(1, 2**21 // (len(maps) * int(counts[1:].prod())))
 
     focal = (cameras.intrinsics[:, 0, 0] * cameras.intrinsics[:, 1, 1]).sqrt()
 
     def of_slab(along_x: Float[Tensor, " x"]) -> Float[Tensor, "2 x y z"]:
-        """Return the smallest distance to a silhouette that is not outvoted, by both counts."""
+        """Return the smallest distance of a view not outvoted: with weights, and with all 1."""
         shape = len(along_x), len(reach[1]), len(reach[2])
-        distance, word = low.new_ones(2, len(maps), *shape)
+        distance, weight = low.new_ones(2, len(maps), *shape)
         for view, border in enumerate(maps):
             start, step = first[view], steps[view]
             u, v, depth = (
@@ -298,25 +299,25 @@ def _voted(
                 + ((step[row, 1] * reach[1])[:, None] + step[row, 2] * reach[2])
                 for row in range(3)
             )
-            place = torch.stack([u / depth, v / depth], dim=-1).reshape(1, 1, -1, 2)
+            pixels = torch.stack([u / depth, v / depth], dim=-1).reshape(1, 1, -1, 2)
             height, width = border.shape[1:]
-            grid = grid_from_pixels(place + 1, width, height)
-            found = grid_sample(border[None], grid, padding_mode="border", align_corners=False)
-            value, *counted = found.reshape(-1, *shape)
-            if counted:
-                word[view] = counted[0]
-            looks = (depth > 0) & (value < _UNSEEN / 1e3)
-            distance[view] = torch.where(looks, value * (depth / focal[view]), _UNSEEN)
-        chosen = torch.empty(2, *shape)
-        rows = [one.flatten(1).cpu().numpy() for one in (distance, word)]
-        vote(rows[0], rows[1], _UNSEEN, *fractions, chosen.flatten(1).numpy())
-        return chosen.to(distance)
+            grid = grid_from_pixels(pixels + 1, width, height)
+            sampled = grid_sample(border[None], grid, padding_mode="border", align_corners=False)
+            value, *weights = sampled.reshape(-1, *shape)
+            if weights:
+                weight[view] = weights[0]
+            visible = (depth > 0) & (value < _UNSEEN / 1e3)
+            distance[view] = torch.where(visible, value * (depth / focal[view]), _UNSEEN)
+        smallest = torch.empty(2, *shape)
+        rows = [values.flatten(1).cpu().numpy() for values in (distance, weight)]
+        vote(rows[0], rows[1], _UNSEEN, *fractions, smallest.flatten(1).numpy())
+        return smallest.to(distance)
 
     slabs = list(side_by_side(of_slab, torch.split(reach[0], slab), tracked=False))
-    distance, certain = torch.cat(slabs, dim=1)
-    found, count = label((distance > 0).cpu().numpy())
-    labels = torch.from_numpy(found).to(distance.device)
-    apart = torch.bincount(labels[certain > 0], minlength=count + 1)[labels] == 0
-    apart &= labels > 0
-    distance = torch.where(apart, -spacing, distance)
+    distance, unweighted = torch.cat(slabs, dim=1)
+    components, count = label((distance > 0).cpu().numpy())
+    labels = torch.from_numpy(components).to(distance.device)
+    separate = torch.bincount(labels[unweighted > 0], minlength=count + 1)[labels] == 0
+    separate &= labels > 0
+    distance = torch.where(separate, -spacing, distance)
     return Hull(origin_world=low, spacing=spacing, distance=distance)

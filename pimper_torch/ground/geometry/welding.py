@@ -1,4 +1,4 @@
-"""Vertices at the same place made one: what STL and texture seams keep apart."""
+"""Merging of vertices at the same position, which STL and texture seams duplicate."""
 
 import torch
 from jaxtyping import Float, Int
@@ -8,17 +8,17 @@ from torch import Tensor
 from pimper_torch.ground.geometry.topology import first_of_each, graph_components
 from pimper_torch.ground.shapes import Faces, Vertices
 
-# Of the diagonal: the widest distance of vertices that are one. A choice: rounding in single
+# Maximum distance of merged vertices, as a fraction of the diagonal. A choice: rounding in single
 # precision and in text of seven digits is below, edges of any mesh of an object are far above.
 TOLERANCE = 1e-6
 
 
 def welded(vertices: Vertices, faces: Faces) -> tuple[Float[Tensor, "kept 3"], Faces]:
-    """Merge vertices that are closer than a millionth of the diagonal; drop those without faces.
+    """Merge vertices closer than a millionth of the diagonal; drop vertices without faces.
 
     Returns:
-        The first vertex of each place, in their order, and as many faces, some of which may now
-        name a vertex twice. A mesh that has nothing to merge comes back as it is.
+        The first vertex at each position, in their order, and the same number of faces, which may
+        now have a vertex twice.
 
     >>> corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> welded(corners, torch.tensor([[0, 1, 2], [3, 4, 5]]))[1]
@@ -29,19 +29,19 @@ def welded(vertices: Vertices, faces: Faces) -> tuple[Float[Tensor, "kept 3"], F
     vertices = vertices[used]
     if len(vertices) == 0:
         return vertices, faces
-    label = _places(vertices.detach().cpu().double()).to(faces.device)
+    label = _cluster(vertices.detach().cpu().double()).to(faces.device)
     first = first_of_each(label[:, None])
-    rank = torch.empty_like(first).scatter(0, label[first], torch.arange(len(first)).to(first))
-    return vertices[first], rank[label][faces]
+    new_index = torch.empty_like(first).scatter(0, label[first], torch.arange(len(first)).to(first))
+    return vertices[first], new_index[label][faces]
 
 
-def _places(vertices: Vertices) -> Int[Tensor, " vertex"]:
-    """Label vertices by place: those of one cell of a grid, and cells whose vertices are close."""
+def _cluster(vertices: Vertices) -> Int[Tensor, " vertex"]:
+    """Label vertices by position: one label for a cell of a fine grid, and for close cells."""
     low = vertices.amin(dim=0)
     tolerance = TOLERANCE * float((vertices.amax(dim=0) - low).norm())
     if tolerance == 0:
         return torch.zeros(len(vertices), dtype=torch.long)
-    # A cell's diagonal is within the tolerance, and three of its numbers fit in 63 bits.
+    # A cell's diagonal is within the tolerance, and its three indices fit in 63 bits.
     x, y, z = ((vertices - low) / (tolerance / 2)).floor().long().unbind(dim=1)
     _, cell = torch.unique((x << 42) | (y << 21) | z, return_inverse=True)
     of_cell = torch.empty(int(cell.max()) + 1, dtype=torch.long)

@@ -1,1 +1,1 @@
-"""Linear algebra the stages share: least squares on rasters and meshes, and its solvers."""
+"""Sparse linear algebra: least squares, robust losses, Cholesky and multigrid solvers."""

@@ -1,18 +1,18 @@
 r"""Prolongation of algebraic multigrid by smoothed aggregation.
 
-Strongly connected unknowns are aggregated to one coarse unknown, and one averaging step smooths
-the piecewise constant prolongation. Two rules make it robust where entries vary by ten orders:
+Strongly connected unknowns are aggregated to one coarse unknown, and one averaging step smooths the
+piecewise constant prolongation. Two rules make it robust to entries that vary by ten orders:
 
 - Two unknowns may root an aggregate together only if their entry is large relative to the
   largest of both rows. A light unknown between two heavy ones must not connect them.
-- An unknown without such an entry is assigned to the aggregate of its largest coupling. Left out
-  instead, it would stay behind when its heavy neighbour moves, and add to the coarse energy.
+- An unknown without such an entry is assigned to the aggregate of its largest coupling. Otherwise
+  it would not follow its heavy neighbour, and would increase the coarse energy.
 
 The near-kernel need not be constant: heights along two directions, one of them nearly in the
 surface, differ by a factor. So unknowns are scaled by a near-kernel vector (ones, smoothed).
 
-On a raster with equal weights the aggregates are patches of about 3 x 3 pixels; along a
-strip between two cuts they are pieces of the strip; a hole has none.
+On a raster with equal weights the aggregates are patches of about 3 x 3 pixels; along a strip
+between two cuts they are pieces of the strip; a hole has none.
 
 Source: Vanek, Mandel & Brezina, Computing 56, 1996, for smoothed aggregation; Bell, Dalton &
 Olson, SIAM J. Sci. Comput. 34(4), 2012, for parallel aggregation; Brezina, Falgout, MacLachlan,
@@ -26,20 +26,20 @@ from scipy.sparse import csr_array
 
 from pimper_torch.runtime.parallel import over_rows
 
-# An entry is strong if it is at least this fraction of the largest of a row; compared by
-# iterations on weights that vary over 0 to 10 orders, where 0.1 takes up to 1.6 times as many.
+# An entry is strong if it is at least this fraction of the largest of its row; chosen by iterations
+# on weights that vary over 0 to 10 orders, where 0.1 takes up to 1.6 times as many.
 _STRONG = 0.25
 
-# An unknown whose couplings add up to less than this fraction of its diagonal is determined by its
-# own anchor: smoothing alone solves for it. A choice.
+# An unknown with couplings that sum to less than this fraction of its diagonal is determined by its
+# own prior: smoothing alone solves for it. A choice.
 _COUPLED = 0.05
 
 # Of the averaging step that smooths the aggregates' edges; 2/3 damps the highest frequencies
 # of an M-matrix best.
 _DAMPING = 2 / 3
 
-# Roots are chosen in blocks of this many unknowns, in random order within each: a choice, a block
-# and its neighbours fit the cache.
+# Roots are chosen in blocks of this many unknowns, in random order within each: a choice, for which
+# a block and its neighbours fit the cache.
 _BLOCK = 4096
 
 
@@ -47,11 +47,11 @@ def prolongation(matrix: csr_array) -> csr_array:
     """Return the prolongation from coarse unknowns to those of ``matrix``.
 
     Args:
-        matrix: Symmetric, its diagonal positive; best with few positive entries off it.
+        matrix: Symmetric, with a positive diagonal; best with few positive entries off it.
 
     Returns:
-        One column per coarse unknown, not negative. Rows of isolated unknowns are empty; the
-        others add up to the near-kernel vector where there is no anchor (excess of the diagonal).
+        One column per coarse unknown, not negative. Rows of isolated unknowns are empty; the others
+        sum to the near-kernel vector where the diagonal has no excess (a prior).
     """
     from pimper_torch.ground.kernels import multigrid_levels as kernels
 
@@ -62,7 +62,7 @@ def prolongation(matrix: csr_array) -> csr_array:
     for _ in range(5):
         over_rows(kernels.smooth_ones, size, *parts, dominant, scale, smoother, _DAMPING)
         scale, smoother = smoother, scale
-    # An anchor or a fold would make it vanish.
+    # Priors and folds could make it vanish.
     scale = np.maximum(np.abs(scale, out=scale), 0.1, out=scale)
     largest, coupled, excess = dominant, smoother, np.empty(size)  # reused memory
     over_rows(kernels.couplings, size, *parts, scale, largest, coupled, excess)
@@ -72,29 +72,31 @@ def prolongation(matrix: csr_array) -> csr_array:
     within = np.random.default_rng(0).permutation(min(size, _BLOCK))
     order = (np.arange(0, size, _BLOCK)[:, None] + within).ravel() if size else within
     count = kernels.roots(*parts[:2], strong, order[order < size], label)
-    other = np.empty_like(label)
+    next_label = np.empty_like(label)
     for _ in range(2):
-        over_rows(kernels.assigned, size, *parts, scale, strong, label, other)
-        label, other = other, label
+        over_rows(kernels.assigned, size, *parts, scale, strong, label, next_label)
+        label, next_label = next_label, label
     while any(
-        over_rows(kernels.assigned_by_coupling, size, *parts, *connections, _COUPLED, label, other)
+        over_rows(
+            kernels.assigned_by_coupling, size, *parts, *connections, _COUPLED, label, next_label
+        )
     ):
-        label, other = other, label
-    found = over_rows(
+        label, next_label = next_label, label
+    blocks = over_rows(
         kernels.prolongation, size, *parts, scale, largest, excess, label, _STRONG, _DAMPING
     )
-    return _concatenated(found, count)
+    return _concatenated(blocks, count)
 
 
 def dominant_diagonal(matrix: csr_array) -> Float[np.ndarray, " unknown"]:
     """Return a diagonal with which Jacobi's iteration has a spectrum within [0, 2].
 
-    It is the matrix's own wherever that is diagonally dominant.
+    It is that of the matrix in rows that are diagonally dominant.
     """
     from pimper_torch.ground.kernels import multigrid_levels as kernels
 
-    own, dominant = np.empty((2, matrix.shape[0]))
-    over_rows(kernels.diagonals, len(own), *parts_of(matrix), own, dominant)
+    diagonal, dominant = np.empty((2, matrix.shape[0]))
+    over_rows(kernels.diagonals, len(diagonal), *parts_of(matrix), diagonal, dominant)
     return dominant
 
 
@@ -111,9 +113,9 @@ def parts_of(matrix: csr_array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return matrix.indptr, matrix.indices, matrix.data
 
 
-def _concatenated(found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int) -> csr_array:
+def _concatenated(blocks: list[tuple[np.ndarray, np.ndarray, np.ndarray]], width: int) -> csr_array:
     """Concatenate blocks of rows, each as counts of entries, columns and entries, to a matrix."""
-    counts, columns, entries = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    counts, columns, entries = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     starts = np.zeros(len(counts) + 1, np.int32)
     np.cumsum(counts, out=starts[1:])
     return csr_array((entries, columns, starts), shape=(len(counts), width))

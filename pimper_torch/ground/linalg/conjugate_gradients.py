@@ -21,20 +21,19 @@ def compressed_gradients(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Tensor, "unknown side"], int, bool]:
-    r"""Solve :math:`A x = b` for all right-hand sides at once, in float64 on the CPU.
+    r"""Solve :math:`A x = b` for all right-hand sides together, in float64 on the CPU.
+
+    Not differentiable; :mod:`~pimper_torch.ground.linalg.prepared` has gradients of solutions.
 
     Args:
         matrix: A, symmetric and positive definite.
-        start: Where to begin; zero if not given.
-        tolerance: Of the error's energy norm, as the hierarchy estimates it, relative to that of
-            the solution. Invariant to the scale of A and of any unknown.
+        start: Initial solution; zero if ``None``.
+        tolerance: Maximum energy norm of the error, as estimated by the hierarchy, relative to that
+            of the solution. Invariant to the scale of A and of any unknown.
         max_iterations: Limit. All systems iterate until the last has converged, or none descends.
 
     Returns:
         The solutions, the number of iterations, and whether all systems converged.
-
-    Constant to autograd; see :mod:`~pimper_torch.ground.linalg.prepared` for gradients of a
-    solution.
 
     Source: Hestenes & Stiefel, Journal of Research of the NBS 49(6), 1952.
     """
@@ -44,20 +43,20 @@ def compressed_gradients(
     count, sides = rhs.shape
     blocks = -(-count // kernels.BLOCK)
 
-    def inner(one: Tensor, other: Tensor) -> Tensor:
+    def inner(a: Tensor, b: Tensor) -> Tensor:
         sums = torch.empty(blocks, sides, dtype=torch.float64)
-        vectors = as_array(one), as_array(other), sums.numpy()
+        vectors = as_array(a), as_array(b), sums.numpy()
         over_rows(kernels.dots, blocks, *vectors, size=kernels.BLOCK)
         return sums.sum(dim=0)
 
-    def product(vectors: Tensor, base: Tensor, found: Tensor, keep: float, gain: float) -> None:
-        arrays = as_array(vectors), as_array(base), as_array(found)
+    def product(vectors: Tensor, base: Tensor, out: Tensor, keep: float, gain: float) -> None:
+        arrays = as_array(vectors), as_array(base), as_array(out)
         over_rows(sparse_products.product, count, *parts_of(matrix), *arrays, keep, gain)
 
-    found, residual = torch.zeros_like(rhs), rhs.clone()
+    solution, residual = torch.zeros_like(rhs), rhs.clone()
     if start is not None:
-        found.copy_(start)
-        product(found, rhs, residual, 1.0, -1.0)
+        solution.copy_(start)
+        product(solution, rhs, residual, 1.0, -1.0)
     rounded = residual.to(hierarchy.dtype, copy=True)
     preconditioned = hierarchy.cycle(rounded)
     decrease = inner(residual, preconditioned)
@@ -65,7 +64,7 @@ def compressed_gradients(
     size = decrease if start is None else inner(rhs, hierarchy.cycle(rounded.copy_(rhs)))
     goal = tolerance**2 * size
     steps = 0
-    # Written so that NaN stops the loop, and has not converged.
+    # NaN stops the loop and counts as not converged.
     while bool((decrease > goal).any()) and steps < max_iterations:
         product(direction, image, image, 0.0, 1.0)
         curvature = inner(direction, image)
@@ -73,13 +72,12 @@ def compressed_gradients(
         if not bool(descends.any()):
             break
         length = torch.where(descends, decrease / curvature, 0).numpy()
-        vectors = (as_array(each) for each in (found, residual, direction, image))
+        vectors = (as_array(each) for each in (solution, residual, direction, image))
         over_rows(kernels.step, count, *vectors, length, rounded.numpy())
         preconditioned = hierarchy.cycle(rounded)
         previous, decrease = decrease, inner(residual, preconditioned)
         growth = torch.where(previous > 0, decrease / previous, 0).numpy()
-        over_rows(
-            kernels.new_direction, count, as_array(direction), as_array(preconditioned), growth
-        )
+        vectors = (as_array(each) for each in (direction, preconditioned))
+        over_rows(kernels.new_direction, count, *vectors, growth)
         steps += 1
-    return found, steps, bool((decrease.abs() <= goal).all())
+    return solution, steps, bool((decrease.abs() <= goal).all())

@@ -1,12 +1,12 @@
-r"""Values of some vertices, inpainted on the others.
+r"""Smooth inpainting of unknown vertex values.
 
-Values vary from vertex to vertex like a random walk, and are known, badly, from elsewhere, so
-that the most likely ones of the others minimize
+Values vary from vertex to vertex like a random walk and have a weak prior. So the most likely
+unknown values minimize
 
 .. math:: \sum_{ab} |v_a - v_b|^2 + \sum_u h_u |v_u - w_u|^2
 
-over edges that end in one of them, and over them; ``h`` is the variance of a step over that of
-what is known from elsewhere.
+over edges with an unknown end, and over unknown vertices; ``h`` is the variance of a step over the
+prior variance.
 """
 
 import torch
@@ -24,16 +24,16 @@ def continued(
     otherwise: VertexValues,
     damping: PerVertex,
 ) -> VertexValues:
-    """Continue values smoothly from where they are known.
+    """Inpaint unknown vertex values smoothly from known ones.
 
     Args:
-        values: Of the vertices; anything where they are not known.
+        values: Of the vertices; ignored where unknown.
         edges: Between neighbours, each once.
-        otherwise: What the others are taken for, far from what is known.
-        damping: How many neighbours that counts as; above 0 unless all have a known one, or one
-            that has.
+        otherwise: Prior mean of unknown values, reached far from known ones.
+        damping: Weight of the prior mean, 1 being that of a neighbour; above 0 except in connected
+            components with a known vertex.
 
-    Differentiable in the values that are known, and in the others' ``otherwise`` and ``damping``.
+    Differentiable in the known values, and in ``otherwise`` and ``damping`` of the unknown ones.
 
     >>> chain = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4]])
     >>> known = torch.tensor([True, True, False, True, True])
@@ -44,50 +44,50 @@ def continued(
     (unknown,) = torch.nonzero(~known, as_tuple=True)
     if len(unknown) == 0:
         return values
-    each = torch.arange(len(unknown), device=known.device)
-    index = known.long().index_copy(0, unknown, each)
-    both = torch.cat([edges, edges.flip(1)])
-    own, beside = both[~known[both[:, 0]]].unbind(dim=1)
-    row, fixed = index[own], known[beside]
-    own_damping = damping[unknown].double()
-    side = own_damping[:, None] * otherwise[unknown].double()
-    side = side.index_add(0, row[fixed], values[beside[fixed]].double())
-    around = torch.bincount(row, minlength=len(unknown)).to(own_damping)
-    (found,) = solutions(
-        torch.cat([each, row[~fixed]]),
-        torch.cat([each, index[beside[~fixed]]]),
-        torch.cat([around + own_damping, around.new_full((int((~fixed).sum()),), -1.0)]),
-        side,
+    rows = torch.arange(len(unknown), device=known.device)
+    index = known.long().index_copy(0, unknown, rows)
+    directed = torch.cat([edges, edges.flip(1)])
+    vertex, neighbour = directed[~known[directed[:, 0]]].unbind(dim=1)
+    row, fixed = index[vertex], known[neighbour]
+    row_damping = damping[unknown].double()
+    rhs = row_damping[:, None] * otherwise[unknown].double()
+    rhs = rhs.index_add(0, row[fixed], values[neighbour[fixed]].double())
+    degree = torch.bincount(row, minlength=len(unknown)).to(row_damping)
+    (solution,) = solutions(
+        torch.cat([rows, row[~fixed]]),
+        torch.cat([rows, index[neighbour[~fixed]]]),
+        torch.cat([degree + row_damping, degree.new_full((int((~fixed).sum()),), -1.0)]),
+        rhs,
         what="the inpainting of vertices",
     )
-    return values.index_copy(0, unknown, found.to(values))
+    return values.index_copy(0, unknown, solution.to(values))
 
 
 def about_mean(values: VertexValues, known: VertexMask, edges: Edges) -> VertexValues:
-    """Continue values from where they are known; far from there, they are the mean of these.
+    """Inpaint unknown vertex values, with the mean of the known ones as prior mean.
 
-    Both variances are those of the known values. If none is known, ``values`` are returned.
-    Differentiable in the known values.
+    The variances of a step and of the prior are those of the known values. If none is known,
+    ``values`` are returned. Differentiable in the known values.
     """
     if not bool(known.any()):
         return values
-    given = values[known]
-    mean = given.mean(dim=0)
-    spread = average((given - mean).double().square().sum(dim=1))
-    one, other = values.double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
-    step = total((one - other).square()) / max(len(one), 1)
-    damping = torch.where(spread > 0, step / torch.where(spread > 0, spread, 1), 0)
+    known_values = values[known]
+    mean = known_values.mean(dim=0)
+    variance = average((known_values - mean).double().square().sum(dim=1))
+    start, end = values.double()[edges[known[edges].all(dim=1)]].unbind(dim=1)
+    step = total((start - end).square()) / max(len(start), 1)
+    damping = torch.where(variance > 0, step / torch.where(variance > 0, variance, 1), 0)
     damping = damping.clamp_min(1e-6).expand(len(values))
     return continued(values, known, edges, mean.expand_as(values), damping)
 
 
 def enclosed(known: VertexMask, faces: Faces, border: VertexMask | None = None) -> VertexMask:
-    """Find what known vertices enclose: groups of others that do not reach the border.
+    """Return the unknown vertices enclosed by known ones: components without a border vertex.
 
-    A group without any known vertex beside it is not enclosed.
+    A component without a known neighbour is not enclosed.
 
     Args:
-        border: Of the surface; without, that of the faces.
+        border: Border vertices of the surface; those of the faces by default.
 
     >>> fan = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1]])
     >>> enclosed(torch.tensor([False, True, True, True]), fan)
@@ -96,10 +96,10 @@ def enclosed(known: VertexMask, faces: Faces, border: VertexMask | None = None) 
     label = vertex_components(faces, ~known)
     if border is None:
         border = boundary_vertices(faces, len(known))
-    reaches = torch.zeros(len(known), dtype=torch.bool, device=known.device)
-    reaches[label[border & ~known]] = True
+    at_border = torch.zeros(len(known), dtype=torch.bool, device=known.device)
+    at_border[label[border & ~known]] = True
     corner = known[faces]
     ends = faces[corner.any(dim=1)[:, None] & ~corner]
-    beside = torch.zeros_like(reaches)
-    beside[label[ends]] = True
-    return ~known & beside[label] & ~reaches[label]
+    has_known = torch.zeros_like(at_border)
+    has_known[label[ends]] = True
+    return ~known & has_known[label] & ~at_border[label]

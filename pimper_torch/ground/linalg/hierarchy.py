@@ -1,7 +1,7 @@
 """The multigrid hierarchy of a matrix, and its V-cycle as a preconditioner.
 
-Levels are built once and cycled by compiled kernels, on the CPU: they are constant to autograd.
-Torch's compressed rows take up to 4 times as long for less than a million unknowns.
+Levels are built once and cycled by compiled kernels on the CPU, without gradients. Torch's
+compressed rows take up to 4 times as long for less than a million unknowns.
 
 Vectors have one row per unknown and one column per right-hand side.
 """
@@ -20,27 +20,27 @@ from pimper_torch.ground.linalg import aggregation
 from pimper_torch.ground.shapes import Sides
 from pimper_torch.runtime.parallel import on_one_thread, over_rows
 
-# Up to so many unknowns, the coarsest level is solved by a dense inverse: a choice.
+# Maximum unknowns of a coarsest level that is solved by a dense inverse: a choice.
 _DENSE = 400
 
-# Chebyshev's polynomial smooths the part of the spectrum, [0, 2], above 2 / _SPAN: a choice; the
-# part below is left to the coarse unknowns.
+# Chebyshev's polynomial smooths the spectrum, [0, 2], above 2 / _SPAN: a choice; the coarse
+# unknowns reduce the rest.
 _SPAN = 4
 
-# Two steps of the three-term recurrence of Chebyshev's polynomials on that part: the first goes
-# by D^-1 residual / _CENTER, the second by _OF_STEP of that and _OF_CORRECTION of D^-1 residual.
+# Two steps of the three-term recurrence of Chebyshev's polynomials on that interval: the first step
+# is D^-1 residual / _CENTER, the second adds _OF_STEP of it and _OF_CORRECTION of D^-1 residual.
 _CENTER, _RADIUS = 1 + 1 / _SPAN, 1 - 1 / _SPAN
 _GAIN = 1 / (2 * _CENTER / _RADIUS - _RADIUS / _CENTER)
 _OF_STEP, _OF_CORRECTION = 1 + _GAIN * _RADIUS / _CENTER, 2 * _GAIN / _RADIUS
 
 
 class Level:
-    """A level: its matrix, smoother, prolongation and restriction; all right-hand sides at once.
+    """A level: its matrix, smoother, prolongation and restriction, for all right-hand sides.
 
     Its vectors are allocated once: results are valid until the next cycle.
 
     Args:
-        prolong: From the next level's unknowns to this one's; ``None`` on the last.
+        prolong: From the next level's unknowns to those of this level; ``None`` on the last.
         dtype: Of vectors.
     """
 
@@ -62,30 +62,30 @@ class Level:
         from pimper_torch.ground.kernels import sparse_products
 
         remaining, size = residual, len(residual)
-        step, found = (self._buffer(name, residual) for name in ("step", "found"))
+        step, solution = (self._buffer(name, residual) for name in ("step", "solution"))
         if start is not None:
-            remaining = self._buffer("left", residual)
-            with_product(self._matrix, start, residual, keep=1.0, gain=-1.0, found=remaining)
-        diagonal, left = self._inverse_diagonal, as_array(remaining)
-        over_rows(sparse_products.scaled, size, diagonal, left, as_array(step), 1 / _CENTER)
-        vectors = [as_array(each) for each in (step, step if start is None else start, found)]
+            remaining = self._buffer("remaining", residual)
+            with_product(self._matrix, start, residual, keep=1.0, gain=-1.0, out=remaining)
+        diagonal, rhs = self._inverse_diagonal, as_array(remaining)
+        over_rows(sparse_products.scaled, size, diagonal, rhs, as_array(step), 1 / _CENTER)
+        vectors = [as_array(each) for each in (step, step if start is None else start, solution)]
         of_step = _OF_STEP - 1 if start is None else _OF_STEP
-        arrays = *aggregation.parts_of(self._matrix), diagonal, left, *vectors
+        arrays = *aggregation.parts_of(self._matrix), diagonal, rhs, *vectors
         over_rows(sparse_products.corrected, size, *arrays, of_step, _OF_CORRECTION)
-        return found
+        return solution
 
-    def correct(self, residual: Sides, found: Sides, coarser: Callable[[Sides], Sides]) -> None:
-        """Add the prolonged correction that the next level makes of the restricted residual."""
+    def correct(self, residual: Sides, solution: Sides, coarser: Callable[[Sides], Sides]) -> None:
+        """Add the next level's solution for the restricted residual, prolonged."""
         assert self._prolong is not None, "the last level has no coarser one"
         assert self._restrict is not None
-        remaining = self._buffer("left", residual)
-        with_product(self._matrix, found, residual, keep=1.0, gain=-1.0, found=remaining)
+        remaining = self._buffer("remaining", residual)
+        with_product(self._matrix, solution, residual, keep=1.0, gain=-1.0, out=remaining)
         coarse = self._buffer("coarse", residual, self._restrict.shape[0])
-        correction = coarser(with_product(self._restrict, remaining, found=coarse))
-        with_product(self._prolong, correction, found, keep=1.0, found=found)
+        correction = coarser(with_product(self._restrict, remaining, out=coarse))
+        with_product(self._prolong, correction, solution, keep=1.0, out=solution)
 
     def _buffer(self, name: str, like: Tensor, size: int | None = None) -> Tensor:
-        """Return a named buffer, kept from cycle to cycle while its shape is the same."""
+        """Return a named buffer, reused while its shape is the same."""
         shape = (len(like) if size is None else size, *like.shape[1:])
         if name not in self._vectors or self._vectors[name].shape != shape:
             self._vectors[name] = like.new_empty(shape)
@@ -93,12 +93,12 @@ class Level:
 
 
 class Hierarchy:
-    """Levels of a symmetric positive definite matrix, cycled as a preconditioner.
+    """Levels of a symmetric positive definite matrix; their V-cycle is a preconditioner.
 
     Args:
-        dtype: Of cycles: float32 takes half the memory, and as many cycles.
+        dtype: Of cycles: float32 takes half the memory, and the same number of cycles.
 
-    The cycle is symmetric and positive definite, as conjugate gradients need it: two
+    The cycle is symmetric and positive definite, as conjugate gradients require: two
     Chebyshev-Jacobi steps before and after every coarser level.
     """
 
@@ -118,7 +118,7 @@ class Hierarchy:
         self._coarsest = _dense_inverse(matrix).to(dtype) if small else None
 
     def cycle(self, residual: Sides) -> Sides:
-        """Apply the approximate inverse; the next cycle may overwrite the result."""
+        """Return the approximate inverse times ``residual``; the next cycle may overwrite it."""
         return self._cycle(0, residual)
 
     def _cycle(self, depth: int, residual: Sides) -> Sides:
@@ -128,9 +128,9 @@ class Hierarchy:
                 with on_one_thread():
                     return self._coarsest @ residual
             return level.smoothed(residual)
-        found = level.smoothed(residual)
-        level.correct(residual, found, partial(self._cycle, depth + 1))
-        return level.smoothed(residual, found)
+        solution = level.smoothed(residual)
+        level.correct(residual, solution, partial(self._cycle, depth + 1))
+        return level.smoothed(residual, solution)
 
 
 def with_product(
@@ -139,21 +139,21 @@ def with_product(
     start: Float[Tensor, "row side"] | None = None,
     keep: float = 0.0,
     gain: float = 1.0,
-    found: Float[Tensor, "row side"] | None = None,
+    out: Float[Tensor, "row side"] | None = None,
 ) -> Float[Tensor, "row side"]:
-    """Return ``keep * start + gain * matrix @ vectors`` by compiled kernels, into ``found``."""
+    """Return ``keep * start + gain * matrix @ vectors`` by compiled kernels, in ``out``."""
     from pimper_torch.ground.kernels import sparse_products
 
-    if found is None:
-        found = vectors.new_empty(matrix.shape[0], *vectors.shape[1:])
-    columns = [as_array(each) for each in (vectors, found if start is None else start, found)]
+    if out is None:
+        out = vectors.new_empty(matrix.shape[0], *vectors.shape[1:])
+    columns = [as_array(each) for each in (vectors, out if start is None else start, out)]
     arrays = *aggregation.parts_of(matrix), *columns
-    over_rows(sparse_products.product, len(found), *arrays, keep, gain)
-    return found
+    over_rows(sparse_products.product, len(out), *arrays, keep, gain)
+    return out
 
 
 def _rounded(matrix: csr_array, real: np.dtype[np.floating]) -> csr_array:
-    """Return a matrix with entries of another type; the arrays of indices are shared."""
+    """Return a matrix with its entries in the type ``real``; the arrays of indices are shared."""
     entries = matrix.data.astype(real, copy=False)
     return csr_array((entries, matrix.indices, matrix.indptr), shape=matrix.shape)
 

@@ -23,7 +23,7 @@ def normal_equations(
     r"""Return :math:`J^T W J` and :math:`J^T W t` of equations :math:`\sum_k c_k x_{u_k} = t`.
 
     Args:
-        coefficients: Of these. Pad shorter equations with 0 of any unknown.
+        coefficients: Of these unknowns. Pad shorter equations with 0 for any unknown.
         weights: Of each equation, not negative.
 
     Returns:
@@ -41,7 +41,7 @@ def normal_equations(
     return rows.flatten(), cols.flatten(), blocks.flatten(), rhs
 
 
-# Of some equations: unknowns, coefficients, targets and weights.
+# Unknowns, coefficients, targets and weights of a set of equations.
 Terms = tuple[Int[Tensor, "_ _"], Float[Tensor, "_ _"], Float[Tensor, " _"], Float[Tensor, " _"]]
 
 
@@ -50,21 +50,21 @@ def compressed_equations(
 ) -> tuple[csr_array, Float[Tensor, " unknown"]]:
     """Return the normal equations of several sets by compiled kernels, in float64 on the CPU.
 
-    They take no memory beyond that of the matrix.
+    They need no memory except that of the matrix.
 
     Args:
         kinds: Unknowns, coefficients, targets and weights of each set, as in
             :func:`normal_equations`.
         damping: Weight of each unknown's prior; above 0.
+        start: Prior mean of each unknown.
 
     Returns:
-        The matrix, columns in order, and the right-hand side. A constant to autograd.
+        The matrix, columns sorted, and the right-hand side. Not differentiable.
     """
     from pimper_torch.ground.kernels import normal_equations as kernels
 
     size = len(damping)
-    each = torch.arange(size)[:, None]
-    prior = (each, torch.ones(size, 1, dtype=start.dtype), start, damping)
+    prior = (torch.arange(size)[:, None], torch.ones(size, 1, dtype=start.dtype), start, damping)
     sets = []
     for unknowns, coefficients, targets, weights in (prior, *kinds):
         if len(unknowns):
@@ -72,9 +72,9 @@ def compressed_equations(
             values = as_array(coefficients, real), as_array(targets, real)
             sets.append((as_array(unknowns), *values, as_array(weights, torch.float64)))
     counts, side = np.zeros(size, np.int32), np.zeros(size)
-    for index, factors, wanted, weight in sets:
+    for index, factors, target, weight in sets:
         kernels.count(index, counts)
-        kernels.add_sides(index, factors, wanted, weight, side)
+        kernels.add_sides(index, factors, target, weight, side)
     starts = np.zeros(size, np.int32)
     np.cumsum(counts[:-1], out=starts[1:])
     total = int(counts.sum(dtype=np.int64))
@@ -82,7 +82,7 @@ def compressed_equations(
     for index, factors, _, weight in sets:
         kernels.fill(index, factors, weight, ends, columns, entries)
     first = kernels.merge(starts, ends, columns, entries)
-    for array in (columns, entries):  # what duplicates took is given back, without a copy
+    for array in (columns, entries):  # free the memory of duplicates, without a copy
         array.resize(first[-1], refcheck=False)
     matrix = csr_array((entries, columns, first), shape=(size, size))
     return matrix, torch.from_numpy(side)

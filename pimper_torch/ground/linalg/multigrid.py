@@ -1,4 +1,4 @@
-"""Conjugate gradients preconditioned by multigrid, with the interface of sparse Cholesky."""
+"""Sparse solver by conjugate gradients with a multigrid preconditioner."""
 
 import torch
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from pimper_torch.ground.linalg.conjugate_gradients import compressed_gradients
 from pimper_torch.ground.linalg.hierarchy import Hierarchy, with_product
 from pimper_torch.ground.linalg.prepared import WORST_RESIDUAL, PreparedMatrix, SingularSystemError
 
-# A choice: the hardest systems of `benchmarks/linear_systems.py` take 25 cycles.
+# Iteration limit, a choice: the hardest systems of `benchmarks/linear_systems.py` take 25.
 _MAX_CYCLES = 300
 
 
@@ -22,14 +22,14 @@ def solve_by_cycles(
     what: str,
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> tuple[Float[Tensor, "unknown side"], int]:
-    """Solve A x = b in float64 by conjugate gradients, for all right-hand sides at once.
+    """Solve A x = b in float64 by conjugate gradients, for all right-hand sides together.
 
     Args:
         diagonal: Of A; only to measure the residual.
         rhs: ``b``, on the CPU.
-        tolerance: Of the error's energy norm, as the hierarchy estimates it, relative to that of
-            the solution.
-        start: Where to begin; zero if not given.
+        tolerance: Maximum energy norm of the error, as estimated by the hierarchy, relative to that
+            of the solution.
+        start: Initial solution; zero by default.
 
     Returns:
         The solution, and the number of iterations.
@@ -37,34 +37,34 @@ def solve_by_cycles(
     Raises:
         SingularSystemError: No convergence, with the iterations and the residual reached.
     """
-    found, cycles, converged = compressed_gradients(
+    solution, cycles, converged = compressed_gradients(
         matrix, hierarchy, rhs, start=start, tolerance=tolerance, max_iterations=_MAX_CYCLES
     )
-    residual = with_product(matrix, found, rhs, keep=1.0, gain=-1.0)
+    residual = with_product(matrix, solution, rhs, keep=1.0, gain=-1.0)
     scale = diagonal.rsqrt()[:, None]
-    left, side = (scale * residual).norm(dim=0), (scale * rhs).norm(dim=0)
-    # Smooth solutions have a right-hand side that is small compared with their energy norm.
-    energy = (found * rhs).sum(dim=0).clamp_min(0).sqrt()
-    # The energy norm bounds the residual but for a factor of 1.5; the hierarchy estimates it.
-    most = torch.maximum(WORST_RESIDUAL * side, 10.0 * tolerance * energy)
-    if not (converged and bool((left <= most).all())):
+    remaining, side = (scale * residual).norm(dim=0), (scale * rhs).norm(dim=0)
+    # The right-hand side of a smooth solution is small compared with its energy norm.
+    energy = (solution * rhs).sum(dim=0).clamp_min(0).sqrt()
+    # The energy norm bounds the residual up to a factor of 1.5; the hierarchy estimates it.
+    limit = torch.maximum(WORST_RESIDUAL * side, 10.0 * tolerance * energy)
+    if not (converged and bool((remaining <= limit).all())):
         raise SingularSystemError(
             f"{what} ({len(rhs)} unknowns) did not converge: after {cycles} iterations of "
-            f"multigrid its residual is {float((left / most).max()):.1e} of the largest that is "
-            f"accepted, and its relative error must be {tolerance:.0e}. Some "
-            "unknowns are determined by (nearly) no equation, or the matrix is not positive "
-            "definite: anchor them, raise the weight of the prior, or solve by Cholesky."
+            f"multigrid its residual is {float((remaining / limit).max()):.1e} times the accepted "
+            f"one, with a relative tolerance of {tolerance:.0e}. (Nearly) no equation determines "
+            "some of the unknowns, or the matrix is not positive definite: add equations, "
+            "increase the weight of the prior, or solve by Cholesky."
         )
-    return found, cycles
+    return solution, cycles
 
 
 class Multigrid(PreparedMatrix):
-    r"""Solves a sparse system by conjugate gradients with a multigrid preconditioner.
+    r"""Sparse matrix solved by conjugate gradients with a multigrid preconditioner.
 
     For millions of unknowns: memory and time are linear in the unknowns, unlike those of
-    :class:`~pimper_torch.ground.linalg.sparse.SparseCholesky`. For graph Laplacians and similar
-    matrices, whose off-diagonal entries are mostly negative. Cycles run on the CPU, wherever the
-    right-hand side is.
+    :class:`~pimper_torch.ground.linalg.sparse.SparseCholesky`. For matrices with mostly negative
+    off-diagonal entries, such as graph Laplacians. Cycles run on the CPU for any device of the
+    right-hand side.
 
     >>> index = torch.tensor([0, 1])
     >>> grid = Multigrid(index, index, torch.tensor([2.0, 4.0]), size=2)
@@ -79,12 +79,12 @@ class Multigrid(PreparedMatrix):
     def iterate(
         self, rhs: Float[Tensor, "unknown ..."]
     ) -> tuple[Float[Tensor, "unknown ..."], int]:
-        """Solve and count the iterations; not differentiable, in float64 on the CPU."""
+        """Return the solution and the number of iterations; float64 on the CPU, no gradients."""
         columns = rhs.detach().cpu().double().reshape(len(rhs), -1).contiguous()
-        given = self._matrix, self._hierarchy, self._diagonal, columns
-        found, cycles = solve_by_cycles(*given, self._tolerance, self._what)
-        return found.reshape(rhs.shape), cycles
+        system = self._matrix, self._hierarchy, self._diagonal, columns
+        solution, cycles = solve_by_cycles(*system, self._tolerance, self._what)
+        return solution.reshape(rhs.shape), cycles
 
     def solve_values(self, rhs: Float[Tensor, "unknown ..."]) -> Float[Tensor, "unknown ..."]:
-        """Solve; constant to autograd."""
+        """Solve without gradients."""
         return rhs.clone() if rhs.numel() == 0 else self.iterate(rhs)[0].to(rhs)

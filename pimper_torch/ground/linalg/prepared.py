@@ -1,4 +1,4 @@
-"""The base of sparse solvers: assembly of the matrix, and gradients of solutions."""
+"""Base class of sparse solvers: assembly of the matrix, and gradients of solutions."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -12,8 +12,8 @@ from torch import Tensor
 from pimper_torch.ground.shapes import PerEntry, Unknowns
 from pimper_torch.runtime.errors import NumericalError
 
-# Maximum residual of a solution, with the diagonal scaled to 1, relative to the right-hand side: a
-# choice, far above rounding and far below any noise of the data.
+# Maximum residual of a solution relative to the right-hand side, with the diagonal scaled to 1: a
+# choice, far above rounding and far below noise of the data.
 WORST_RESIDUAL = 1e-6
 
 
@@ -21,12 +21,12 @@ class SingularSystemError(NumericalError):
     """Linear equations that do not determine their unknowns."""
 
 
-def refuse_hopeless(entries: PerEntry, diagonal: Float[Tensor, " unknown"], what: str) -> None:
-    """Refuse entries that are not finite and unknowns without a positive diagonal."""
+def require_solvable(entries: PerEntry, diagonal: Float[Tensor, " unknown"], what: str) -> None:
+    """Raise SingularSystemError for entries that are not finite or a diagonal not positive."""
     if not bool(entries.isfinite().all()):
         raise SingularSystemError(
-            f"{what} has {int((~entries.isfinite()).sum())} entries that are not finite "
-            "numbers; all must be. Look for zero weights or invalid samples in its input."
+            f"{what} has {int((~entries.isfinite()).sum())} entries that are not finite; all must "
+            "be finite numbers. Look for zero weights or invalid samples in its input."
         )
     empty = torch.nonzero(diagonal <= 0).flatten()
     if len(empty):
@@ -37,7 +37,7 @@ def refuse_hopeless(entries: PerEntry, diagonal: Float[Tensor, " unknown"], what
         )
 
 
-# Of the error's energy norm relative to the solution's: a choice; a digit costs one to two cycles.
+# Energy norm of the error over that of the solution: a choice; a digit costs one to two cycles.
 DEFAULT_TOLERANCE = 1e-10
 
 
@@ -49,8 +49,8 @@ class PreparedMatrix(ABC):
 
     Args:
         values: Of the entries; solutions are differentiable in them.
-        what: Names the system in errors, such as ``"the alignment"``.
-        tolerance: Of the error, in the energy norm, relative; a factor is exact.
+        what: Name of the system in errors, such as ``"the alignment"``.
+        tolerance: Maximum relative error in the energy norm; ignored by a Cholesky factor.
 
     Raises:
         SingularSystemError: Entries that are not finite, or an unknown without a positive
@@ -70,8 +70,8 @@ class PreparedMatrix(ABC):
         entries = values.detach().double().cpu().numpy()
         self._matrix = coo_array((entries, index), shape=(size, size)).tocsr()
         self._diagonal = torch.from_numpy(self._matrix.diagonal())
-        refuse_hopeless(torch.from_numpy(self._matrix.data), self._diagonal, what)
-        if not values.requires_grad:  # gradients alone need the entries
+        require_solvable(torch.from_numpy(self._matrix.data), self._diagonal, what)
+        if not values.requires_grad:  # only gradients need the entries
             rows, cols, values = (part.new_empty(0) for part in (rows, cols, values))
         self.rows, self.cols, self._values, self._what = rows, cols, values, what
         self._prepare(tolerance)
@@ -80,22 +80,22 @@ class PreparedMatrix(ABC):
     def _prepare(self, tolerance: float) -> None: ...
 
     def solve(self, rhs: Unknowns) -> Unknowns:
-        """Solve for one right-hand side or several at once.
+        """Solve for one or more right-hand sides.
 
         Differentiable in ``rhs`` and in the matrix's ``values``, any number of times, by adjoint
-        solves with the same preparation. A gradient with respect to ``values`` treats the
-        entries as free; used through a symmetric assembly it is exact.
+        solves with the same preparation. The gradient by ``values`` treats all entries as
+        independent; through a symmetric assembly it is exact.
 
         Raises:
-            SingularSystemError: The solution does not satisfy the equations to 1e-6 of the
-                right-hand side, or the right-hand side is not finite.
+            SingularSystemError: The residual exceeds 1e-6 of the right-hand side, or the
+                right-hand side is not finite.
         """
         solution: Tensor = _Solve.apply(self, self._values, rhs)  # type: ignore[no-untyped-call]
         return solution
 
     @abstractmethod
     def solve_values(self, rhs: Unknowns) -> Unknowns:
-        """Solve, constant to autograd, in device and dtype of rhs; see :meth:`solve` for errors."""
+        """Solve without gradients, in device and dtype of ``rhs``; raises as :meth:`solve`."""
 
 
 class _Solve(torch.autograd.Function):

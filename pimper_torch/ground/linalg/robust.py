@@ -21,13 +21,13 @@ Scale = Annotated[float, Range(above=0, most=1e12)]
 
 
 class Loss(ABC):
-    r"""A loss of residuals, :math:`\tfrac{s^2}{2} \rho(r^2 / s^2)`, by which outliers lose weight.
+    r"""A loss of residuals, :math:`\tfrac{s^2}{2} \rho(r^2 / s^2)`, which reduces outliers' weight.
 
-    A loss of one's own defines :meth:`rho` and :meth:`weight`.
+    A custom loss defines :meth:`rho` and :meth:`weight`.
 
     Attributes:
         scale: ``s`` in standard deviations of the residuals.
-        code: Number of the loss in compiled kernels; without one, solvers run in torch.
+        code: Number of the loss in compiled kernels; if ``None``, solvers run in torch.
     """
 
     scale: float
@@ -42,18 +42,18 @@ class Loss(ABC):
 
     @abstractmethod
     def weight(self, square: Scalars) -> Scalars:
-        """Return the derivative of :meth:`rho`, the weight of iteratively reweighted squares."""
+        """Return the derivative of :meth:`rho`: the weight in iteratively reweighted squares."""
 
     def slope(self, square: Scalars) -> Scalars:
         """Return the derivative of :meth:`weight`, by autograd."""
         return with_slope(self.weight, square)[1]
 
     def weights(self, residual: Scalars, deviation: Float[Tensor, "*#batch"]) -> Scalars:
-        """Return the weight of each residual; that of a zero residual where the deviation is 0."""
+        """Return the weight of each residual, and that of a zero residual if the deviation is 0."""
         return self.weight(_relative_square(residual, self.scale * deviation))
 
     def curvatures(self, residual: Scalars, deviation: Float[Tensor, "*#batch"]) -> Scalars:
-        """Return the second derivative of the loss by the residual, negative for some outliers."""
+        """Return the second derivative of the loss by the residual; it may be negative."""
         square = _relative_square(residual, self.scale * deviation)
         return self.weight(square) + 2 * square * self.slope(square)
 
@@ -120,32 +120,32 @@ class Huber(Loss):
     scale: Scale = twin_constants.HUBER_TUNING
 
     def rho(self, square: Scalars) -> Scalars:
-        """Return squares of small residuals, and sizes of large ones."""
+        r"""Return :math:`u` up to 1, and :math:`2 \sqrt u - 1` beyond."""
         return torch.where(square <= 1, square, 2 * square.clamp_min(1).sqrt() - 1)
 
     def weight(self, square: Scalars) -> Scalars:
-        r"""Return 1, and :math:`1 / \sqrt u` beyond."""
+        r"""Return 1 for :math:`u` up to 1, and :math:`1 / \sqrt u` beyond."""
         return square.clamp_min(1).rsqrt()
 
 
 def with_slope(
     function: Callable[[Scalars], Float[Tensor, "..."]], at: Scalars
 ) -> tuple[Float[Tensor, "..."], Scalars]:
-    """Return a function's values and the derivative of their sum, both constant to autograd."""
+    """Return a function's values and the derivative of their sum, both without gradients."""
     with torch.enable_grad():
         at = at.detach().requires_grad_()
-        found = function(at)
-        if not found.requires_grad:
-            return found, torch.zeros_like(at)
-        (slope,) = torch.autograd.grad(found.sum(), at)
-    return found.detach(), slope
+        values = function(at)
+        if not values.requires_grad:
+            return values, torch.zeros_like(at)
+        (slope,) = torch.autograd.grad(values.sum(), at)
+    return values.detach(), slope
 
 
 def median_deviation(residual: Items, seen: Seen) -> Scalars:
-    """Estimate residuals' standard deviation by their median absolute value; 0 if none is seen.
+    """Estimate the standard deviation of residuals by their median absolute value; 0 without any.
 
-    The factor 1.4826 makes it consistent for Gaussian noise. Where most residuals are close to
-    zero it rejects the others more strictly than :func:`robust_deviation`.
+    The factor 1.4826 makes it consistent for Gaussian noise. If most residuals are close to zero it
+    rejects the others more strictly than :func:`robust_deviation`.
     """
     size = torch.where(seen, residual.abs(), torch.nan)
     return 1.4826 * size.nanmedian(dim=-1).values.nan_to_num(nan=0.0)
@@ -154,20 +154,19 @@ def median_deviation(residual: Items, seen: Seen) -> Scalars:
 def robust_deviation(residual: Items, seen: Seen) -> Scalars:
     r"""Estimate the standard deviation of residuals, robustly and differentiably.
 
-    An M-estimate of scale, of which the median absolute value is the limit of high powers: the
-    ``t`` with
+    An M-estimate of scale, the ``t`` with
 
     .. math:: \frac1n \sum_i \frac{r_i^4}{r_i^4 + t^4} = \frac12.
 
-    Its breakdown point is a half, like that of the median; unlike the median it is a smooth
-    function of every residual.
+    With higher powers it tends to the median absolute value. It has the same breakdown point, a
+    half, but is a smooth function of every residual.
 
     Args:
-        residual: Ignored where not seen.
+        residual: Ignored where missing.
         seen: False where missing.
 
     Returns:
-        0 where none is seen, or half of them are zero. Differentiable by the implicit function.
+        0 if all are missing or half are zero. Differentiable by the implicit function theorem.
 
     >>> noise = torch.randn(100_000, generator=torch.Generator().manual_seed(0))
     >>> torch.allclose(robust_deviation(3 * noise, noise < 9), torch.tensor(3.0), rtol=0.01)
@@ -184,7 +183,7 @@ def robust_variance(square: Items, seen: Seen) -> Scalars:
     """Estimate the variance from squared residuals; see :func:`robust_deviation`.
 
     Args:
-        square: Zero where not seen.
+        square: Zero where missing.
         seen: False where missing.
     """
     half = seen.sum(dim=-1).to(square) / 2
@@ -193,24 +192,24 @@ def robust_variance(square: Items, seen: Seen) -> Scalars:
     fraction = _fractions(square, scale)
     slope = 2 * along_last((fraction * (1 - fraction)).detach())
     correction = (along_last(fraction) - half) / torch.where(slope > 0, slope, 1)
-    # One more Newton step, of length about zero: its derivative is the implicit function's.
+    # The derivative of one more Newton step, of about zero, is that of the implicit function.
     variance = (scale[..., 0] * (1 + correction)).clamp_min(0)
     return torch.where(determined, variance / twin_constants.GAUSSIAN_SCALE**2, 0)
 
 
 @torch.no_grad()
 def _scale_of_squares(square: Items, half: Scalars) -> Scalars:
-    """Find the squared scale by Newton's method for its logarithm, from the mean square down."""
+    """Return the squared scale, by Newton's method for its logarithm from the mean square."""
     scale = along_last(square) / square.shape[-1]
     scale = torch.where(scale > 0, scale, 1)
-    close = torch.finfo(square.dtype).eps ** 0.75
+    tolerance = torch.finfo(square.dtype).eps ** 0.75
     for _ in range(twin_constants.NEWTON_STEPS):
         fraction = _fractions(square, scale[..., None])
         slope = 2 * (along_last(fraction) - along_last(fraction.square()))
         step = (along_last(fraction) - half) / slope.clamp_min(torch.finfo(slope.dtype).eps)
         longest = twin_constants.LONGEST_NEWTON_STEP
         scale = scale * step.clamp(-longest, longest).exp()
-        if bool((step.abs() < close).all()):
+        if bool((step.abs() < tolerance).all()):
             break
     return scale
 

@@ -1,7 +1,7 @@
 """Sparse Cholesky factors, with differentiable solves.
 
-The one place that talks to cholespy (CHOLMOD underneath). Systems are factored on the CPU
-in float64 whatever the device and dtype of the tensors; solutions go back to both.
+The only module that calls cholespy (a wrapper of CHOLMOD). Systems are factored on the CPU in
+float64; solutions have the device and dtype of the right-hand side.
 """
 
 import atexit
@@ -15,23 +15,23 @@ from scipy.sparse import coo_array
 from pimper_torch.ground.linalg.prepared import WORST_RESIDUAL, PreparedMatrix, SingularSystemError
 from pimper_torch.ground.shapes import Unknowns
 
-# Above this the solution has fewer than three digits in float64; an exactly singular
-# matrix that survives elimination by rounding lands at 1e15 and more.
+# Above this condition number the solution has fewer than three digits in float64; singular matrices
+# that can be factored only because of rounding are at 1e15 and more.
 _WORST_CONDITION = 1e13
 
-# Factors whose CHOLMOD part is still to be let go of when Python ends. A result with gradients
-# holds its factor in a graph of torch, which then frees nothing, and cholespy prints what leaks.
+# Factors to free before Python ends. A result with gradients keeps its factor in a graph of torch,
+# which is not freed at exit, and cholespy prints leaks.
 _ALIVE: WeakSet["SparseCholesky"] = WeakSet()
 
 
 class SparseCholesky(PreparedMatrix):
-    r"""A factored matrix.
+    r"""Cholesky factor of a sparse symmetric positive definite matrix.
 
     Arguments are those of :class:`~pimper_torch.ground.linalg.prepared.PreparedMatrix`.
 
     Raises:
-        SingularSystemError: Also for a matrix that is not symmetric positive definite, or one
-            whose condition (after scaling the diagonal to 1) leaves fewer than three digits.
+        SingularSystemError: Also if the matrix is not symmetric positive definite, or if its
+            condition number, with the diagonal scaled to 1, leaves fewer than three digits.
 
     >>> index = torch.tensor([0, 1])
     >>> factor = SparseCholesky(index, index, torch.tensor([2.0, 4.0]), size=2)
@@ -40,7 +40,7 @@ class SparseCholesky(PreparedMatrix):
     """
 
     def _prepare(self, tolerance: float) -> None:
-        # A unit diagonal makes the condition a property of the problem, not of its units.
+        # With a unit diagonal the condition number does not depend on units.
         self._scale = self._diagonal.rsqrt()
         self._scaled = scaled = coo_array(self._matrix)
         scale, size = self._scale.numpy(), len(self._scale)
@@ -54,42 +54,42 @@ class SparseCholesky(PreparedMatrix):
             except ValueError as error:
                 raise SingularSystemError(
                     f"{self._what} ({size} unknowns) is not positive definite: {error} Its "
-                    "equations contradict least squares or leave unknowns free. Anchor the "
-                    "unknowns, or raise the weight of the prior."
+                    "equations contradict least squares or leave unknowns undetermined. Add "
+                    "equations for them, or increase the weight of the prior."
                 ) from error
         _ALIVE.add(self)
-        # The condition is estimated from the solution for a generic right-hand side.
-        probe = torch.cos(torch.arange(size, dtype=torch.float64) ** 2)  # no structure to fit
+        # The condition number is estimated from the solution for a generic right-hand side.
+        probe = torch.cos(torch.arange(size, dtype=torch.float64) ** 2)  # without structure
         growth = float(self._substitute(probe).norm() / probe.norm()) if size else 0.0
         if not growth < _WORST_CONDITION:
             raise SingularSystemError(
                 f"{self._what} ({size} unknowns) has a condition number of about {growth:.0e}; "
-                f"below {_WORST_CONDITION:.0e} is needed. Some unknowns are determined by no "
-                "equation: anchor them, or raise the weight of the prior."
+                f"below {_WORST_CONDITION:.0e} is needed. No equation determines some of the "
+                "unknowns: add equations for them, or increase the weight of the prior."
             )
 
     def _substitute(self, scaled_rhs: Unknowns) -> Unknowns:
-        answer = np.zeros(scaled_rhs.shape)
-        if answer.size and self._solver is not None:
-            self._solver.solve(np.ascontiguousarray(scaled_rhs.numpy()), answer)
-        return torch.from_numpy(answer)
+        solution = np.zeros(scaled_rhs.shape)
+        if solution.size and self._solver is not None:
+            self._solver.solve(np.ascontiguousarray(scaled_rhs.numpy()), solution)
+        return torch.from_numpy(solution)
 
     def solve_values(self, rhs: Unknowns) -> Unknowns:
-        """Solve; constant to autograd."""
+        """Solve without gradients."""
         columns = rhs.detach().double().cpu().reshape(rhs.shape[0], -1)
         scaled = columns * self._scale[:, None]
-        answer = self._substitute(scaled)
-        residual = scaled - torch.from_numpy(self._scaled @ answer.numpy())
+        solution = self._substitute(scaled)
+        residual = scaled - torch.from_numpy(self._scaled @ solution.numpy())
         size = scaled.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
         fraction = residual.norm(dim=0) / size
         if fraction.numel() and not bool((fraction < WORST_RESIDUAL).all()):
             raise SingularSystemError(
-                f"the solution of {self._what} ({len(columns)} unknowns) misses its right-hand "
-                f"side by {float(fraction.max()):.1e} of its size; {WORST_RESIDUAL:.0e} is needed. "
-                "The matrix is nearly singular or not symmetric, or the right-hand side is not "
-                "finite: anchor the unknowns, and look for invalid samples in the input."
+                f"the solution of {self._what} ({len(columns)} unknowns) has a residual of "
+                f"{float(fraction.max()):.1e} of the right-hand side; at most {WORST_RESIDUAL:.0e} "
+                "is accepted. The matrix is nearly singular or not symmetric, or the right-hand "
+                "side is not finite: add equations, and look for invalid samples in the input."
             )
-        return (answer * self._scale[:, None]).reshape(rhs.shape).to(rhs)
+        return (solution * self._scale[:, None]).reshape(rhs.shape).to(rhs)
 
 
 @atexit.register

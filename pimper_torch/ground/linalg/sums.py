@@ -1,7 +1,7 @@
-"""Sums that come out the same whatever the number of threads.
+"""Sums that do not depend on the number of threads.
 
-Torch gives each thread a part of a long sum, so that the order of additions, and with it the last
-bits, depend on how many there are.
+Torch splits a long sum between threads, so the order of additions, and with it the last bits,
+depend on their number.
 """
 
 from jaxtyping import Float, Int, Shaped
@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 
 from pimper_torch.ground.shapes import Scalar, Scalars
 
-# Values of a block: a row, which one thread sums; and so many rows are summed by one thread, too.
+# Values in a block: each block is a row, which one thread sums, as it does up to this many rows.
 _BLOCK = 4096
 
 
@@ -33,14 +33,14 @@ def along_last(values: Float[Tensor, "*batch item"]) -> Scalars:
 
 
 def average(values: Float[Tensor, "*shape"]) -> Scalar:
-    """Return the mean of all values, summed as by :func:`total`; NaN where there are none."""
+    """Return the mean of all values, summed as by :func:`total`; NaN without values."""
     return total(values) / values.numel()
 
 
 def sum_at(
     index: Int[Tensor, " entry"], values: Shaped[Tensor, "entry ..."], count: int
 ) -> Shaped[Tensor, "group ..."]:
-    """Sum the values of each of some groups; 0 for a group without any. Differentiable.
+    """Return the sum of the values in each group; 0 for an empty group. Differentiable.
 
     Args:
         index: The group of each value, below ``count``.

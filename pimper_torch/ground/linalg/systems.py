@@ -1,4 +1,4 @@
-"""Solution of sparse systems by Cholesky or multigrid, by their size."""
+"""Solution of sparse systems by Cholesky or multigrid, depending on their size."""
 
 import numpy as np
 import torch
@@ -12,19 +12,19 @@ from pimper_torch.ground.linalg.multigrid import Multigrid, solve_by_cycles
 from pimper_torch.ground.linalg.prepared import (
     DEFAULT_TOLERANCE,
     SingularSystemError,
-    refuse_hopeless,
+    require_solvable,
 )
 from pimper_torch.ground.linalg.sparse import SparseCholesky
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.runtime.failures import skipped_solver
 from pimper_torch.runtime.parallel import over_rows
 
-# At this size a factor takes three times as long to make as a hierarchy, and a third as long to
-# use; it is exact, and the three coordinates of a surface make up for half a second.
+# At this size a Cholesky factor takes three times as long to compute as a hierarchy, and a third as
+# long to use. It is exact, and the solves for three coordinates make up for half a second.
 _CHOLESKY_UNKNOWNS = 50_000
 
-# By kernels, a hierarchy is faster from this size on: the fusion of the demo's second iteration,
-# 34,000 and 137,000 unknowns, takes 6.1 s in place of 7.3.
+# With compiled kernels, a hierarchy is faster from this size: the fusion in the demo's second
+# iteration, 34,000 and 137,000 unknowns, takes 6.1 s instead of 7.3.
 _COMPILED_CHOLESKY_UNKNOWNS = 10_000
 
 # Maximum fraction of positive entries off the diagonal for multigrid: a choice.
@@ -42,13 +42,13 @@ def prepare(
 ) -> SparseCholesky | Multigrid:
     """Prepare a sparse symmetric positive definite matrix for any number of solves.
 
-    Multigrid serves more than 50,000 unknowns whose couplings are mostly negative, as those of
-    Laplacians are, and sparse Cholesky all others.
+    Multigrid is used for more than 50,000 unknowns with mostly negative couplings, as in
+    Laplacians, and sparse Cholesky otherwise.
 
     Args:
         rows: Row of each entry; duplicate entries add up.
         values: Of the entries; solutions are differentiable in them.
-        tolerance: Of multigrid: of the error, in the energy norm, relative.
+        tolerance: Of multigrid: maximum relative error in the energy norm.
 
     Raises:
         SingularSystemError: See :class:`~pimper_torch.ground.linalg.sparse.SparseCholesky` and
@@ -70,12 +70,10 @@ def solutions(
     what: str = "the linear system",
     tolerance: float = DEFAULT_TOLERANCE,
 ) -> tuple[Float[Tensor, "unknown ..."], ...]:
-    """Solve for some right-hand sides, by a factor where multigrid does not converge.
+    """Solve for several right-hand sides, by Cholesky if multigrid does not converge.
 
     Slivers among the faces of a mesh, and weights that differ by a factor of a million between
-    neighbours, may slow multigrid down.
-
-    Differentiable in ``values`` and in the sides.
+    neighbours, may slow multigrid down. Differentiable in ``values`` and in the sides.
     """
     size = len(sides[0])
     prepared = prepare(rows, cols, values, size, what, tolerance=tolerance)
@@ -84,7 +82,7 @@ def solutions(
     except SingularSystemError as error:
         if isinstance(prepared, SparseCholesky):
             raise
-        _by_factor(what, error)
+        _report_fallback(what, error)
     factor = SparseCholesky(rows, cols, values, size, what)
     return tuple(factor.solve(side) for side in sides)
 
@@ -97,7 +95,11 @@ def solve_compressed(
     tolerance: float = DEFAULT_TOLERANCE,
     start: Float[Tensor, "unknown side"] | None = None,
 ) -> Float[Tensor, "unknown side"]:
-    """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients."""
+    """Solve as :func:`solutions`, for a matrix in compressed rows, without gradients.
+
+    Args:
+        start: Initial solution of multigrid; zero by default.
+    """
     from pimper_torch.ground.kernels import multigrid_levels as kernels
 
     diagonal = torch.from_numpy(matrix.diagonal())
@@ -105,19 +107,17 @@ def solve_compressed(
         parts = over_rows(kernels.off_diagonal, len(sides), *parts_of(matrix))
         positive, total = (sum(part) for part in zip(*parts, strict=True))
         if positive <= _POSITIVE_FRACTION * total:
-            refuse_hopeless(torch.from_numpy(matrix.data), diagonal, what)
+            require_solvable(torch.from_numpy(matrix.data), diagonal, what)
             try:
-                levels = Hierarchy(matrix, torch.float32)
-                given = matrix, levels, diagonal, sides
-                return solve_by_cycles(*given, tolerance, what, start)[0]
+                system = matrix, Hierarchy(matrix, torch.float32), diagonal, sides
+                return solve_by_cycles(*system, tolerance, what, start)[0]
             except SingularSystemError as error:
-                _by_factor(what, error)
+                _report_fallback(what, error)
     rows = np.repeat(np.arange(len(sides)), np.diff(matrix.indptr))
     index = torch.from_numpy(rows), torch.from_numpy(matrix.indices).long()
     return SparseCholesky(*index, torch.from_numpy(matrix.data), len(sides), what).solve(sides)
 
 
-def _by_factor(what: str, error: SingularSystemError) -> None:
-    """Note that multigrid did not converge."""
+def _report_fallback(what: str, error: SingularSystemError) -> None:
     done = "It is solved by a Cholesky factor instead, which takes more time and memory"
     skipped_solver("linalg", what, error, done)

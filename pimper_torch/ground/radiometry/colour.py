@@ -1,4 +1,4 @@
-"""Encoding of radiance by a file's samples."""
+"""Encoding of radiance that a file declares."""
 
 from dataclasses import dataclass
 
@@ -14,14 +14,14 @@ _LEVELS = torch.linspace(0, 1, 1025, dtype=torch.float64)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Colour:
-    """Encoding of a file's samples.
+    """Encoding that a file declares.
 
     Attributes:
-        source: Where it says so, such as ``ICC profile "Display P3"``; empty where it is silent.
-        response: ``None`` where it says nothing, or nothing that can be followed.
-        srgb_from_file: From linear values to linear sRGB; ``None`` where primaries are those of
-            sRGB, or not told.
-        trouble: What about it cannot be followed; empty where all can.
+        source: Declaration, such as ``ICC profile "Display P3"``; empty without one.
+        response: ``None`` if it is not declared or not supported.
+        srgb_from_file: From linear values to linear sRGB; ``None`` if the primaries are those of
+            sRGB, or not declared.
+        trouble: Unsupported part of the declaration; empty if all is supported.
     """
 
     source: str = ""
@@ -34,23 +34,23 @@ SILENT = Colour()
 
 
 def plain(response: Response) -> Response:
-    """Return the standard response that a file's own cannot be told from, or the file's own."""
-    known: tuple[Response, ...] = (Linear(), Srgb())
-    for standard in known:
-        again = standard.encoded_from_linear(_through(response))
-        # Half a level of 255 is what no file of 8 bits tells from the curve itself.
-        if float((again - _LEVELS).abs().max()) <= 0.5 / 255:
+    """Return ``Linear`` or ``Srgb`` if ``response`` equals it in 8 bits, else ``response``."""
+    standards: tuple[Response, ...] = (Linear(), Srgb())
+    for standard in standards:
+        encoded = standard.encoded_from_linear(_linear_levels(response))
+        # In a file of 8 bits, differences of up to half a level of 255 vanish.
+        if float((encoded - _LEVELS).abs().max()) <= 0.5 / 255:
             return standard
     return response
 
 
 def disagree(one: Response, other: Response) -> bool:
-    """Return whether radiance differs by 0.02 of full scale; of gamma 2.2 and sRGB it does not."""
-    return float((_through(one) - _through(other)).abs().max()) > 0.02
+    """Return whether radiance differs by over 0.02 of full scale; gamma 2.2 and sRGB agree."""
+    return float((_linear_levels(one) - _linear_levels(other)).abs().max()) > 0.02
 
 
 def describe(response: Response) -> str:
-    """Name a response as the option does."""
+    """Return the name of a response, as in the option."""
     if isinstance(response, Linear):
         return "linear"
     if isinstance(response, Srgb):
@@ -58,7 +58,6 @@ def describe(response: Response) -> str:
     return f"{response.exponent:.4g}" if isinstance(response, Gamma) else "a curve"
 
 
-def _through(response: Response) -> Float[Tensor, "channel level"]:
+def _linear_levels(response: Response) -> Float[Tensor, "channel level"]:
     rows = len(response.radiance) if isinstance(response, Curve) else 1
-    spread = _LEVELS.expand(rows, 1, -1)
-    return response.linear_from_encoded(spread)[:, 0]
+    return response.linear_from_encoded(_LEVELS.expand(rows, 1, -1))[:, 0]

@@ -1,4 +1,4 @@
-"""User-given encoding of the values in photographs' files."""
+"""User-given encoding of the values in the files of photographs."""
 
 import math
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ from typing import Literal
 from pimper_torch.runtime.config import require
 
 ResponseChoice = Literal["auto", "srgb", "linear"] | float | Path
-# A whole number is one of a file's levels.
+# Integers are levels of the file.
 SaturationChoice = Literal["auto"] | float | tuple[float | int, float | int, float | int]
 
-# Radiance from which a pixel counts as saturated, 1 being the level itself: JPEG moves what was
-# 255 down by two levels, which in sRGB are 0.018 of radiance.
+# Radiance at which a pixel counts as saturated, as a fraction of the saturation level: JPEG may
+# lower 255 by two levels, 0.018 of radiance in sRGB.
 SATURATED = 0.98
 
 
@@ -24,12 +24,12 @@ class Encoding:
     0.25 and 16384 are the same in files of 16 bits.
 
     Attributes:
-        response: auto takes what each file says (its ICC profile, PNG's cICP, EXIF),
-            sRGB where it is silent; or, whatever they say, srgb; linear; the exponent of a gamma
-            curve, such as 2.2; a CSV or NPY file with a measured response curve.
-        saturation: Level at which the sensor saturates, one or red, green and blue; auto finds
-            it in the photographs, and takes full scale where they show none.
-        black: Level that the files hold in the dark.
+        response: auto uses the declaration of each file (its ICC profile, PNG's cICP, EXIF), or
+            sRGB without one. These override it: srgb; linear; the exponent of a gamma curve, such
+            as 2.2; a CSV or NPY file with a measured response curve.
+        saturation: Level at which the sensor saturates, one for all colours or red, green and blue;
+            auto estimates it from the photographs, or uses full scale if nothing is saturated.
+        black: Level of the files in the dark.
     """
 
     response: ResponseChoice = "auto"
@@ -45,7 +45,7 @@ class Encoding:
             return
         given = self.saturation if isinstance(self.saturation, tuple) else (self.saturation,)
         for level in given:
-            assert not isinstance(level, str), "auto was seen to above"
+            assert not isinstance(level, str), "auto returns above"
             above = level > self.black or (level <= 1 < self.black)
             require(
                 0 < level < math.inf and above,
@@ -55,7 +55,7 @@ class Encoding:
             )
 
 
-# What files say; what most cameras and programs write; what is proportional to radiance up to full
+# As declared by files; as most cameras and programs write; proportional to radiance up to full
 # scale.
 FROM_FILES = Encoding()
 SRGB = Encoding(response="srgb")

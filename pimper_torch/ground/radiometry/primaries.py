@@ -1,4 +1,4 @@
-"""Primaries: what red, green and blue of a file are, and their radiance in those of sRGB."""
+"""RGB primaries of files, and conversion of radiance to those of sRGB."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from pimper_torch.ground.radiometry.encoding import SATURATED
 from pimper_torch.ground.shapes import Matrix3
 
-# Columns are the primaries of sRGB in XYZ, adapted to D50 as profiles hold them (ICC, "sRGB").
+# Columns are the primaries of sRGB in XYZ, adapted to D50 as in ICC profiles ("sRGB").
 _SRGB_D50 = torch.tensor(
     [
         [0.4360747, 0.3850649, 0.1430804],
@@ -18,14 +18,14 @@ _SRGB_D50 = torch.tensor(
     ],
     dtype=torch.float64,
 )
-# Cone responses of Bradford's adaptation, as ICC.1 annex E gives it.
+# Cone responses of Bradford's adaptation, from ICC.1 annex E.
 _BRADFORD = torch.tensor(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]],
     dtype=torch.float64,
 )
 _D50 = torch.tensor([0.9642, 1.0, 0.8249], dtype=torch.float64)
-# Choices: rows of a matrix from primaries to sRGB sum to 1, up to the profile's white; what mixes
-# a colour with less than this of another is not saturated with it.
+# Choices: maximum deviation of the rows' sums from 1, for primaries with a profile's rounded white;
+# minimum weight at which a saturated colour saturates another one, and minimum determinant.
 _MAX_OFF_WHITE, _MIXED = 0.1, 0.01
 # x and y of red, green, blue and white.
 Chromaticities = Sequence[tuple[float, float]]
@@ -37,14 +37,13 @@ DISPLAY_P3: Chromaticities = ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060), _D
 
 
 def srgb_from_primaries(primaries_xyz: Matrix3) -> Matrix3 | None:
-    """Return the matrix from linear values of some primaries to linear sRGB; white stays white.
+    """Return the matrix from linear values in given primaries to linear sRGB; white stays white.
 
     Args:
-        primaries_xyz: Columns are red, green and blue in XYZ adapted to D50, as an ICC profile
-            has them.
+        primaries_xyz: Columns are red, green and blue in XYZ adapted to D50, as in ICC profiles.
 
     Returns:
-        The identity where the primaries are those of sRGB; ``None`` where they are no primaries.
+        The identity if the primaries are those of sRGB; ``None`` if they are not valid primaries.
     """
     matrix = torch.linalg.solve(_SRGB_D50, primaries_xyz.double())
     white = matrix.sum(dim=1, keepdim=True)
@@ -52,15 +51,16 @@ def srgb_from_primaries(primaries_xyz: Matrix3) -> Matrix3 | None:
         return None
     if float((white - 1).abs().max()) > _MAX_OFF_WHITE:
         return None
-    matrix, same = matrix / white, torch.eye(3, dtype=torch.float64)
-    # Profiles of sRGB differ, as their white was rounded or adapted in other ways.
-    return same if float((matrix - same).abs().max()) < 0.02 else matrix
+    matrix, identity = matrix / white, torch.eye(3, dtype=torch.float64)
+    # Profiles of sRGB differ in the rounding and adaptation of their white.
+    return identity if float((matrix - identity).abs().max()) < 0.02 else matrix
 
 
 def primaries_of(chromaticities: Chromaticities) -> Matrix3 | None:
     """Return primaries in XYZ adapted to D50 from x and y of red, green, blue and white.
 
-    Adapted by Bradford's cone responses. ``None`` where they span no colours.
+    Adapted by Bradford's cone responses. ``None`` if they are linearly dependent or a y is not
+    positive.
     """
     xy = torch.tensor(chromaticities, dtype=torch.float64)
     if not bool((xy[:, 1] > 0).all()):
@@ -77,15 +77,15 @@ def primaries_of(chromaticities: Chromaticities) -> Matrix3 | None:
 def in_srgb_primaries(
     radiance: Float[Tensor, "3 height width"], srgb_from_file: Matrix3
 ) -> Float[Tensor, "3 height width"]:
-    r"""Express radiance in the primaries of sRGB, up to one factor.
+    r"""Convert radiance to the primaries of sRGB, up to one factor.
 
     With :math:`M` the matrix, radiance becomes :math:`\max(0, M x) / s`, where :math:`s` is the
-    largest sum of a row's positive entries: what is not saturated stays below 1. A colour that a
-    saturated one is mixed into is saturated. Colours outside sRGB lose what is below 0.
+    largest sum of a row's positive entries: unsaturated values stay below 1. A colour with a
+    contribution of a saturated one is saturated. Colours outside sRGB are clipped at 0.
 
     Args:
         radiance: Linear, 1 where saturated.
-        srgb_from_file: Of :func:`srgb_from_primaries`.
+        srgb_from_file: Result of :func:`srgb_from_primaries`.
     """
     matrix = srgb_from_file.to(radiance)
     scale = matrix.clamp_min(0).sum(dim=1).max()
