@@ -12,7 +12,7 @@ from pimper_torch.runtime.errors import caution
 
 
 def loaded() -> Any:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    """Return the module pycolmap, without its handler of SIGTERM, which prints a stack trace.
+    """Return pycolmap, without the SIGTERM handler of its log, which aborts with a stack trace.
 
     Pillow is loaded first: both contain zlib, and with that of pycolmap loaded first, Pillow
     corrupts memory as soon as it writes a PNG.
