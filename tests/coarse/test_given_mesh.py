@@ -158,7 +158,7 @@ def test_a_mesh_without_area_is_rejected(scene, unknown, true_mesh):
 def test_a_mesh_in_a_different_frame_is_rejected_or_warned_of(
     scene, unknown, masks, true_mesh, change, with_masks
 ):
-    with pytest.raises((InputError, PimperWarning), match="(where|from) the photographs"):
+    with pytest.raises((InputError, PimperWarning), match=r"(where|from) the photographs"):
         prepared(change(true_mesh), scene, masks if with_masks else unknown)
 
 

@@ -29,8 +29,7 @@ Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 # Variance of a position known to one pixel: that of the uniform distribution over it.
 _PIXEL = 1 / 12
 
-# Variance added by measuring a slope between pixels: a difference over one pixel (1/12) of linearly
-# interpolated values (1/6).
+# Variance of measuring a slope: a difference over a pixel (1/12) of interpolated values (1/6).
 _READING = 1 / 12 + 1 / 6
 
 
@@ -158,8 +157,7 @@ _ALONG_NORMAL = 0.9
 # Distance outside the visual hull at which a ray may touch the surface.
 _TOLERANCE_PX = 1.5
 
-# A point's disc reaches to the last of this many nearest points, itself included: its neighbours in
-# a triangle mesh.
+# A point's disc reaches to the last of this many nearest points, the neighbours in a triangle mesh.
 _NEIGHBOURS = 7
 
 

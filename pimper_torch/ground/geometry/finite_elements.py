@@ -53,9 +53,8 @@ def cotangent_laplacian(
             cotangents of needles would otherwise dominate the condition number.
 
     Returns:
-        Rows, columns and values; duplicate entries add up. Positive semidefinite: a constant on a
-        connected component is in the null space. Differentiable in the weights and, through the
-        elements, in the vertices.
+        Rows, columns and values; duplicate entries add up. Positive semidefinite: constants of a
+        connected component are in the null space. Differentiable in weights and vertices.
     """
     longest = mesh.opposite.square().sum(-1).amax(dim=1)
     shape = torch.maximum(mesh.area, min_shape * longest)

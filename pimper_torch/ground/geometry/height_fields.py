@@ -1,9 +1,8 @@
 """Height fields on templates: interpolation, and intersection with rays.
 
-A height field is a depth z for every sample of a raster in the patch frame. Sample (row i,
-column j) is at ``x = origin_x + j spacing``, ``y = origin_y + i spacing``: indices count from the
-centre of the first sample, unlike pixels (:mod:`~pimper_torch.ground.geometry.pixels`). Rasters
-have at least two samples a side.
+A height field is a depth z for every sample of a raster in the patch frame, of at least two samples
+a side. Sample (row i, column j) is at ``x = origin_x + j spacing``, ``y = origin_y + i spacing``:
+indices, unlike :mod:`~pimper_torch.ground.geometry.pixels`, count from the first sample's centre.
 """
 
 import torch
@@ -17,8 +16,7 @@ PerPatch = Float[Tensor, " patch"]
 Origins = Float[Tensor, "patch 2"]
 PerRay = Float[Tensor, "patch ray"]
 
-# A neighbour with less interpolation weight than this may be invalid: rounding must not make a
-# point on a row of samples miss.
+# A neighbour of less weight may be invalid: rounding must not make a point on a row miss.
 _NEGLIGIBLE_WEIGHT = 1e-4
 
 
@@ -70,9 +68,8 @@ def intersect_height_field(
 
     Newton steps on :math:`f(t) = o_z + t d_z - \mathrm{depth}(o_{xy} + t d_{xy})` from the point on
     the plane z = 0, with the slope of the bilinear cell. One step is exact on a plane. On a smooth
-    height field, three steps converge to rounding for rays within some 60 degrees of the z axis. If
-    a ray crosses the height field several times, the result is usually the crossing nearest to the
-    plane.
+    height field, three steps converge to rounding for rays within some 60 degrees of the z axis. Of
+    several crossings of a ray, the result is usually the nearest to the plane.
 
     Args:
         depth: z, patch frame; values of invalid samples are ignored.
@@ -86,8 +83,7 @@ def intersect_height_field(
         a miss is finite and on the ray, without a meaning.
 
     Differentiable in ``depth``, ``ray_origins`` and ``ray_directions`` by the implicit function
-    theorem: only the last step has gradients, with its slope held constant, which is exact if the
-    previous steps have converged.
+    theorem: only the last step has gradients, with constant slope, exact if the others converged.
     """
     x, y, z = ray_origins.unbind(dim=-1)
     dx, dy, dz = ray_directions.unbind(dim=-1)

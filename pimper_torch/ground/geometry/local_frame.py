@@ -19,8 +19,7 @@ NO_OFFSET: Offset = (0.0, 0.0, 0.0)
 def local_origin(cam_from_world: Poses, points_world: Points) -> Offset:
     """Choose the origin of a scene's local frame, in round numbers; zero if no shift is needed.
 
-    It is the rounded median of the cloud, or of the cameras without a cloud; the median ignores
-    outliers.
+    It is the rounded median, which ignores outliers, of the cloud, or of the cameras without one.
 
     Args:
         points_world: The cloud; may be empty.
@@ -58,8 +57,7 @@ def to_local(cam_from_world: Poses, offset: Offset) -> Poses:
 def from_local(cam_from_local: Poses, offset: Offset) -> Poses:
     """Invert :func:`to_local`, in float64.
 
-    Rotations are orthogonalized first: their rounding times the offset would otherwise shift the
-    cameras' centres.
+    Rotations are orthogonalized: their rounding times the offset would shift the cameras' centres.
     """
     if offset == NO_OFFSET:
         return cam_from_local.double()

@@ -26,7 +26,7 @@ Rows = Float[Tensor, "ray 3"]
 def compare_with_scene(
     mesh: Mesh, scene: SparseScene, silhouettes: Silhouettes
 ) -> dict[str, int | float]:
-    """Measure how well a mesh fits the points and masks of a scene; warn if it is far off.
+    """Measure how well a mesh fits the points and masks of a scene; warn if it is off.
 
     An observed point is neither behind the mesh nor in front of it: the ray to it hits the mesh at
     the point or, if the point is background, nowhere.
@@ -35,12 +35,11 @@ def compare_with_scene(
         silhouettes: Compared if they are masks given with the photographs.
 
     Returns:
-        Figures that can be computed: ``distance_percent``, median distance of points whose rays hit
-        the mesh, in per cent of its diagonal; ``on_mesh``, fraction of these points on it;
-        ``overlap`` with the masks; ``observations``, number of these rays.
+        Available figures: median distance of points with rays that hit the mesh, in per cent of its
+        diagonal; fraction of these points on it; overlap with the masks; number of these rays.
 
     Raises:
-        InputError: Hardly any point is on the mesh, and hardly any mask overlaps with it.
+        InputError: Hardly any agreement with points and masks.
     """
     fit = _fit(mesh, *_rays(scene, silhouettes))
     frame = "in the coordinate frame of the cameras (same axes, same unit)"
@@ -56,13 +55,9 @@ def compare_with_scene(
             f"The given mesh deviates from the photographs: {fit.message()}. Check that it is "
             f"{frame} and shows this object."
         )
-    figures = {
-        "distance_percent": 100 * fit.distance,
-        "on_mesh": fit.on_mesh,
-        "overlap": fit.overlap,
-        "observations": fit.hits,
-    }
-    return {name: value for name, value in figures.items() if not math.isnan(value)}
+    names = ("distance_percent", "on_mesh", "overlap", "observations")
+    figures = zip(names, (100 * fit.distance, fit.on_mesh, fit.overlap, fit.hits), strict=True)
+    return {name: value for name, value in figures if not math.isnan(value)}
 
 
 def refuse_other_axes(mesh: Mesh, scene: SparseScene) -> None:

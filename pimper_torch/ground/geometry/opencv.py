@@ -1,5 +1,7 @@
 """OpenCV operations on masks and photographs."""
 
+import math
+
 import cv2
 import numpy as np
 import torch
@@ -57,10 +59,8 @@ def warped(
     """
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centres
     matrix = np.linalg.inv(half) @ homography.double().numpy() @ half
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    result = cv2.warpPerspective(
-        picture.numpy(), matrix, size_px, flags=flags, borderValue=float("nan")
-    )
+    flags, pixels = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, picture.numpy()
+    result = cv2.warpPerspective(pixels, matrix, size_px, flags=flags, borderValue=math.nan)
     return torch.from_numpy(result)
 
 
@@ -87,12 +87,12 @@ def grab_cut(
 ) -> Mask:
     """Segment the object by two colour mixtures and a graph cut; deterministic.
 
-    Source: Rother, Kolmogorov & Blake, GrabCut, SIGGRAPH 2004.
+    Without initial pixels of both sides, the initial mask is returned. Source: Rother, Kolmogorov &
+    Blake, GrabCut, SIGGRAPH 2004.
 
     Args:
-        labels: ``BACKGROUND`` and ``OBJECT`` are fixed, ``PERHAPS_BACKGROUND`` and
-            ``PERHAPS_OBJECT`` are initial labels. Without pixels of both sides, the initial mask is
-            returned.
+        labels: ``BACKGROUND`` or ``OBJECT`` if fixed, else ``PERHAPS_BACKGROUND`` or
+            ``PERHAPS_OBJECT``.
     """
     seeded = labels & 1 > 0
     if not seeded.any() or seeded.all():
@@ -153,16 +153,16 @@ def _morphed(mask: Mask, operation: int, radius_px: int) -> Mask:
 
 def without_specks(mask: Mask, kept: Mask, min_px: int) -> Mask:
     """Remove components that are small or do not overlap ``kept``, and fill small holes."""
-    return ~_large(~_large(mask, kept, min_px), torch.ones_like(mask), min_px)
+    large = _large_components(mask, kept, min_px)
+    return ~_large_components(~large, torch.ones_like(mask), min_px)
 
 
 def components_of(mask: Mask, meeting: Mask) -> Mask:
     """Return the components of a mask that overlap ``meeting``."""
-    return _large(mask, meeting, 1)
+    return _large_components(mask, meeting, 1)
 
 
-def _large(mask: Mask, meeting: Mask, min_px: int) -> Mask:
-    """Return the components of at least ``min_px`` pixels that overlap ``meeting``."""
+def _large_components(mask: Mask, meeting: Mask, min_px: int) -> Mask:
     pixels = mask.numpy().astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=4)
     overlapping = np.bincount(labels[meeting.numpy()], minlength=count) > 0

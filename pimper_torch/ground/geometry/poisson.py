@@ -34,8 +34,7 @@ def poisson_surface(
     """Fit a closed surface to oriented points by screened Poisson reconstruction.
 
     Args:
-        depth: Of the octree, at least 5: the longest side of the points' bounding box has at most
-            ``2 ** depth`` cells.
+        depth: Of the octree, at least 5: the points' box has up to ``2 ** depth`` cells a side.
         point_weight: Weight of the points relative to the smoothness.
 
     Returns:
@@ -75,8 +74,7 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
         ConfigError: ``num_faces`` is less than 4.
         ReconstructionError: COLMAP cannot simplify the mesh.
 
-    Source: Garland & Heckbert, Surface simplification using quadric error metrics,
-    SIGGRAPH 1997.
+    Source: Garland & Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997.
     """
     require(num_faces >= 4, "faces", num_faces, "4 at least, those of a tetrahedron")
     if len(mesh.faces) <= num_faces:

@@ -63,14 +63,12 @@ def subdivide(vertices: Corners, facets: Facets, spacing: PerFacet) -> Subdivisi
     Args:
         vertices: Of the coarse mesh. Unused ones are not in the result.
         facets: Faces of the coarse mesh; an edge may have any number of them.
-        spacing: Target length of the faces' edges in each facet, scene units; the finer of its
-            facets determines an edge. Faces of a narrow facet are longer along it and shorter
-            across.
+        spacing: Target length of the faces' edges in each facet, scene units; an edge has that of
+            its finer facet. Faces of a narrow facet are longer along it and shorter across.
 
     Returns:
         A mesh with the topology and the surface of the coarse mesh: parts of a coarse edge have as
-        many faces as the edge, areas add up, and no face is flipped. Needle-shaped facets give
-        needle-shaped faces.
+        many faces as the edge, areas add up, and no face is flipped. Needles give needles.
 
     Differentiable in ``vertices`` through ``points``; the cuts are constants.
 
@@ -113,10 +111,9 @@ def subdivide(vertices: Corners, facets: Facets, spacing: PerFacet) -> Subdivisi
 def transferred(
     values: PerVertex, source: Subdivision, points: Float[Tensor, "asked 3"]
 ) -> Float[Tensor, " asked"]:
-    """Interpolate vertex values of a subdivision at other points of the same facets.
+    """Interpolate smooth vertex values of a subdivision at other points of the same facets.
 
-    The result is the mean of the three nearest vertices, weighted by inverse distance, for smooth
-    values. Differentiable in ``values`` only.
+    From the three nearest vertices, by inverse distance. Differentiable in ``values`` only.
     """
     tree = cKDTree(source.points.detach().cpu().double().numpy())
     queries = points.detach().cpu().double().numpy()

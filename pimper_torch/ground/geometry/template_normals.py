@@ -22,8 +22,7 @@ def transferred_normals(coarse: CoarseMesh, templates: Templates) -> PatchVector
 def coarse_normals(coarse: CoarseMesh, templates: Templates) -> PatchVectors:
     """Interpolate the mesh's vertex normals over every template, patch frame.
 
-    Barycentric coordinates are clamped to the facet, to avoid extrapolation. All normals face the
-    viewer.
+    Barycentric coordinates are clamped to the facet: no extrapolation. Normals face the viewer.
     """
     mesh = coarse.mesh
     per_vertex = mesh.normals_world

@@ -54,8 +54,7 @@ class Hits(Record):
     ) -> "Hits":
         """Recompute the intersections with the same faces, in the dtype of the rays.
 
-        Differentiable in vertices, origins and directions. A ray in the plane of its face keeps the
-        result of ray casting.
+        Differentiable in vertices, origins and directions. Rays in the plane of a face keep theirs.
         """
         hit = self.face >= 0
         a, b, c = vertices[faces[self.face.clamp_min(0)]].unbind(dim=-2)

@@ -164,12 +164,10 @@ def visual_hull(
     that exist only because of these weights are removed. Time and memory grow with the voxels.
 
     Args:
-        box_world: Smallest and largest corner of the search region; the grid is fitted to the hull
-            in it.
+        box_world: Smallest and largest corner of the region; the grid is fitted to the hull in it.
         num_voxels: Of the complete grid; an arc of views gives a hull elongated along their rays.
         disagreeing: Maximum sum of the weights against a voxel inside the hull, as a fraction of
-            the views that see it. Parts that only a few views cut, such as the ends of an arc, need
-            a small one.
+            the views that see it. Parts that few views cut, as at an arc's ends, need a low one.
         min_seen: Minimum fraction of the reliable views that must see a voxel.
 
     Returns:
@@ -211,8 +209,7 @@ def margins(
     """Return each pixel's distance inside the hull's projection, in pixels; negative outside.
 
     It is the greatest depth of the ray in the hull, over the size of a pixel there: accurate to a
-    fraction of a pixel at the border, less accurate far from it. Rays are cast through every fourth
-    pixel in each direction, and interpolated.
+    fraction of a pixel at the border, less far from it. Interpolated from every fourth pixel.
     """
     width, height = size_px
     columns, rows = -(-width // _STRIDE), -(-height // _STRIDE)

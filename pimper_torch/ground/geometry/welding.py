@@ -17,8 +17,7 @@ def welded(vertices: Vertices, faces: Faces) -> tuple[Float[Tensor, "kept 3"], F
     """Merge vertices closer than a millionth of the diagonal; drop vertices without faces.
 
     Returns:
-        The first vertex at each position, in their order, and the same number of faces, which may
-        now have a vertex twice.
+        The first vertex at each position, in order, and all faces, which may now repeat a vertex.
 
     >>> corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> welded(corners, torch.tensor([[0, 1, 2], [3, 4, 5]]))[1]

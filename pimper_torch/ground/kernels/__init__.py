@@ -1,8 +1,7 @@
 """Compiled hot functions, for the CPU.
 
-Where gradients or other devices may be asked for, a kernel stands in for a torch function, which
-stays the reference: see :func:`~pimper_torch.ground.kernels.switch.compiled_for`. What is constant
-to autograd (structure from motion, the coarse surface, hierarchies of multigrid, decimation) has
-the kernel alone. A kernel runs on one thread and lets other threads run;
-:mod:`~pimper_torch.runtime.parallel` runs several side by side.
+Functions that need gradients or other devices exist twice: in torch, which is the reference, and as
+a kernel, see :func:`~pimper_torch.ground.kernels.switch.compiled_for`. Non-differentiable functions
+(structure from motion, the coarse surface, hierarchies of multigrid, decimation) have only a
+kernel. Each runs on one thread without the GIL; :mod:`~pimper_torch.runtime.parallel` runs several.
 """

@@ -1,4 +1,4 @@
-"""Tensors as contiguous arrays on the CPU."""
+"""Conversion of tensors to contiguous arrays on the CPU."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,24 +9,24 @@ from torch import Tensor
 
 
 def as_array(values: Tensor, dtype: torch.dtype | None = None) -> NDArray[Any]:
-    """Share a tensor's memory if it has the type and is contiguous on the CPU, else copy it."""
+    """Return a tensor as array: its memory if of that type and contiguous on the CPU, or a copy."""
     return values.detach().to("cpu", dtype).contiguous().numpy()
 
 
 def pulled_back(
     adjoint: Callable[..., None], inputs: Sequence[Tensor], of_pictures: bool
 ) -> list[Tensor | None]:
-    """Return the gradients that an adjoint adds up.
+    """Return the gradients of the inputs, computed by an adjoint.
 
     Args:
-        adjoint: Adds to arrays of the shapes of ``inputs``.
-        inputs: The finest level of pictures, the coarser ones, and what else was given.
-        of_pictures: Whether gradients of pictures are wanted; they take memory. The adjoint gets
-            arrays of one pixel where not.
+        adjoint: Adds to arrays with the shapes of ``inputs``.
+        inputs: The finest level of pictures, the coarser ones, and the other inputs.
+        of_pictures: Whether gradients of pictures, which take memory, are needed. If not, the
+            adjoint gets arrays of one pixel for them, and ``None`` is returned.
     """
-    shapes = [each.shape if of_pictures else (1, 1) for each in inputs[:2]]
-    found = [torch.zeros(shape) for shape in shapes]
-    found += [torch.zeros(each.shape, dtype=torch.float64) for each in inputs[2:]]
-    adjoint(*map(as_array, found))
-    pictures = found[:2] if of_pictures else [None, None]
-    return [*pictures, *(one.to(each) for one, each in zip(found[2:], inputs[2:], strict=True))]
+    pictures, others = inputs[:2], inputs[2:]
+    gradients = [torch.zeros(values.shape if of_pictures else (1, 1)) for values in pictures]
+    gradients += [torch.zeros(values.shape, dtype=torch.float64) for values in others]
+    adjoint(*map(as_array, gradients))
+    first = gradients[:2] if of_pictures else [None, None]
+    return [*first, *(g.to(values) for g, values in zip(gradients[2:], others, strict=True))]

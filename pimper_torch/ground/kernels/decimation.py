@@ -1,7 +1,6 @@
 """Mesh decimation by half-edge collapses under a bound on the distance of removed vertices.
 
-It has no twin in torch: which vertices stay is constant to autograd. Tests check the bound against
-the nearest points of the surface.
+Not differentiable, so without a twin in torch. Tests check the bound against nearest points.
 """
 
 import numpy as np
@@ -15,15 +14,15 @@ Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 Vector = tuple[float, float, float]
 
-# Choices. Fans with more faces, or more removed vertices, are not changed: bounds of workspace.
+# Choices. Size of the workspace: fans with more faces, or more removed vertices, are not changed.
 _MAX_FACES, _MAX_POINTS = 24, 2048
-# A new face has at least this shape (4 sqrt(3) area / squared sides, 1 if equilateral), or that of
-# the worst face that it replaces; and this cosine between its normal and the mean of theirs.
+# Minimum shape of a new face (4 sqrt(3) area / squared sides, 1 if equilateral), unless a replaced
+# face has a worse one; and minimum cosine of its normal and the mean normal of the replaced faces.
 _MIN_SHAPE = 0.2
 _MIN_COSINE = 0.2
-# Neighbours that a vertex is tried to merge with, best new shapes first.
+# Neighbours on which the collapse of a vertex is tried, best new shapes first.
 _MAX_CANDIDATES = 3
-# Passes over the vertices: few vertices go after the first ten.
+# Passes over the vertices: few vertices are removed after the first ten.
 _ITERATIONS = 30
 
 
@@ -33,8 +32,8 @@ def link_corners(faces: Indices, links: Indices) -> None:
 
     Args:
         faces: Corner ``3 f + s`` is slot ``s`` of face ``f``.
-        links: Result: the first corner of every vertex, then the next corner of every corner of
-            the same vertex; -1 ends a list.
+        links: Result: the first corner of every vertex, then the next corner of the same vertex for
+            every corner; -1 ends a list.
     """
     vertices = len(links) - faces.size
     links[:vertices] = -1
@@ -63,7 +62,7 @@ def _dot(a: Vector, b: Vector) -> float:
 def _closest(
     points: Floats, first: int, second: int, third: int, query: int
 ) -> tuple[float, Vector]:
-    """Find the point of a triangle that is nearest to a vertex.
+    """Compute the point of a triangle nearest to a vertex.
 
     Returns:
         Its squared distance and barycentric coordinates.
@@ -105,14 +104,14 @@ def _fan(vertex: int, faces: Indices, links: Indices, ring: Numbers, owner: Numb
         owner: Result: the face between each neighbour and the next.
 
     Returns:
-        Their count; 0 where they do not close around the vertex, or are too many.
+        Their number; 0 if they do not form a closed fan around the vertex, or are too many.
     """
     vertices = len(links) - faces.size
-    count, before, corner = 0, vertex, links[vertex]
+    count, previous, corner = 0, vertex, links[vertex]
     while corner >= 0:
         face, slot = corner // 3, corner % 3
         if faces[face, 0] < 0:
-            links[before] = links[vertices + corner]
+            links[previous] = links[vertices + corner]
         else:
             if count == _MAX_FACES:
                 return 0
@@ -120,21 +119,24 @@ def _fan(vertex: int, faces: Indices, links: Indices, ring: Numbers, owner: Numb
             ring[count] = faces[face, (slot + 1) % 3]
             ring[_MAX_FACES + count] = faces[face, (slot + 2) % 3]
             count += 1
-            before = vertices + corner
+            previous = vertices + corner
         corner = links[vertices + corner]
-    for index in range(1, count):  # sort: each begins where the one before ends
-        wanted = ring[_MAX_FACES + index - 1]
-        if wanted == ring[0]:
-            return 0  # two fans meet in the vertex
+    for index in range(1, count):  # sort: each begins at the end of the previous one
+        start = ring[_MAX_FACES + index - 1]
+        if start == ring[0]:
+            return 0  # two fans meet at the vertex
         other = index
-        while other < count and ring[other] != wanted:
+        while other < count and ring[other] != start:
             other += 1
         if other == count:
             return 0
         ring[index], ring[other] = ring[other], ring[index]
         owner[index], owner[other] = owner[other], owner[index]
-        there = _MAX_FACES + index
-        ring[there], ring[there + other - index] = ring[there + other - index], ring[there]
+        end_index = _MAX_FACES + index
+        ring[end_index], ring[end_index + other - index] = (
+            ring[end_index + other - index],
+            ring[end_index],
+        )
     return count if count >= 3 and ring[_MAX_FACES + count - 1] == ring[0] else 0
 
 
@@ -142,8 +144,8 @@ def _fan(vertex: int, faces: Indices, links: Indices, ring: Numbers, owner: Numb
 def _may_merge(vertex: int, index: int, faces: Indices, links: Indices, ring: Numbers) -> bool:
     """Return whether the mesh stays manifold when a vertex is collapsed on its neighbour.
 
-    The link condition: the two share only the two neighbours opposite of their edge, and the face
-    of these and the neighbour does not exist yet.
+    The link condition: both share only the two neighbours opposite to their edge, and there is no
+    face of these two and the neighbour.
     """
     count = len(ring)
     left, right = ring[(index + count - 1) % count], ring[(index + 1) % count]
@@ -151,13 +153,13 @@ def _may_merge(vertex: int, index: int, faces: Indices, links: Indices, ring: Nu
     while corner >= 0:
         face, slot = corner // 3, corner % 3
         if faces[face, 0] >= 0:
-            one, two = faces[face, (slot + 1) % 3], faces[face, (slot + 2) % 3]
-            if one != vertex and two != vertex:
-                if (one == left and two == right) or (one == right and two == left):
+            start, end = faces[face, (slot + 1) % 3], faces[face, (slot + 2) % 3]
+            if start != vertex and end != vertex:
+                if (start == left and end == right) or (start == right and end == left):
                     return False
                 for other in range(count):
                     third = ring[other]
-                    shared = third in (one, two)
+                    shared = third in (start, end)
                     if shared and other != index and third != left and third != right:
                         return False
         corner = links[len(links) - faces.size + corner]
@@ -166,7 +168,7 @@ def _may_merge(vertex: int, index: int, faces: Indices, links: Indices, ring: Nu
 
 @compiled()
 def _shape(points: Floats, first: int, second: int, third: int) -> tuple[float, float, Vector]:
-    """Return a triangle's shape, 1 if equilateral, twice its area, and a normal of that length."""
+    """Return a triangle's shape (1 if equilateral), twice its area, and a normal of that length."""
     u, v = _edge(points, first, second), _edge(points, first, third)
     normal = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
     twice = np.sqrt(_dot(normal, normal))
@@ -176,10 +178,10 @@ def _shape(points: Floats, first: int, second: int, third: int) -> tuple[float, 
 
 @compiled()
 def _score(points: Floats, vertex: int, ring: Numbers, score: NDArray[np.float64]) -> None:
-    """Compute the worst new shape for every neighbour that a vertex may be collapsed on.
+    """Compute the worst shape of a new face for every neighbour that a vertex may be collapsed on.
 
     Args:
-        score: Result, of every neighbour; -1 where a new face is too thin or folded.
+        score: Result for every neighbour; -1 if a new face is too thin or folded.
     """
     count, least = len(ring), _MIN_SHAPE
     x, y, z = 0.0, 0.0, 0.0
@@ -192,8 +194,8 @@ def _score(points: Floats, vertex: int, ring: Numbers, score: NDArray[np.float64
     for index in range(count):
         score[index] = 2.0
         for step in range(1, count - 1):
-            one, two = ring[(index + step) % count], ring[(index + step + 1) % count]
-            shape, area, normal = _shape(points, ring[index], one, two)
+            start, end = ring[(index + step) % count], ring[(index + step + 1) % count]
+            shape, area, normal = _shape(points, ring[index], start, end)
             if shape < least or _dot(normal, mean) <= _MIN_COSINE * area:
                 score[index] = -1.0
                 break
@@ -201,8 +203,8 @@ def _score(points: Floats, vertex: int, ring: Numbers, score: NDArray[np.float64
 
 
 @compiled()
-def _collected(vertex: int, owner: Numbers, lists: Indices, faces: int, points: Numbers) -> int:
-    """List a vertex and all removed vertices of its faces, and return their number."""
+def _collect(vertex: int, owner: Numbers, lists: Indices, faces: int, points: Numbers) -> int:
+    """Write a vertex and all removed vertices of its faces to ``points``; return their number."""
     points[0], size = vertex, 1
     for face in owner:
         point = lists[face]
@@ -223,7 +225,7 @@ def _blend(values: Floats, corners: tuple[int, int, int], weights: Vector, chann
 
 
 @compiled()
-def _placed(
+def _project(
     points: Floats,
     values: Floats,
     bound: float,
@@ -234,10 +236,10 @@ def _placed(
     step_of: Numbers,
     errors: Floats,
 ) -> bool:
-    """Find the nearest new face of all removed vertices, until one is out of bounds.
+    """Find the nearest new face of each removed vertex; return False if one is out of bounds.
 
     Args:
-        points: See :func:`decimate`, as for the three that follow.
+        points: See :func:`decimate`, also for the next three arguments.
         index: The neighbour that the vertex is collapsed on.
         step_of: Result: the new face of each, counted around the neighbour from 1.
         errors: Result: distance and cosine of each.
@@ -247,10 +249,10 @@ def _placed(
         point = removed[item]
         best, chosen, weights = np.inf, 0, (0.0, 0.0, 0.0)
         for step in range(1, count - 1):
-            one, two = ring[(index + step) % count], ring[(index + step + 1) % count]
-            square, place = _closest(points, ring[index], one, two, point)
+            start, end = ring[(index + step) % count], ring[(index + step + 1) % count]
+            square, coordinates = _closest(points, ring[index], start, end, point)
             if square < best:
-                best, chosen, weights = square, step, place
+                best, chosen, weights = square, step, coordinates
         if best > bound * bound:
             return False
         corners = ring[index], ring[(index + chosen) % count], ring[(index + chosen + 1) % count]
@@ -273,7 +275,7 @@ def _placed(
 def _collapse(
     vertex: int, index: int, faces: Indices, links: Indices, ring: Numbers, owner: Numbers
 ) -> None:
-    """Replace a vertex by its neighbour in all its faces, and remove the two that had both."""
+    """Replace a vertex by its neighbour in all its faces, and remove the two faces of the edge."""
     for other in range(len(owner)):
         face = owner[other]
         if other == index or other == (index + len(ring) - 1) % len(ring):
@@ -304,21 +306,20 @@ def decimate(
     lists: Indices,
     deviation: Floats,
 ) -> None:
-    """Collapse vertices on neighbours as long as all removed ones stay near the surface.
+    """Collapse vertices on neighbours while all removed vertices stay near the surface.
 
-    Every removed vertex is on the list of a face. A vertex is collapsed if it and all on the
-    lists of its faces are within ``bound`` of the new faces, their normals within the given cosine
-    of the interpolated ones, and their attributes within 1 of the interpolated ones. In one
+    Every removed vertex is on the list of a face. A vertex is collapsed if it and all vertices on
+    the lists of its faces are within ``bound`` of the new faces, their normals within the given
+    cosine of the interpolated ones, and their attributes within 1 of the interpolated ones. In one
     iteration no face changes twice, so that the mesh is decimated evenly.
 
     Args:
         values: Unit normals, then attributes in units of their tolerance.
         free: Vertices that may be removed.
-        candidates: Whether a vertex is to be tried; updated.
+        candidates: Vertices to try; updated.
         faces: Updated: removed faces have -1 in their first slot.
         links: From :func:`link_corners`; updated.
-        lists: The first removed vertex on every face's list, then the next of every vertex on the
-            same list; -1 ends a list; updated.
+        lists: Each face's first removed vertex, then the next one after each; -1 at ends; updated.
         deviation: Distance and cosine of every removed vertex; updated.
     """
     rings, owners = np.empty(2 * _MAX_FACES, np.int64), np.empty(_MAX_FACES, np.int64)
@@ -334,10 +335,10 @@ def decimate(
             candidates[vertex] = False
             count = _fan(vertex, faces, links, rings, owners)
             ring, owner, score = rings[:count], owners[:count], scores[:count]
-            size = _collected(vertex, owner, lists, len(faces), collected)
+            size = _collect(vertex, owner, lists, len(faces), collected)
             if count == 0 or size == _MAX_POINTS:
                 continue
-            gone = collected[:size]
+            removed = collected[:size]
             _score(points, vertex, ring, score)
             for _ in range(min(_MAX_CANDIDATES, count)):
                 index = 0
@@ -349,14 +350,14 @@ def decimate(
                 score[index] = -1.0
                 if not _may_merge(vertex, index, faces, links, ring):
                     continue
-                if not _placed(points, values, bound, cosine, ring, index, gone, steps, errors):
+                if not _project(points, values, bound, cosine, ring, index, removed, steps, errors):
                     continue
                 _collapse(vertex, index, faces, links, ring, owner)
                 for other in range(count):
                     lists[owner[other]] = -1
                     touched[ring[other]], candidates[ring[other]] = sweep, True
                 for item in range(size):
-                    point, face = gone[item], owner[(index + steps[item]) % count]
+                    point, face = removed[item], owner[(index + steps[item]) % count]
                     lists[len(faces) + point], lists[face] = lists[face], point
                     deviation[point, 0], deviation[point, 1] = errors[item, 0], errors[item, 1]
                 done = False

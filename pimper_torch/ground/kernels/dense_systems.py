@@ -1,6 +1,6 @@
-"""Symmetric positive systems of a few hundred unknowns, solved in the calling thread.
+"""Dense systems of a few hundred unknowns, solved in the calling thread.
 
-LAPACK would be as fast, but starts threads of its own at these sizes.
+LAPACK would be as fast, but starts threads at these sizes.
 """
 
 import math
@@ -20,7 +20,7 @@ def solve_damped(matrix: Doubles, ridge: float, rhs: Doubles, factor: Doubles) -
     Args:
         matrix: Its upper triangle; the size is a multiple of 4.
         ridge: Added to the diagonal.
-        rhs: Becomes the solution.
+        rhs: Replaced by the solution.
         factor: Workspace for ``U``.
 
     Returns:
@@ -71,7 +71,7 @@ def eliminate(matrix: Doubles, rhs: Doubles) -> bool:
     """Solve ``matrix x = rhs`` by elimination with partial pivoting; both are overwritten.
 
     Args:
-        rhs: Becomes the solution, a column each.
+        rhs: Replaced by the solutions, one a column.
 
     Returns:
         Whether the matrix is regular; if not, ``rhs`` is undefined.

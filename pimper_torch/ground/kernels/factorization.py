@@ -1,8 +1,8 @@
 """Damped variable projection on the cone, patch by patch.
 
 Twin of ``method.photometry.variable_projection.solve_variable_projection`` for first-order light. A
-patch is packed first, without samples and views that have no data, and stays in the cache while it
-is iterated. Radiance, weights and shading are float32; sums over samples are vectorized, those over
+patch is packed without samples and views that have no data, so it stays in the cache during the
+iterations. Radiance, weights and shading are float32; sums over samples are vectorized, those over
 views are float64.
 """
 
@@ -35,7 +35,7 @@ Integers = NDArray[np.int64]
 
 _EPS = float(np.finfo(np.float32).eps)
 
-# The codes of StopCause.
+# Codes of StopCause.
 _CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
 
 # Row and column of each entry of a packed matrix.
@@ -54,7 +54,7 @@ class ConeProblem(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """See ``solve_variable_projection``; all samples count where ``curvature_samples`` is 0."""
+    """See ``solve_variable_projection``; ``curvature_samples`` of 0 uses all samples."""
 
     max_iterations: int
     tolerance: float
@@ -66,8 +66,8 @@ class ConeSolution(NamedTuple):
     """The solution of a batch.
 
     Attributes:
-        shading: Samples without weight keep the start.
-        weight: The final ones, zero before.
+        shading: Samples without weight keep their initial value.
+        weight: Final weights; zero before.
         residual: Root mean square.
         cause: Code of the stop cause.
     """
@@ -86,16 +86,16 @@ class Patch(NamedTuple):
     Attributes:
         radiance: View by sample.
         given: Weight of each entry; 0 in the padding.
-        weight: The same, robust weights included.
+        weight: ``given`` times robust weights.
         residual: Workspace.
         prior: Packed entry by sample.
         equations: The samples' normal equations: ten packed entries and the right-hand side.
-        anchor: View by 4.
+        prior_mean: View by 4.
         regularization: Of each view.
         slack: Sum of the regularization of the omitted views, times 4.
-        num_views: Omitted views included.
-        num_scale: The residual deviation is estimated from so many samples, the first.
-        level: Minimum deviation of residuals.
+        num_views: Including omitted views.
+        num_scale: Number of samples, the first ones, for the estimate of the residual deviation.
+        min_deviation: Minimum deviation of residuals.
         loss: Code of the loss.
         scale: Of the loss, in deviations.
     """
@@ -111,7 +111,7 @@ class Patch(NamedTuple):
     slack: float
     num_views: int
     num_scale: int
-    level: float
+    min_deviation: float
     loss: int
     scale: float
 
@@ -120,39 +120,39 @@ class Patch(NamedTuple):
 def _views_that_count(
     given: Floats, prior_mean: Floats, regularization: Floats, lights: Floats
 ) -> Integers:
-    """List the views with data, and those whose light is not at its anchor."""
-    found = np.empty(len(given), np.int64)
+    """Return the views with data or with a light that is not its prior mean."""
+    indices = np.empty(len(given), np.int64)
     count = 0
     for f in range(len(given)):
         fixed = regularization[f] > 0
         for i in range(4):
             fixed = fixed and lights[f, i] == prior_mean[f, i]
         if not fixed or np.any(given[f] > 0):
-            found[count] = f
+            indices[count] = f
             count += 1
-    return found[:count]
+    return indices[:count]
 
 
 @compiled()
 def samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
-    """List the samples with data, those that estimate the deviation first, and count the latter."""
+    """Return the samples with data, first those for the deviation, and the number of the latter."""
     seen = np.zeros(given.shape[1], np.bool_)
     for f in range(len(given)):
         row = given[f]
         for k in range(len(row)):
             seen[k] |= row[k] > 0
-    found = np.empty(given.shape[1], np.int64)
+    indices = np.empty(given.shape[1], np.int64)
     count = 0
     for k in range(0, len(seen), stride):
         if seen[k]:
-            found[count] = k
+            indices[count] = k
             count += 1
     num_scale = count
     for k in range(len(seen)):
         if seen[k] and k % stride > 0:
-            found[count] = k
+            indices[count] = k
             count += 1
-    return found[:count], num_scale
+    return indices[:count], num_scale
 
 
 @compiled()
@@ -160,18 +160,18 @@ def _packed(
     problem: ConeProblem,
     p: int,
     views: Integers,
-    found: tuple[Integers, int],
+    selection: tuple[Integers, int],
     loss: int,
     scale: float,
 ) -> Patch:
-    samples, num_scale = found
+    samples, num_scale = selection
     radiance, given, prior_mean = problem.radiance[p], problem.given[p], problem.prior_mean[p]
     regularization, prior = problem.regularization[p], problem.prior[p]
     num_views, num_samples = len(views), len(samples)
     padded = TILE * (-(-num_samples // TILE))
     shape = (num_views, padded)
     radiance_rows, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    own_prior_mean, own_regularization = (
+    view_prior_mean, view_regularization = (
         np.empty((num_views, 4), np.float32),
         np.empty(num_views, np.float32),
     )
@@ -185,14 +185,14 @@ def _packed(
             size += abs(radiance_rows[f, k])
             count += weight[f, k]
         for i in range(4):
-            own_prior_mean[f, i] = prior_mean[views[f], i]
-        own_regularization[f] = regularization[views[f]]
-        slack -= 4 * own_regularization[f]
+            view_prior_mean[f, i] = prior_mean[views[f], i]
+        view_regularization[f] = regularization[views[f]]
+        slack -= 4 * view_regularization[f]
     prior_rows = np.zeros((10, padded), np.float32)
     for i in range(10):
         for k in range(num_samples):
             prior_rows[i, k] = prior[i, samples[k]]
-    # The identity: the padding's equations are regular.
+    # The identity makes the equations of the padding regular.
     for i in (0, 4, 7, 9):
         prior_rows[i, num_samples:] = 1
     return Patch(
@@ -202,12 +202,12 @@ def _packed(
         residual=np.empty(shape, np.float32),
         prior=prior_rows,
         equations=np.empty((14, padded), np.float32),
-        prior_mean=own_prior_mean,
-        regularization=own_regularization,
+        prior_mean=view_prior_mean,
+        regularization=view_regularization,
         slack=max(slack, 0.0),
         num_views=len(regularization),
         num_scale=num_scale,
-        level=MIN_DEVIATION * size / max(count, 1.0),
+        min_deviation=MIN_DEVIATION * size / max(count, 1.0),
         loss=loss,
         scale=scale,
     )
@@ -215,7 +215,7 @@ def _packed(
 
 @compiled()
 def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tuple[int, int]:
-    """Iterate one patch; lights and shading are replaced by the solution.
+    """Factorize one patch; lights and shading are replaced by the solution.
 
     Returns:
         The number of steps, and the code of the stop cause.
@@ -227,22 +227,22 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
     curvature, factor, mean = np.zeros((size, size)), np.empty((size, size)), 0.0
     cost, energy, scale, damping, small = np.inf, 0.0, 0.0, INITIAL_DAMPING, 0
     better, exact, stalled = True, False, False
-    # Round 0 evaluates the start, and every round judges the step before: each function that is
-    # inlined here has one call where it can, as compiling a copy takes seconds.
-    for taken in range(max_iterations + 2):
-        if better and taken != 1:
+    # Iteration 0 evaluates the start, and every iteration evaluates the previous step. So most
+    # functions inlined here are called only once: compiling a copy takes seconds.
+    for iteration in range(max_iterations + 2):
+        if better and iteration != 1:
             scale = _robust_weights(patch, lights, shading, scale)
-            if taken == 0:
+            if iteration == 0:
                 energy = _energy(patch)
             elif patch.loss != SQUARES:
                 cost = _evaluate(patch, lights, shading, slope)
         if exact or small >= small_steps:
-            return taken - 1, _CONVERGED
+            return iteration - 1, _CONVERGED
         if stalled:
-            return taken - 1, _STALLED
-        if taken > max_iterations:
+            return iteration - 1, _STALLED
+        if iteration > max_iterations:
             break
-        if taken > 0:
+        if iteration > 0:
             if better:
                 _equations(patch, lights)
                 _curvature(patch, lights, shading, curvature_samples, curvature)
@@ -253,8 +253,8 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
                     trace += curvature[4 * f + i, 4 * f + i]
             mean = (trace + patch.slack) / (4 * patch.num_views)
         after = np.inf
-        if taken == 0 or solve_damped(curvature, damping * max(mean, 1e-300), step, factor):
-            if taken > 0:
+        if iteration == 0 or solve_damped(curvature, damping * max(mean, 1e-300), step, factor):
+            if iteration > 0:
                 for f in range(len(lights)):
                     for i in range(4):
                         new_lights[f, i] = lights[f, i] + step[4 * f + i]
@@ -263,8 +263,8 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
             _equations(patch, new_lights)
             update_shading(patch.equations, new_shading, SHADING_STEPS)
             after = _evaluate(patch, new_lights, new_shading, new_slope)
-        better = taken == 0 or after < cost
-        if taken > 0:
+        better = iteration == 0 or after < cost
+        if iteration > 0:
             exact = cost <= (ZERO_ROUNDINGS * _EPS) ** 2 * energy
             if better:
                 small = small + 1 if (cost - after) / max(cost, 1e-38) < tolerance else 0
@@ -280,7 +280,7 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
 
 @compiled()
 def overwrite(target: NDArray[Any], source: NDArray[Any]) -> None:
-    """Copy a matrix; assigned slices would compile a message on shapes, a second each."""
+    """Copy a matrix; assigning slices would compile messages about shapes, a second each."""
     for i in range(len(target)):
         for k in range(target.shape[1]):
             target[i, k] = source[i, k]
@@ -288,7 +288,7 @@ def overwrite(target: NDArray[Any], source: NDArray[Any]) -> None:
 
 @compiled(fast=True)
 def _robust_weights(patch: Patch, lights: Floats, shading: Floats, start_scale: float) -> float:
-    """Update the robust weights; return the scale that the next call starts from."""
+    """Update the robust weights; return the initial scale for the next call."""
     if patch.loss == SQUARES:
         return 0.0
     squares = np.empty(patch.radiance.shape[0] * patch.num_scale, np.float32)
@@ -300,7 +300,7 @@ def _robust_weights(patch: Patch, lights: Floats, shading: Floats, start_scale: 
             squares[count] = residual_row[k] * residual_row[k]
             count += given[k] > 0
     variance, scale = robust_variance(squares[:count], start_scale, np.float32)
-    width = patch.scale * max(math.sqrt(variance), patch.level)
+    width = patch.scale * max(math.sqrt(variance), patch.min_deviation)
     one, inverse = np.float32(1), np.float32(1 / width if width > 0 else 0.0)
     for f in range(len(lights)):
         residual_row, given, weight = patch.residual[f], patch.given[f], patch.weight[f]
@@ -334,10 +334,10 @@ def _energy(patch: Patch) -> float:
     total = 0.0
     for f in range(len(patch.radiance)):
         radiance, weight = patch.radiance[f], patch.weight[f]
-        part = np.float32(0)
+        view_total = np.float32(0)
         for k in range(len(radiance)):
-            part += weight[k] * radiance[k] * radiance[k]
-        total += float(part)
+            view_total += weight[k] * radiance[k] * radiance[k]
+        total += float(view_total)
     return total
 
 
@@ -403,7 +403,7 @@ def _quadratic_penalty(p: Floats, s: Floats, x: Floats, y: Floats, z: Floats) ->
 
 @compiled()
 def _keep_scale(patch: Patch, before: Floats, lights: Floats, shading: Floats) -> None:
-    """Normalize lights without regularization to their former size; rescale shading inversely."""
+    """Normalize lights without regularization to their previous norm; rescale shading inversely."""
     before_size, size = 0.0, 0.0
     for f in range(len(lights)):
         if patch.regularization[f] > 0:
@@ -422,7 +422,7 @@ def _keep_scale(patch: Patch, before: Floats, lights: Floats, shading: Floats) -
 def _curvature(
     patch: Patch, lights: Floats, shading: Floats, samples: int, matrix: Doubles
 ) -> None:
-    """Sum the upper triangle of the Gauss-Newton matrix, with the present equations."""
+    """Compute the upper triangle of the Gauss-Newton matrix from the current equations."""
     num_views, num_samples = patch.radiance.shape
     whitener = np.empty((12, num_samples), np.float32)
     whitening(patch.equations, shading, whitener)
@@ -441,9 +441,12 @@ def _curvature(
         for f in range(num_views):
             target, weight, light = white[j, f], patch.weight[f], lights[f]
             for k in range(chosen):
-                at = k * stride
-                target[k] = weight[at] * (
-                    light[0] * a[at] + light[1] * b[at] + light[2] * c[at] + light[3] * d[at]
+                sample = k * stride
+                target[k] = weight[sample] * (
+                    light[0] * a[sample]
+                    + light[1] * b[sample]
+                    + light[2] * c[sample]
+                    + light[3] * d[sample]
                 )
     weights_row = np.zeros(chosen, np.float32)
     for f in range(num_views):
@@ -466,7 +469,7 @@ def _block(
     factor: float,
     curvature: Doubles,
 ) -> None:
-    """Sum the block of two views: ``n n^T`` times the Schur complement of the samples."""
+    """Compute the block of two views: ``n n^T`` times the Schur complement, summed over samples."""
     u, v, w = white[0, f], white[1, f], white[2, f]
     x, y, z = white[0, g], white[1, g], white[2, g]
     a, b, c, d, e = pairs[0], pairs[1], pairs[2], pairs[3], pairs[4]
@@ -516,10 +519,10 @@ def solve_on_cone(
     """Factorize a batch of patches, one after the other.
 
     Args:
-        loss: Its code.
+        loss: Code of the loss.
         scale: Of the loss, in standard deviations.
         stride: The deviation is estimated from every ``stride``-th sample.
-        solution: Its lights and shading are the start.
+        solution: Result; lights and shading are the start.
     """
     _, given, prior_mean, regularization, _ = problem
     lights, shading, weight, iterations, residual, cause = solution

@@ -1,7 +1,7 @@
-"""Lights and albedo fitted together by damped Gauss-Newton, for ``method.photometry.light_fit``.
+"""Joint fit of lights and albedo by damped Gauss-Newton, for ``method.photometry.light_fit``.
 
-Arrays are view by sample, so that loops run along samples. Their count is a multiple of TILE; no
-view sees those of the padding.
+Arrays are view by sample, so that loops run along samples. The number of samples is a multiple of
+TILE; no view sees those of the padding.
 """
 
 import math
@@ -16,16 +16,16 @@ from pimper_torch.ground.kernels.twin_constants import CAUCHY_TUNING, MIN_DEVIAT
 
 Doubles = NDArray[np.float64]
 
-# Samples whose equations are summed together: those of 24 views then fit the cache.
+# Samples of a tile, with equations summed together: those of 24 views fit the cache.
 TILE = 256
 
-# The damping at first, when a step is taken and when not, and its bounds.
+# The initial damping, its factors after accepted and rejected steps, and its bounds.
 _DAMPING, _LESS, _MORE, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 0.25, 10.0, 1e-9, 1e6
 
 
 @compiled(fast=True)
 def _shade(geometry: Doubles, lights: Doubles, shading: Doubles) -> None:
-    """Compute radiance of albedo 1, by the harmonics and the point light, if there is one."""
+    """Compute radiance of albedo 1 under the harmonics and the point light, if there is one."""
     terms = _soft_terms(geometry, lights[0])
     for v in range(len(lights)):
         light, row = lights[v], shading[v]
@@ -49,7 +49,7 @@ def _shade(geometry: Doubles, lights: Doubles, shading: Doubles) -> None:
 
 @compiled()
 def _soft_terms(geometry: Doubles, light: Doubles) -> int:
-    """Count the coefficients of soft light; a point light has 4 values and 6 coordinates."""
+    """Return the number of soft coefficients; a point light has 4 values and 6 coordinates."""
     return len(light) if len(geometry) == len(light) else len(light) - 4
 
 
@@ -62,7 +62,7 @@ def _direction(light: Doubles) -> tuple[float, float, float, float]:
 
 @compiled(fast=True)
 def _slopes(geometry: Doubles, light: Doubles, first: int, slopes: Doubles) -> None:
-    """Compute the derivatives of a view's shading by its light's parameters, for one tile."""
+    """Compute the derivatives of a view's shading by the parameters of its light, for a tile."""
     terms = _soft_terms(geometry, light)
     samples = slice(first, first + TILE)
     for j in range(terms):
@@ -82,7 +82,7 @@ def _slopes(geometry: Doubles, light: Doubles, first: int, slopes: Doubles) -> N
         geometry[terms + 5, samples],
     )
     strength, x, y, z = _direction(light[terms:])
-    near, at = light[terms + 3], terms * TILE
+    near, offset = light[terms + 3], terms * TILE
     for i in range(TILE):
         k, m, n = a[i], b[i], c[i]
         s, t, u = d[i], e[i], f[i]
@@ -95,19 +95,19 @@ def _slopes(geometry: Doubles, light: Doubles, first: int, slopes: Doubles) -> N
         radial = 3 * facing * inverse * inverse
         g, h, j = falloff * (k - radial * p), falloff * (m - radial * q), falloff * (n - radial * r)
         along = facing * falloff - (g * x + h * y + j * z)
-        slopes[at + i] = g + along * x
-        slopes[at + TILE + i] = h + along * y
-        slopes[at + 2 * TILE + i] = j + along * z
-        slopes[at + 3 * TILE + i] = -strength * (g * s + h * t + j * u)
+        slopes[offset + i] = g + along * x
+        slopes[offset + TILE + i] = h + along * y
+        slopes[offset + 2 * TILE + i] = j + along * z
+        slopes[offset + 3 * TILE + i] = -strength * (g * s + h * t + j * u)
 
 
 @compiled()
-def _clamp(geometry: Doubles, lights: Doubles, max_closeness: float) -> None:
-    """Project the parameters on their bounds: see ``light_models``."""
+def _clamp(geometry: Doubles, lights: Doubles, max_inverse_distance: float) -> None:
+    """Clamp the parameters to their bounds: see ``light_models``."""
     for light in lights:
         light[0] = max(light[0], 0.0)
         if _soft_terms(geometry, light) < len(light):
-            light[-1] = min(max(light[-1], 0.0), max_closeness)
+            light[-1] = min(max(light[-1], 0.0), max_inverse_distance)
 
 
 @compiled(fast=True)
@@ -115,27 +115,27 @@ def _residuals(
     radiance: Doubles, seen: Doubles, albedo: Doubles, shading: Doubles, residual: Doubles
 ) -> None:
     for v in range(len(radiance)):
-        x, visible, shade, left = radiance[v], seen[v], shading[v], residual[v]
+        x, visible, shade, errors = radiance[v], seen[v], shading[v], residual[v]
         for i in range(len(albedo)):
-            left[i] = visible[i] * (x[i] - albedo[i] * shade[i])
+            errors[i] = visible[i] * (x[i] - albedo[i] * shade[i])
 
 
 @compiled(fast=True)
 def _weigh(residual: Doubles, seen: Doubles, scale: Doubles, weight: Doubles) -> float:
-    """Set Cauchy's weights, and return the sum of the loss."""
+    """Write Cauchy's weights, and return the sum of the loss."""
     total = 0.0
     for v in range(len(residual)):
-        left, visible, weights = residual[v], seen[v], weight[v]
+        errors, visible, weights = residual[v], seen[v], weight[v]
         inverse = 1 / scale[v] if scale[v] > 0 else 0.0
-        for i in range(len(left)):
-            relative = left[i] * inverse
+        for i in range(len(errors)):
+            relative = errors[i] * inverse
             weights[i] = visible[i] / (1 + relative * relative)
         # A logarithm of a product is cheaper than a sum of logarithms.
         product, logarithm = 1.0, 0.0
-        for i in range(len(left)):
-            relative = left[i] * inverse
+        for i in range(len(errors)):
+            relative = errors[i] * inverse
             product *= 1 + relative * relative
-            if product > 1e100:  # a factor more does not overflow
+            if product > 1e100:  # one more factor does not overflow
                 logarithm += math.log(product)
                 product = 1.0
         total += scale[v] * scale[v] * (logarithm + math.log(product))
@@ -144,16 +144,16 @@ def _weigh(residual: Doubles, seen: Doubles, scale: Doubles, weight: Doubles) ->
 
 @compiled(fast=True)
 def _scales(
-    residual: Doubles, seen: Doubles, level: Doubles, widen: float, guess: Doubles, scale: Doubles
+    residual: Doubles, seen: Doubles, mean: Doubles, widen: float, guess: Doubles, scale: Doubles
 ) -> None:
     squares = np.empty(residual.shape[1] + 1)
     for v in range(len(residual)):
-        left, visible, count = residual[v], seen[v], 0
-        for i in range(len(left)):
-            squares[count] = left[i] * left[i]
+        errors, visible, count = residual[v], seen[v], 0
+        for i in range(len(errors)):
+            squares[count] = errors[i] * errors[i]
             count += visible[i] > 0
         variance, guess[v] = robust_variance(squares[:count], guess[v], np.float32)
-        scale[v] = widen * CAUCHY_TUNING * max(math.sqrt(variance), MIN_DEVIATION * level[v])
+        scale[v] = widen * CAUCHY_TUNING * max(math.sqrt(variance), MIN_DEVIATION * mean[v])
 
 
 @compiled(fast=True)
@@ -166,10 +166,10 @@ def _settle(
     residual: Doubles,
     albedo: Doubles,
 ) -> float:
-    """Solve for albedo with the present weights, and again with weights from its residuals.
+    """Solve for albedo with the present weights, and again with weights of its residuals.
 
     Returns:
-        The loss of the last residuals; weights and residuals are updated.
+        The loss of the final residuals; weights and residuals are updated.
     """
     square, product = np.empty_like(albedo), np.empty_like(albedo)
     cost = 0.0
@@ -201,25 +201,25 @@ def _tile(
     first: int,
     slopes: Doubles,
     cross: Doubles,
-    own: Doubles,
+    diagonal: Doubles,
     albedo_gradient: Doubles,
     matrix: Doubles,
     gradient: Doubles,
 ) -> None:
-    """Add a tile's part of the equations of the lights, and set up those of its albedos."""
+    """Add a tile's part of the equations of the lights, and compute those of its albedos."""
     num_views, size = lights.shape
     samples = slice(first, first + TILE)
-    square, by_albedo, albedo_tile = own[samples], albedo_gradient[samples], albedo[samples]
+    square, by_albedo, albedo_tile = diagonal[samples], albedo_gradient[samples], albedo[samples]
     square[:] = 0
     by_albedo[:] = 0
     weighted_slope = np.empty(TILE)
     for v in range(num_views):
         _slopes(geometry, lights[v], first, slopes)
-        weights, shade, left = weight[v, samples], shading[v, samples], residual[v, samples]
+        weights, shade, errors = weight[v, samples], shading[v, samples], residual[v, samples]
         for i in range(TILE):
             square[i] += weights[i] * shade[i] * shade[i]
         for i in range(TILE):
-            by_albedo[i] += weights[i] * left[i] * shade[i]
+            by_albedo[i] += weights[i] * errors[i] * shade[i]
         for p in range(size):
             for i in range(TILE):
                 weighted_slope[i] = weights[i] * albedo_tile[i] * slopes[p * TILE + i]
@@ -228,7 +228,7 @@ def _tile(
             for i in range(TILE):
                 row[i] = weighted_slope[i] * shade[i]
             for i in range(TILE):
-                total += weighted_slope[i] * left[i]
+                total += weighted_slope[i] * errors[i]
             gradient[v * size + p] += total
             for q in range(p, size):
                 total = 0.0
@@ -242,24 +242,24 @@ def _eliminate(cross: Doubles, inverse: Doubles, first: int, matrix: Doubles) ->
     """Subtract a tile's part of the Schur complement from the equations, upper triangle."""
     weights = np.empty(TILE)
     samples = slice(first, first + TILE)
-    own = inverse[samples]
+    inverse_tile = inverse[samples]
     count = len(cross)
-    shows = np.empty(count, np.bool_)
+    nonzero = np.empty(count, np.bool_)
     for p in range(count):
         row = cross[p, samples]
         total = 0.0
         for i in range(TILE):
-            total += own[i] * row[i] * row[i]
-        shows[p] = total != 0
+            total += inverse_tile[i] * row[i] * row[i]
+        nonzero[p] = total != 0
     for p in range(count):
-        if not shows[p]:
+        if not nonzero[p]:
             continue
         row = cross[p, samples]
         for i in range(TILE):
-            weights[i] = own[i] * row[i]
+            weights[i] = inverse_tile[i] * row[i]
         q = p
         while q + 4 <= count:
-            if not (shows[q] or shows[q + 1] or shows[q + 2] or shows[q + 3]):
+            if not (nonzero[q] or nonzero[q + 1] or nonzero[q + 2] or nonzero[q + 3]):
                 q += 4
                 continue
             a, b = cross[q, samples], cross[q + 1, samples]
@@ -293,22 +293,22 @@ def _step(
     weight: Doubles,
     albedo: Doubles,
     damping: float,
-    max_closeness: float,
+    max_inverse_distance: float,
     cross: Doubles,
     new_lights: Doubles,
     new_albedo: Doubles,
 ) -> bool:
-    """Solve the damped Gauss-Newton equations, albedos eliminated; false if not positive."""
+    """Solve the damped Gauss-Newton equations, albedos eliminated; false if not definite."""
     num_views, size = lights.shape
     count, num_samples = num_views * size, len(albedo)
     padded = 4 * (-(-count // 4))
     matrix, gradient = np.zeros((padded, padded)), np.zeros(padded)
-    own, albedo_gradient = np.empty(num_samples), np.empty(num_samples)
+    diagonal, albedo_gradient = np.empty(num_samples), np.empty(num_samples)
     slopes = np.empty(size * TILE)
     for first in range(0, num_samples, TILE):
         _tile(
             geometry, lights, shading, residual, weight, albedo, first,
-            slopes, cross, own, albedo_gradient, matrix, gradient
+            slopes, cross, diagonal, albedo_gradient, matrix, gradient
         )  # fmt: skip
     for v in range(num_views):
         total = 0.0
@@ -320,23 +320,23 @@ def _step(
                 1e-9 * total if total > 0 else 1.0
             )
     for i in range(num_samples):
-        own[i] = 1 / (own[i] * (1 + damping)) if own[i] > 0 else 0.0
+        diagonal[i] = 1 / (diagonal[i] * (1 + damping)) if diagonal[i] > 0 else 0.0
     for first in range(0, num_samples, TILE):
-        _eliminate(cross, own, first, matrix)
+        _eliminate(cross, diagonal, first, matrix)
     for v in range(num_views):
         for p in range(size):
             new_lights[v, p] = lights[v, p] + gradient[v * size + p]
-    _clamp(geometry, new_lights, max_closeness)
+    _clamp(geometry, new_lights, max_inverse_distance)
     rhs = np.zeros(padded)
     for index in range(count):
         v, p = index // size, index % size
         row = cross[index]
         total = 0.0
         for i in range(num_samples):
-            total += row[i] * own[i] * albedo_gradient[i]
+            total += row[i] * diagonal[i] * albedo_gradient[i]
         rhs[index] = gradient[index] - total
         if new_lights[v, p] == lights[v, p]:
-            # Active bound: the gradient points out of the feasible set.
+            # Active bound: the gradient is directed out of the feasible set.
             matrix[index, :] = 0
             matrix[:, index] = 0
             matrix[index, index], rhs[index] = 1.0, 0.0
@@ -350,8 +350,8 @@ def _step(
         for i in range(num_samples):
             albedo_gradient[i] -= step * row[i]
     for i in range(num_samples):
-        new_albedo[i] = albedo[i] + own[i] * albedo_gradient[i]
-    _clamp(geometry, new_lights, max_closeness)
+        new_albedo[i] = albedo[i] + diagonal[i] * albedo_gradient[i]
+    _clamp(geometry, new_lights, max_inverse_distance)
     return True
 
 
@@ -363,21 +363,20 @@ def fit(
     geometry: Doubles,
     radiance: Doubles,
     seen: Doubles,
-    level: Doubles,
-    max_closeness: float,
+    brightness: Doubles,
+    max_inverse_distance: float,
     limit: int,
     min_gain: float,
     lights: Doubles,
     albedo: Doubles,
 ) -> None:
-    """Minimize over lights and albedo together, in place.
+    """Minimize the loss over lights and albedo, in place.
 
     Args:
-        geometry: Rows of the samples: the harmonics; with a point light, coordinates of the
-            normals and of the points, too.
+        geometry: Harmonics by sample; with a point light, also coordinates of normals and points.
         radiance: View by sample; zero where not seen.
-        level: Mean brightness of each view.
-        min_gain: A step that lowers the loss by less than this fraction is the last.
+        brightness: Mean radiance of each view.
+        min_gain: The iteration ends after a step that reduces the loss by less than this fraction.
     """
     shading, residual = np.empty_like(radiance), np.empty_like(radiance)
     trial_shading, new_residual = np.empty_like(radiance), np.empty_like(radiance)
@@ -385,17 +384,17 @@ def fit(
     cross = np.empty((lights.size, len(albedo)))
     new_lights, new_albedo = np.empty_like(lights), np.empty_like(albedo)
     scale, guess = np.zeros(len(lights)), np.zeros(len(lights))
-    _clamp(geometry, lights, max_closeness)
+    _clamp(geometry, lights, max_inverse_distance)
     _shade(geometry, lights, shading)
     _residuals(radiance, seen, albedo, shading, residual)
     damping = _DAMPING
     for step in range(limit):
         widen = max(1.0, 4.0 * 0.7**step)
-        _scales(residual, seen, level, widen, guess, scale)
+        _scales(residual, seen, brightness, widen, guess, scale)
         cost = _weigh(residual, seen, scale, weight)
         after = np.inf
         if _step(
-            geometry, lights, shading, residual, weight, albedo, damping, max_closeness,
+            geometry, lights, shading, residual, weight, albedo, damping, max_inverse_distance,
             cross, new_lights, new_albedo
         ):  # fmt: skip
             _shade(geometry, new_lights, trial_shading)

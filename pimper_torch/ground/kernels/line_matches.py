@@ -28,15 +28,15 @@ def most_alike(
     first_best: Indices,
     second_best: Indices,
 ) -> None:
-    """Find, for every feature, the two largest products of descriptors near its epipolar line.
+    """Compute, for every feature, the two largest descriptor products near its epipolar line.
 
     Args:
-        first: Pixels in one photograph.
+        first: Pixels in the first photograph.
         matrix: Homography from the first photograph, or fundamental matrix.
-        max_error_px: Distance from the mapped point, or Sampson's from the epipolar line.
-        first_products: Result, -1 before: the largest and the second largest.
-        second_products: The same for features of the other photograph.
-        first_best: Result, -1 before: index of the feature with the largest.
+        max_error_px: Distance from the mapped point, or Sampson distance from the epipolar line.
+        first_products: Result, -1 before: the largest and the second largest product.
+        second_products: The same for features of the second photograph.
+        first_best: Result, -1 before: index of the feature with the largest product.
     """
     count, length = len(second), second_descriptors.shape[1]
     x, y = np.empty(count, np.float32), np.empty(count, np.float32)
@@ -56,26 +56,26 @@ def most_alike(
         a = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]
         b = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]
         c = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
-        found = 0
+        num_candidates = 0
         if planar:
-            at_x, at_y = np.float32(a / c - centre_x), np.float32(b / c - centre_y)
+            mapped_x, mapped_y = np.float32(a / c - centre_x), np.float32(b / c - centre_y)
             for j in range(count):
-                candidates[found] = j
-                found += (x[j] - at_x) ** 2 + (y[j] - at_y) ** 2 <= limit
+                candidates[num_candidates] = j
+                num_candidates += (x[j] - mapped_x) ** 2 + (y[j] - mapped_y) ** 2 <= limit
         else:
             line_x, line_y = np.float32(a), np.float32(b)
             offset = np.float32(a * centre_x + b * centre_y + c)
-            own = np.float32(max_error_px**2 * (a * a + b * b))
+            bound = np.float32(max_error_px**2 * (a * a + b * b))
             for j in range(count):
-                candidates[found] = j
-                found += (x[j] * line_x + y[j] * line_y + offset) ** 2 <= own + slope[j]
-        mine = first_descriptors[i]
-        for index in range(found):
+                candidates[num_candidates] = j
+                num_candidates += (x[j] * line_x + y[j] * line_y + offset) ** 2 <= bound + slope[j]
+        descriptor = first_descriptors[i]
+        for index in range(num_candidates):
             j = candidates[index]
-            theirs = second_descriptors[j]
+            other_descriptor = second_descriptors[j]
             product = np.float32(0)
             for k in range(length):
-                product += mine[k] * theirs[k]
+                product += descriptor[k] * other_descriptor[k]
             if product > first_products[i, 0]:
                 first_products[i, 1] = first_products[i, 0]
                 first_products[i, 0] = product

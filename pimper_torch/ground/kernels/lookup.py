@@ -1,4 +1,4 @@
-"""Bilinear interpolation in one level of a pyramid, and the levels of a footprint."""
+"""Bilinear interpolation in one level of a pyramid, and the pyramid levels of a footprint."""
 
 import math
 from typing import Any
@@ -13,16 +13,15 @@ Array = NDArray[Any]
 
 @compiled()
 def corners(height: int, width: int, x: float, y: float) -> tuple[int, int, int, float, float]:
-    """Return the upper left one of the four pixels around a point, and bilinear weights.
+    """Return the four pixels around a point, and their bilinear weights.
 
     Args:
         x: To the right, counted from the first pixel's centre; clamped to the border.
 
     Returns:
-        An index, the steps to the pixels at the right and below (0 at the border), and the
-        weights of these.
+        Index of the upper left pixel; steps to right and lower pixels, 0 at the border; weights.
     """
-    # NaN compares false, and is clamped to the border too.
+    # NaN compares false, and is also clamped to the border.
     x = min(x, width - 1.0) if x > 0 else 0.0
     y = min(y, height - 1.0) if y > 0 else 0.0
     column, row = int(x), int(y)
@@ -48,14 +47,14 @@ def blended_level(squared_footprint: float, count: int) -> tuple[int, float]:
 
 
 @compiled()
-def bilinear(pixels: Array, at: int, right: int, below: int, across: float, down: float) -> float:
-    """Blend four pixels of a row as :func:`corners` gives them."""
-    here, beside = np.float32(pixels[at]), np.float32(pixels[at + right])
-    above = here + across * (beside - here)
-    at += below
-    here, beside = np.float32(pixels[at]), np.float32(pixels[at + right])
-    blended: Any = above + down * (here + across * (beside - here) - above)
-    return blended
+def bilinear(pixels: Array, i: int, right: int, below: int, across: float, down: float) -> float:
+    """Interpolate four pixels of a flat image, given by the results of :func:`corners`."""
+    first, second = np.float32(pixels[i]), np.float32(pixels[i + right])
+    above = first + across * (second - first)
+    i += below
+    first, second = np.float32(pixels[i]), np.float32(pixels[i + right])
+    value: Any = above + down * (first + across * (second - first) - above)
+    return value
 
 
 @compiled("float64[:,::1](int64[:,::1])")

@@ -1,4 +1,4 @@
-"""The adjoint of a look-up in a pyramid: derivatives by its pixels and by the place."""
+"""Adjoint of sampling a pyramid: derivatives by its pixels and by the position."""
 
 from typing import Any
 
@@ -26,51 +26,50 @@ def spread(
     on_channels: Array,
     on_pixels: bool,
 ) -> tuple[float, float, float]:
-    """Add what a sample's channels draw to the pixels that they are blended from.
+    """Pull derivatives by a sample's channels back to the pixels that it is interpolated from.
 
     Args:
-        on_finest: Added to, and ``on_coarser``, if ``on_pixels``.
-        levels: As :func:`~pimper_torch.ground.kernels.resampling.register` takes them.
+        on_finest: Added to if ``on_pixels``, as is ``on_coarser``.
+        levels: See :func:`~pimper_torch.ground.kernels.resampling.register`.
         area: Of the sample's footprint, pixels of the finest level.
         on_channels: Derivatives by the sample.
 
     Returns:
-        Derivatives by the place, right and down, and by the level, half the area's logarithm to
-        base 2.
+        Derivatives by the position, right and down, and by the level, half the area's log2.
     """
     channels, count = len(on_channels), len(levels)
     level, blend = blended_level(area, count)
     on_u, on_v, on_blend = 0.0, 0.0, 0.0
     for step in range(2 if blend > 0 else 1):
         weight = blend if step == 1 else np.float32(1) - blend
-        here = level + step
-        tall, wide = levels[here, 0], levels[here, 1]
-        x, y = u * fractions[here, 1] - 0.5, v * fractions[here, 0] - 0.5
-        at, right, below, across, down = corners(tall, wide, x, y)
+        used_level = level + step
+        tall, wide = levels[used_level, 0], levels[used_level, 1]
+        x, y = u * fractions[used_level, 1] - 0.5, v * fractions[used_level, 0] - 0.5
+        index, right, below, across, down = corners(tall, wide, x, y)
         pixels, target, plane = finest, on_finest, tall * wide
-        if here > 0:
+        if used_level > 0:
             pixels, target = coarser, on_coarser
-            at += channels * levels[here, 2]
+            index += channels * levels[used_level, 2]
         by_x, by_y = 0.0, 0.0
         for channel in range(channels):
-            drawn = on_channels[channel]
-            first, second = pixels[image, at], pixels[image, at + right]
-            third, fourth = pixels[image, at + below], pixels[image, at + below + right]
+            gradient = on_channels[channel]
+            first, second = pixels[image, index], pixels[image, index + right]
+            third, fourth = pixels[image, index + below], pixels[image, index + below + right]
             top, bottom = first + across * (second - first), third + across * (fourth - third)
-            by_x += drawn * ((second - first) * (1 - down) + (fourth - third) * down)
-            by_y += drawn * (bottom - top)
-            value = drawn * (top + down * (bottom - top))
+            by_x += gradient * ((second - first) * (1 - down) + (fourth - third) * down)
+            by_y += gradient * (bottom - top)
+            value = gradient * (top + down * (bottom - top))
             on_blend += value if step == 1 else -value
             if on_pixels:
-                drawn *= weight
-                target[image, at] += drawn * (1 - across) * (1 - down)
-                target[image, at + right] += drawn * across * (1 - down)
-                target[image, at + below] += drawn * (1 - across) * down
-                target[image, at + below + right] += drawn * across * down
-            at += plane
-        # Beyond the outermost centres the place does not count.
+                gradient *= weight
+                target[image, index] += gradient * (1 - across) * (1 - down)
+                target[image, index + right] += gradient * across * (1 - down)
+                target[image, index + below] += gradient * (1 - across) * down
+                target[image, index + below + right] += gradient * across * down
+            index += plane
+        # Beyond the outermost pixel centres the value does not depend on the position.
         if 0 < x < wide - 1:
-            on_u += weight * fractions[here, 1] * by_x
+            on_u += weight * fractions[used_level, 1] * by_x
         if 0 < y < tall - 1:
-            on_v += weight * fractions[here, 0] * by_y
+            on_v += weight * fractions[used_level, 0] * by_y
     return on_u, on_v, on_blend if blend > 0 else 0.0

@@ -1,7 +1,6 @@
 """Aggregates and prolongation of algebraic multigrid, for ``ground/linalg/aggregation.py``.
 
-Matrices are compressed rows, both triangles.
-Functions with ``first`` and ``last`` work on the rows from ``first`` up to ``last`` alone.
+Matrices are compressed rows of both triangles. Functions with ``first`` and ``last`` compute these.
 """
 
 import numpy as np
@@ -12,7 +11,7 @@ Array = np.ndarray
 
 _MATRIX = "int32[::1], int32[::1], float64[::1]"
 _ROWS = "int64, int64"
-_FOUND = "Tuple((int32[::1], int32[::1], float64[::1]))"
+_BLOCK = "Tuple((int32[::1], int32[::1], float64[::1]))"
 
 
 @compiled(f"void({_MATRIX}, float64[::1], float64[::1], {_ROWS})")
@@ -25,7 +24,7 @@ def diagonals(
     first: int,
     last: int,
 ) -> None:
-    """Write the diagonal, and one with which Jacobi's iteration has a spectrum within [0, 2]."""
+    """Write the diagonal, and one for which Jacobi's iteration has a spectrum within [0, 2]."""
     for row in range(first, last):
         total, center = 0.0, 0.0
         for index in range(starts[row], starts[row + 1]):
@@ -40,7 +39,7 @@ def diagonals(
 def off_diagonal(
     starts: Array, columns: Array, entries: Array, first: int, last: int
 ) -> tuple[float, float]:
-    """Add up the positive entries off the diagonal, and the sizes of all of them."""
+    """Return the sums of the positive off-diagonal entries and of all their absolute values."""
     positive, size = 0.0, 0.0
     for row in range(first, last):
         for index in range(starts[row], starts[row + 1]):
@@ -119,13 +118,13 @@ def strong_connections(
     first: int,
     last: int,
 ) -> None:
-    """Find the strong connections, which may root an aggregate.
+    """Mark the strong connections, which may root an aggregate, in ``strong``.
 
     Args:
-        largest: Coupling of each row.
+        largest: Largest coupling of each row.
         coupled: Sum of each row's couplings over its diagonal.
-        min_strength: Of an entry over the largest coupling of both rows.
-        min_coupled: Of an unknown; below it, smoothing alone solves for it.
+        min_strength: Minimum ratio of an entry to the largest coupling of both rows.
+        min_coupled: Minimum of ``coupled``; below it, smoothing alone solves for an unknown.
     """
     for row in range(first, last):
         for index in range(starts[row], starts[row + 1]):
@@ -142,7 +141,7 @@ def strong_connections(
 
 @compiled("int32(int32[::1], int32[::1], boolean[::1], int64[::1], int32[::1])")
 def roots(starts: Array, columns: Array, strong: Array, order: Array, label: Array) -> int:
-    """Label root unknowns more than two strong connections apart, in order; -1 for the others."""
+    """Number the roots, over two strong connections apart; -1 for others. Return their count."""
     covered = np.zeros(len(label), np.bool_)
     label[:] = -1
     for row in order:
@@ -172,13 +171,13 @@ def assigned(
     scale: Array,
     strong: Array,
     label: Array,
-    found: Array,
+    new_label: Array,
     first: int,
     last: int,
 ) -> None:
-    """Assign unlabelled unknowns the label of their strongest connection that has one."""
+    """Assign unlabelled unknowns the label of their strongest labelled connection."""
     for row in range(first, last):
-        found[row] = label[row]
+        new_label[row] = label[row]
         if label[row] >= 0:
             continue
         most = 0.0
@@ -188,7 +187,7 @@ def assigned(
                 coupling = -scale[row] * entries[index] * scale[column]
                 if coupling >= most:
                     most = coupling
-                    found[row] = label[column]
+                    new_label[row] = label[column]
 
 
 @compiled(
@@ -204,17 +203,17 @@ def assigned_by_coupling(
     coupled: Array,
     min_coupled: float,
     label: Array,
-    found: Array,
+    new_label: Array,
     first: int,
     last: int,
 ) -> bool:
-    """Assign unlabelled unknowns the label of their largest coupling; true if any got one.
+    """Assign unlabelled unknowns the label of their largest coupling; return if any changed.
 
-    Couplings grow along such chains, so that they are short.
+    Couplings grow along such chains, so the chains are short.
     """
     changed = False
     for row in range(first, last):
-        found[row] = label[row]
+        new_label[row] = label[row]
         if label[row] >= 0 or coupled[row] <= min_coupled or largest[row] <= 0:
             continue
         strongest = -1
@@ -223,13 +222,13 @@ def assigned_by_coupling(
             if column != row and -scale[row] * entries[index] * scale[column] == largest[row]:
                 strongest = column
         if strongest >= 0 and label[strongest] >= 0:
-            found[row] = label[strongest]
+            new_label[row] = label[strongest]
             changed = True
     return changed
 
 
 @compiled(
-    f"{_FOUND}({_MATRIX}, float64[::1], float64[::1], float64[::1], int32[::1], float64, float64, "
+    f"{_BLOCK}({_MATRIX}, float64[::1], float64[::1], float64[::1], int32[::1], float64, float64, "
     f"{_ROWS})"
 )
 def prolongation(
@@ -248,7 +247,7 @@ def prolongation(
     """Return rows of the prolongation: aggregates, smoothed by one averaging step.
 
     Returns:
-        Entries per row, their columns, and the entries.
+        Numbers of entries per row, their columns, and the entries.
     """
     counts = np.empty(last - first, np.int32)
     capacity = starts[last] - starts[first] + last - first
@@ -286,7 +285,7 @@ def prolongation(
     return counts, aggregates[:count].copy(), values[:count].copy()
 
 
-@compiled(f"{_FOUND}({_MATRIX}, {_MATRIX}, {_MATRIX}, {_ROWS})")
+@compiled(f"{_BLOCK}({_MATRIX}, {_MATRIX}, {_MATRIX}, {_ROWS})")
 def coarser(
     starts: Array,
     columns: Array,
@@ -324,10 +323,10 @@ def coarser(
                         count += 1
         if filled + count > capacity:
             capacity = 2 * capacity + count
-            wider, wider_values = np.empty(capacity, np.int32), np.empty(capacity)
+            wider_columns, wider_values = np.empty(capacity, np.int32), np.empty(capacity)
             for index in range(filled):
-                wider[index], wider_values[index] = aggregates[index], values[index]
-            aggregates, values = wider, wider_values
+                wider_columns[index], wider_values[index] = aggregates[index], values[index]
+            aggregates, values = wider_columns, wider_values
         for index in range(count):
             aggregate = touched[index]
             aggregates[filled + index], values[filled + index] = aggregate, sums[aggregate]

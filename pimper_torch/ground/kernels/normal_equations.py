@@ -31,7 +31,7 @@ def fill(
     columns: Array,
     entries: Array,
 ) -> None:
-    """Append the entries of equations to their rows; ``ends`` are updated."""
+    """Append the entries of all equations to their rows; ``ends`` is updated."""
     terms = unknowns.shape[1]
     for equation in range(len(unknowns)):
         for first_term in range(terms):
@@ -53,7 +53,7 @@ def fill(
 def add_sides(
     unknowns: Array, coefficients: Array, targets: Array, weights: Array, side: Array
 ) -> None:
-    """Add the equations' targets to the right-hand side."""
+    """Add the targets of the equations to the right-hand side."""
     for equation in range(len(unknowns)):
         weighted = weights[equation] * targets[equation]
         for term in range(unknowns.shape[1]):
@@ -79,10 +79,10 @@ def judge(
     answer: Array,
     square: Array,
 ) -> float:
-    """Write squared standardized residuals; return the probe's estimate of the degrees of freedom.
+    """Write squared standardized residuals to ``square``; return estimated degrees of freedom.
 
-    The probe's term of the trace of the hat matrix, ``sum_e w_e i_e (a_e p) (a_e x)`` with ``x``
-    the solution for the probe ``p`` (Hutchinson's estimator).
+    They are the probe's term of the trace of the hat matrix, ``sum_e w_e i_e (a_e p) (a_e x)`` with
+    ``x`` the solution (``answer``) for the probe ``p`` (Hutchinson's estimator).
     """
     used = 0.0
     for equation in range(len(unknowns)):
@@ -99,7 +99,7 @@ def judge(
 
 @compiled("int32[::1](int32[::1], int32[::1], int32[::1], float64[::1])")
 def merge(starts: Array, ends: Array, columns: Array, entries: Array) -> Array:
-    """Sort every row by column, add up duplicates, and close the gaps; return the rows' starts."""
+    """Sort all rows by column, sum duplicates and close gaps; return the starts of the rows."""
     size = len(ends)
     first = np.zeros(size + 1, np.int32)
     filled = 0

@@ -1,4 +1,4 @@
-"""Patches of a view aligned with templates."""
+"""Alignment of a view's patches with templates."""
 
 import numpy as np
 import numpy.typing as npt
@@ -31,17 +31,17 @@ def align(
     deviation: Doubles,
     correlation: Doubles,
 ) -> None:
-    """Align one view's patches by Gauss-Newton on the templates' slopes.
+    """Align one view's patches by Gauss-Newton steps with the templates' slopes.
 
     Args:
-        homographies: From steps of the plane to pixels, one a point.
-        values: Of the templates, light taken out.
-        offsets: Steps of the plane, homogeneous, one column a sample.
+        homographies: From steps in the plane to pixels, one a point.
+        values: Of the templates, with changes of light projected out.
+        offsets: Homogeneous steps in the plane, one column a sample.
         light: Basis of changes of light, orthonormal columns.
-        limits: Iterations; the longest step; the step that converges; iterations after which the
-            correlation is tested; its minimum; bounds of the contrast; the longest shift.
-        shift: Result, along the plane; infinite where the patch was lost or did not converge.
-        deviation: Result: of the point along its worst direction, in steps.
+        limits: Maximum iterations; maximum step; step of convergence; iterations before the
+            correlation is tested; its minimum; bounds of the contrast; maximum shift.
+        shift: Result, along the plane; infinite if the patch was lost or did not converge.
+        deviation: Result: standard deviation of the point along its worst direction, in steps.
         correlation: Result: with the template.
     """
     height, width = log.shape
@@ -67,16 +67,16 @@ def align(
         along, across = 0.0, 0.0
         has_converged = False
         for iteration in range(iterations):
-            at_x = h[0, 2] + h[0, 0] * along + h[0, 1] * across
-            at_y = h[1, 2] + h[1, 0] * along + h[1, 1] * across
-            at_z = h[2, 2] + h[2, 0] * along + h[2, 1] * across
+            center_x = h[0, 2] + h[0, 0] * along + h[0, 1] * across
+            center_y = h[1, 2] + h[1, 0] * along + h[1, 1] * across
+            center_z = h[2, 2] + h[2, 0] * along + h[2, 1] * across
             for s in range(samples):
                 u, v = offsets[0, s], offsets[1, s]
-                z = at_z + h[2, 0] * u + h[2, 1] * v
+                z = center_z + h[2, 0] * u + h[2, 1] * v
                 over = 1 / z if z > 0 else 0.0
-                x = (at_x + h[0, 0] * u + h[0, 1] * v) * over - 0.5
-                y = (at_y + h[1, 0] * u + h[1, 1] * v) * over - 0.5
-                # NaN compares false, and is clamped into the photograph too.
+                x = (center_x + h[0, 0] * u + h[0, 1] * v) * over - 0.5
+                y = (center_y + h[1, 0] * u + h[1, 1] * v) * over - 0.5
+                # NaN compares false, and is also clamped into the photograph.
                 x = min(x, width - 1.0) if x > 0 else 0.0
                 y = min(y, height - 1.0) if y > 0 else 0.0
                 column, row = min(int(x), width - 2), min(int(y), height - 2)

@@ -1,7 +1,7 @@
-"""All views resampled on a bucket of templates in one pass: twin of ``method.patches.warp``.
+"""Resampling of all views on a bucket of templates: twin of ``method.patches.warp``.
 
-Pyramids are rows of pixels (see ``ground.geometry.pyramids``), the finest level in an array of its
-own; ``levels`` lists height, width and offset of each.
+Pyramids are rows of pixels (see ``ground.geometry.pyramids``), with a separate array for the finest
+level; ``levels`` has the height, width and offset of each.
 """
 
 import math
@@ -34,9 +34,9 @@ def project(m: Array, samples: signatures.Samples, patch: int, pixels: Array) ->
 
 @compiled()
 def neighbours(index: int, count: int) -> tuple[int, int]:
-    """Return two samples next to each other; their difference is the forward one.
+    """Return the two neighbouring samples of the forward difference at an index.
 
-    The last difference is repeated, and zero for a single sample.
+    The last difference is repeated; that of a single sample is zero.
     """
     first = max(0, min(index, count - 2))
     return first, min(first + 1, count - 1)
@@ -56,12 +56,11 @@ def register(
     radiance: signatures.Floats5,
     valid: signatures.Masks4,
 ) -> None:
-    """Resample the views, and mark valid samples, occlusion aside.
+    """Resample the views, and mark valid samples, without regard to occlusion.
 
     Args:
-        levels: Height, width and offset of every level in a row of ``coarser``, in pixels of one
-            channel.
-        min_facing: Cosine of the steepest viewing angle.
+        levels: Height, width and offset in ``coarser`` of each level, in pixels of one channel.
+        min_facing: Cosine of the maximum viewing angle.
         dark_level: Mean over the channels below which a sample is invalid.
     """
     rows, image_from_patch, centers_patch = projection
@@ -125,37 +124,37 @@ def register(
                             lost = np.float32(0)
                             for step in range(2 if blend > 0 else 1):
                                 weight = blend if step == 1 else np.float32(1) - blend
-                                here = level + step
-                                tall, wide = levels[here, 0], levels[here, 1]
-                                at, aside, under, across, down = corners(
+                                current = level + step
+                                tall, wide = levels[current, 0], levels[current, 1]
+                                pixel, to_right, to_below, across, down = corners(
                                     tall,
                                     wide,
-                                    u * fractions[here, 1] - 0.5,
-                                    v * fractions[here, 0] - 0.5,
+                                    u * fractions[current, 1] - 0.5,
+                                    v * fractions[current, 0] - 0.5,
                                 )
-                                if here == 0:
+                                if current == 0:
                                     lost += weight * bilinear(
-                                        fine_unusable, at, aside, under, across, down
+                                        fine_unusable, pixel, to_right, to_below, across, down
                                     )
                                     for channel in range(channels):
                                         blended[channel] = weight * bilinear(
-                                            fine, at, aside, under, across, down
+                                            fine, pixel, to_right, to_below, across, down
                                         )
-                                        at += fine_plane
+                                        pixel += fine_plane
                                     continue
-                                start = levels[here, 2]
+                                start = levels[current, 2]
                                 lost += weight * bilinear(
-                                    coarse_unusable, start + at, aside, under, across, down
+                                    coarse_unusable, start + pixel, to_right, to_below, across, down
                                 )
-                                at += channels * start
+                                pixel += channels * start
                                 for channel in range(channels):
                                     value = weight * bilinear(
-                                        coarse, at, aside, under, across, down
+                                        coarse, pixel, to_right, to_below, across, down
                                     )
                                     blended[channel] = (
                                         value if step == 0 else blended[channel] + value
                                     )
-                                    at += tall * wide
+                                    pixel += tall * wide
                             mean = np.float32(0)
                             for channel in range(channels):
                                 mean += blended[channel]

@@ -1,4 +1,4 @@
-"""Gradients of pictures and geometry: the adjoint of ``ground.kernels.resampling``."""
+"""Adjoint of ``ground.kernels.resampling``: gradients of pictures and geometry."""
 
 import math
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from pimper_torch.ground.kernels.resampling import neighbours, project
 
 
 class ViewGradients(NamedTuple):
-    """Derivatives by pictures, and by what :class:`Projection` and :class:`Samples` hold."""
+    """Derivatives by pictures, and by fields of :class:`Projection` and :class:`Samples`."""
 
     finest: signatures.Floats2
     coarser: signatures.Floats2
@@ -32,30 +32,29 @@ def pull_back(
     valid: signatures.Masks4,
     on_radiance: signatures.Floats5,
     on_pixels: int,
-    found: ViewGradients,
+    gradients: ViewGradients,
 ) -> None:
     """Compute derivatives by pictures and geometry from those by the samples.
 
     Args:
-        valid: Samples that count, as ``register`` of :mod:`pimper_torch.ground.kernels.resampling`
-            finds them.
-        on_pixels: Whether derivatives by pictures are wanted, 1 or 0.
-        found: Added to.
+        valid: Valid samples, from ``register`` of :mod:`pimper_torch.ground.kernels.resampling`.
+        on_pixels: Whether derivatives by pictures are needed, 1 or 0.
+        gradients: Added to.
     """
     rows, image_from_patch, _ = projection
     origin, spacing, depth, _ = samples
     patches, views, channels, height, width = on_radiance.shape
     fractions = shrinkage(levels)
-    pixels, drawn = np.empty((height, width, 2)), np.empty((height, width, 2))
+    pixels, on_positions = np.empty((height, width, 2)), np.empty((height, width, 2))
     on_channels = np.empty(channels, np.float32)
     for patch in range(patches):
         for view in range(views):
             m = image_from_patch[patch * views + view]
-            by_m = found.image_from_patch[patch * views + view]
+            by_m = gradients.image_from_patch[patch * views + view]
             if not np.any(valid[patch, view]):
                 continue
             project(m, samples, patch, pixels)
-            drawn[:] = 0
+            on_positions[:] = 0
             for row in range(height):
                 above, below = neighbours(row, height)
                 for column in range(width):
@@ -73,8 +72,8 @@ def pull_back(
                     on_u, on_v, on_level = spread(
                         images.finest,
                         images.coarser,
-                        found.finest,
-                        found.coarser,
+                        gradients.finest,
+                        gradients.coarser,
                         levels,
                         fractions,
                         rows[view],
@@ -84,39 +83,39 @@ def pull_back(
                         on_channels,
                         on_pixels > 0,
                     )
-                    drawn[row, column, 0] += on_u
-                    drawn[row, column, 1] += on_v
+                    on_positions[row, column, 0] += on_u
+                    on_positions[row, column, 1] += on_v
                     on_area = on_level / (2 * math.log(2) * math.copysign(area, signed))
-                    drawn[row, right, 0] += on_area * dv_row
-                    drawn[row, left, 0] -= on_area * dv_row
-                    drawn[row, right, 1] -= on_area * du_row
-                    drawn[row, left, 1] += on_area * du_row
-                    drawn[below, column, 0] -= on_area * dv_column
-                    drawn[above, column, 0] += on_area * dv_column
-                    drawn[below, column, 1] += on_area * du_column
-                    drawn[above, column, 1] -= on_area * du_column
+                    on_positions[row, right, 0] += on_area * dv_row
+                    on_positions[row, left, 0] -= on_area * dv_row
+                    on_positions[row, right, 1] -= on_area * du_row
+                    on_positions[row, left, 1] += on_area * du_row
+                    on_positions[below, column, 0] -= on_area * dv_column
+                    on_positions[above, column, 0] += on_area * dv_column
+                    on_positions[below, column, 1] += on_area * du_column
+                    on_positions[above, column, 1] -= on_area * du_column
             for row in range(height):
                 y = origin[patch, 1] + spacing[patch] * row
                 for column in range(width):
-                    on_u, on_v = drawn[row, column, 0], drawn[row, column, 1]
+                    on_u, on_v = on_positions[row, column, 0], on_positions[row, column, 1]
                     if on_u == 0 and on_v == 0:
                         continue
                     x = origin[patch, 0] + spacing[patch] * column
                     z = depth[patch, row, column]
                     z_cam = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
                     if z_cam == 0:
-                        continue  # no place in the picture
+                        continue  # no position in the picture
                     a, b = on_u / z_cam, on_v / z_cam
                     c = -(a * pixels[row, column, 0] + b * pixels[row, column, 1])
                     by_x = a * m[0, 0] + b * m[1, 0] + c * m[2, 0]
                     by_y = a * m[0, 1] + b * m[1, 1] + c * m[2, 1]
-                    found.depth[patch, row, column] += a * m[0, 2] + b * m[1, 2] + c * m[2, 2]
-                    found.origin[patch, 0] += by_x
-                    found.origin[patch, 1] += by_y
-                    found.spacing[patch] += by_x * column + by_y * row
+                    gradients.depth[patch, row, column] += a * m[0, 2] + b * m[1, 2] + c * m[2, 2]
+                    gradients.origin[patch, 0] += by_x
+                    gradients.origin[patch, 1] += by_y
+                    gradients.spacing[patch] += by_x * column + by_y * row
                     for i in range(3):
-                        part = a if i == 0 else b if i == 1 else c
-                        by_m[i, 0] += part * x
-                        by_m[i, 1] += part * y
-                        by_m[i, 2] += part * z
-                        by_m[i, 3] += part
+                        factor = a if i == 0 else b if i == 1 else c
+                        by_m[i, 0] += factor * x
+                        by_m[i, 1] += factor * y
+                        by_m[i, 2] += factor * z
+                        by_m[i, 3] += factor

@@ -16,7 +16,7 @@ from pimper_torch.ground.kernels.twin_constants import (
 Floats = NDArray[Any]
 Kind = type[np.float32] | type[np.float64]
 
-# The step at which they end.
+# Length of the Newton step that ends the iteration.
 _CLOSE = float(np.finfo(np.float32).eps) ** 0.75
 
 
@@ -25,11 +25,11 @@ def robust_variance(squares: Floats, guess: float, kind: Kind) -> tuple[float, f
     """Estimate the variance from squared residuals, robustly.
 
     Args:
-        guess: Where Newton's method starts: the squared scale of an earlier call, or 0.
+        guess: Initial squared scale: that of an earlier call, or 0 for the mean square.
         kind: Type of the sums.
 
     Returns:
-        The variance, 0 where half of the squares are, and the squared scale.
+        The variance, 0 if at least half of the squares are 0, and the squared scale.
     """
     half = 0.5 * len(squares)
     total, num_positive = 0.0, 0
@@ -52,13 +52,13 @@ def robust_variance(squares: Floats, guess: float, kind: Kind) -> tuple[float, f
 
 @compiled(fast=True)
 def _fractions(squares: Floats, inverse: float, kind: Kind) -> tuple[float, float]:
-    """Sum ``r^4 / (r^4 + t^4)``, and its derivative by the logarithm of ``t^2``, negated."""
+    """Return the sum of ``r^4 / (r^4 + t^4)``, and minus its derivative by ``log(t^2)``."""
     one, most, per = kind(1), kind(1e9), kind(inverse)
     fraction, square = kind(0), kind(0)
     for i in range(len(squares)):
         ratio = min(squares[i] * per, most)
         ratio *= ratio
-        part = ratio / (one + ratio)
-        fraction += part
-        square += part * part
+        value = ratio / (one + ratio)
+        fraction += value
+        square += value * value
     return float(fraction), 2 * (float(fraction) - float(square))

@@ -1,7 +1,7 @@
 """Gauss-Newton steps of samples on the cone: twin of ``method.photometry.bilinear.update_shading``.
 
 A sample has 14 values: its normal equations ``A``, ten packed entries, and ``b``. They are copied
-to tiles of constant stride: only then can the compiler exclude aliasing, and vectorize.
+to tiles of constant stride: only then can the compiler exclude aliasing and vectorize.
 """
 
 import math
@@ -22,7 +22,7 @@ Ten = tuple[float, float, float, float, float, float, float, float, float, float
 # Samples of a tile: a choice, two cache lines of float32 a row.
 TILE = 32
 
-# As in ``method.photometry.bilinear``, and as ``method.photometry.quadratics`` has it in float64.
+# As in ``method.photometry.bilinear``, and as in ``method.photometry.quadratics`` in float64.
 _ROUNDING = 8 * float(np.finfo(np.float32).eps)
 _TINY = float(np.finfo(np.float64).tiny) ** 0.5
 
@@ -33,7 +33,7 @@ def update_shading(equations: Floats, shading: Floats, steps: int) -> None:
 
     Args:
         equations: 14 rows: ``A`` and ``b``; a multiple of TILE samples.
-        steps: Of each sample; one that does not lower its objective is rejected.
+        steps: Number of steps of each sample; those that increase its objective are rejected.
     """
     tile = np.empty(18 * TILE, np.float64)
     for first in range(0, shading.shape[1], TILE):
@@ -62,7 +62,7 @@ def load(equations: Floats, shading: Floats, first: int, tile: Doubles) -> None:
 @compiled(fast=True)
 def _step(tile: Doubles) -> None:
     for k in range(TILE):
-        a, b, s = at(tile, k)
+        a, b, s = read_sample(tile, k)
         image = apply(a, s)
         value = objective(s, image, b)
         moved = tangent_step(
@@ -77,8 +77,8 @@ def _step(tile: Doubles) -> None:
 
 
 @compiled(fast=True)
-def at(tile: Doubles, k: int) -> tuple[Ten, Four, Four]:
-    """Read a sample's ``A``, ``b`` and shading vector."""
+def read_sample(tile: Doubles, k: int) -> tuple[Ten, Four, Four]:
+    """Return the ``A``, ``b`` and shading vector of a sample."""
     a = (
         tile[k],
         tile[TILE + k],
@@ -98,7 +98,7 @@ def at(tile: Doubles, k: int) -> tuple[Ten, Four, Four]:
 
 @compiled(fast=True)
 def apply(a: Ten, v: Four) -> Four:
-    """Multiply a packed matrix with a vector."""
+    """Return the product of a packed matrix and a vector."""
     return (
         a[0] * v[0] + a[1] * v[1] + a[2] * v[2] + a[3] * v[3],
         a[1] * v[0] + a[4] * v[1] + a[5] * v[2] + a[6] * v[3],
@@ -120,7 +120,7 @@ def objective(s: Four, image: Four, b: Four) -> float:
 
 @compiled(fast=True)
 def tangent_step(a: Ten, slope: Four, s: Four) -> Four:
-    """Take the step ``(B^T A B)^-1 B^T slope`` along the cone, of bounded length."""
+    """Return ``s`` after the step ``(B^T A B)^-1 B^T slope`` along the cone, of bounded length."""
     n, first, second = frame(s)
     m = raised(congruence(a, n, first, second))
     inverse = inverse_factor(m)
@@ -193,14 +193,14 @@ def congruence(a: Ten, n: Three, first: Three, second: Three) -> Six:
 
 @compiled(fast=True)
 def raised(m: Six) -> Six:
-    """Raise the diagonal, so that the matrix can be inverted."""
+    """Return the matrix with an increased diagonal, so that it can be inverted."""
     more = 1e-9 * (m[0] + m[3] + m[5])
     return m[0] + more, m[1], m[2], m[3] + more, m[4], m[5] + more
 
 
 @compiled(fast=True)
 def inverse_factor(m: Six) -> Six:
-    """Return ``C^-1`` row by row, ``m = C C^T``; see ``quadratics.PackedCholesky``."""
+    """Return ``C^-1`` by rows, with ``m = C C^T``; see ``quadratics.PackedCholesky``."""
     floor = max(1e-12 * (m[0] + m[3] + m[5]), _TINY)
     c00 = 1 / math.sqrt(max(m[0], floor))
     c10, c20 = m[1] * c00, m[2] * c00
@@ -218,25 +218,25 @@ def whitening(equations: Floats, shading: Floats, vectors: Floats) -> None:
     """Compute the rows of ``C^-1 B^T``: times lights and weights they are whitened derivatives.
 
     Args:
-        vectors: Becomes 12 rows: three vectors of four.
+        vectors: Result, 12 rows: three vectors of four.
     """
-    tile, found = np.empty(18 * TILE, np.float64), np.empty(12 * TILE, np.float64)
+    tile, whitened = np.empty(18 * TILE, np.float64), np.empty(12 * TILE, np.float64)
     for start in range(0, shading.shape[1], TILE):
         load(equations, shading, start, tile)
         for k in range(TILE):
-            a, _, s = at(tile, k)
+            a, _, s = read_sample(tile, k)
             n, first, second = frame(s)
             inverse = inverse_factor(congruence(a, n, first, second))
-            found[k] = inverse[0]
-            found[4 * TILE + k] = inverse[1]
-            found[8 * TILE + k] = inverse[3]
+            whitened[k] = inverse[0]
+            whitened[4 * TILE + k] = inverse[1]
+            whitened[8 * TILE + k] = inverse[3]
             for i in range(3):
-                found[(1 + i) * TILE + k] = inverse[0] * n[i]
-                found[(5 + i) * TILE + k] = inverse[1] * n[i] + inverse[2] * first[i]
-                found[(9 + i) * TILE + k] = (
+                whitened[(1 + i) * TILE + k] = inverse[0] * n[i]
+                whitened[(5 + i) * TILE + k] = inverse[1] * n[i] + inverse[2] * first[i]
+                whitened[(9 + i) * TILE + k] = (
                     inverse[3] * n[i] + inverse[4] * first[i] + inverse[5] * second[i]
                 )
         for row in range(12):
             target = vectors[row]
             for k in range(TILE):
-                target[start + k] = found[row * TILE + k]
+                target[start + k] = whitened[row * TILE + k]

@@ -1,4 +1,4 @@
-"""Arrays and records of arrays that kernels take, with the types that numba compiles them for."""
+"""Arguments of kernels, arrays and named tuples of arrays, with the types that numba compiles."""
 
 from typing import Annotated, Any, NamedTuple
 
@@ -21,14 +21,14 @@ Masks4 = Annotated[NDArray[Any], "boolean[:,:,:,::1]"]
 
 
 class PictureRows(NamedTuple):
-    """Pyramids of photographs, one in a row: the finest level, and the others."""
+    """Image pyramids, one row per photograph: the finest level, and the others concatenated."""
 
     finest: Floats2
     coarser: Floats2
 
 
 class FractionRows(NamedTuple):
-    """The same of fractions in 255ths."""
+    """Pyramids of fractions in 255ths, as :class:`PictureRows`."""
 
     finest: Bytes2
     coarser: Bytes2
@@ -38,7 +38,7 @@ class Projection(NamedTuple):
     """Projection of patches into views.
 
     Attributes:
-        rows: Where each camera's photograph is among the pictures.
+        rows: Row of each camera's photograph in the pyramids.
         image_from_patch: Three by four, for every patch and view.
         centers_patch: Of the cameras, for every patch and view.
     """

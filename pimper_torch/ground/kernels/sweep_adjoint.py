@@ -1,4 +1,4 @@
-"""The adjoint of :mod:`pimper_torch.ground.kernels.sweep_costs`."""
+"""Adjoint of :mod:`pimper_torch.ground.kernels.sweep_costs`."""
 
 import math
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ Array = NDArray[Any]
 
 
 class CostGradients(NamedTuple):
-    """Derivatives by pictures, and by the arguments of the costs."""
+    """Derivatives by pictures, and by the other arguments of the costs."""
 
     finest: signatures.Floats2
     coarser: signatures.Floats2
@@ -43,9 +43,9 @@ class CostGradients(NamedTuple):
 
 @compiled("float32(float32[::1], int64[::1], int64)")
 def _lower_median(values: Array, order: Array, count: int) -> float:
-    """Return the lower median of the first ``count`` values.
+    """Return the lower median of the first ``count`` values, and sort ``order`` by them.
 
-    By insertion sort of ``order``: linear time if it is nearly sorted.
+    By insertion sort: linear time if ``order`` is nearly sorted.
     """
     for last in range(1, count):
         candidate = order[last]
@@ -75,10 +75,10 @@ def _inconsistency(
     on_radiance: Array,
     on_shading: Array,
 ) -> float:
-    """Differentiate the cost of one sample and height.
+    """Compute the derivatives of the cost of one sample and height.
 
     Args:
-        on_radiance: Set, at this step.
+        on_radiance: Result, of this step.
         on_shading: Added to.
 
     Returns:
@@ -113,11 +113,11 @@ def _inconsistency(
     for view in range(count):
         error = radiance[step, view] - third * shading[view]
         residual = error * per_scale
-        drawn = on_cost * residual / (one + residual * residual)
-        on_radiance[step, view] = drawn * per_scale
-        on_shading[view] -= drawn * per_scale * third
-        on_albedo -= drawn * per_scale * shading[view]
-        on_scale += drawn * error
+        on_residual = on_cost * residual / (one + residual * residual)
+        on_radiance[step, view] = on_residual * per_scale
+        on_shading[view] -= on_residual * per_scale * third
+        on_albedo -= on_residual * per_scale * shading[view]
+        on_scale += on_residual * error
     falls_second = square > 0
     for iteration in range(2):
         albedo = second if iteration == 0 else first
@@ -131,11 +131,11 @@ def _inconsistency(
             weight = one / (one + residual * residual)
             lit = shading[view] * weight
             on_lit = on_square * shading[view] + on_product * radiance[step, view]
-            drawn = -two * residual * on_lit * lit * weight
-            on_radiance[step, view] += on_product * lit + drawn * per_scale
-            on_shading[view] += on_square * lit + on_lit * weight - drawn * per_scale * albedo
-            on_albedo -= drawn * per_scale * shading[view]
-            on_scale += drawn * error
+            on_residual = -two * residual * on_lit * lit * weight
+            on_radiance[step, view] += on_product * lit + on_residual * per_scale
+            on_shading[view] += on_square * lit + on_lit * weight - on_residual * per_scale * albedo
+            on_albedo -= on_residual * per_scale * shading[view]
+            on_scale += on_residual * error
     on_radiance[step, median] += on_albedo * per_shading[median]
     on_shading[median] -= on_albedo * per_shading[median] * first
     return float(on_scale)
@@ -152,15 +152,15 @@ def pull_back(
     trial: Trial,
     on_cost: signatures.Floats4,
     on_pixels: int,
-    found: CostGradients,
+    gradients: CostGradients,
 ) -> None:
     """Compute derivatives by pictures, geometry and light from those by the costs.
 
-    Which views a sample is compared in, and which of them is the median, is constant.
+    The choice of a sample's views and of their median is held constant.
 
     Args:
-        on_pixels: Whether derivatives by pictures are wanted, 1 or 0.
-        found: Added to.
+        on_pixels: Whether derivatives by pictures are needed, 1 or 0.
+        gradients: Added to.
     """
     patches, views, height, width = trial.valid.shape
     heights, limit = len(trial.ladder), min(trial.num_views, views)
@@ -176,7 +176,7 @@ def pull_back(
     paths = np.empty((limit, 2, 3))
     areas = np.empty(limit)
     on_channel = np.empty(1, np.float32)
-    place, on_place = np.empty(3), np.empty(3)
+    point, on_point = np.empty(3), np.empty(3)
     along, on_along = np.empty(3), np.empty(3)
     on_path = np.empty((2, 3))
     for patch in range(patches):
@@ -229,38 +229,38 @@ def pull_back(
                         on_radiance,
                         on_lit,
                     )
-                place[0] = samples.origin[patch, 0] + spacing * column
-                place[1] = samples.origin[patch, 1] + spacing * row
-                place[2] = samples.depth[patch, row, column]
-                on_place[:], on_along[:] = 0, 0
+                point[0] = samples.origin[patch, 0] + spacing * column
+                point[1] = samples.origin[patch, 1] + spacing * row
+                point[2] = samples.depth[patch, row, column]
+                on_point[:], on_along[:] = 0, 0
                 for axis in range(3):
                     along[axis] = samples.outward[patch, row, column, axis]
                 normal = shaded.normals[patch, row, column]
-                on_normal = found.normals[patch, row, column]
+                on_normal = gradients.normals[patch, row, column]
                 on_spacing = 0.0
                 for slot in range(count):
                     view = choice.views[slot]
-                    both = patch * views + view
+                    index = patch * views + view
                     gain = shaded.gains[patch, view]
                     path = paths[slot]
                     on_path[:] = 0
                     on_level, on_gain = 0.0, 0.0
                     for step in range(heights):
-                        drawn = on_radiance[step, slot]
-                        if drawn == 0:
+                        on_sample = on_radiance[step, slot]
+                        if on_sample == 0:
                             continue
-                        on_gain += drawn * radiance[step, slot]
-                        on_channel[0] = drawn * gain
+                        on_gain += on_sample * radiance[step, slot]
+                        on_channel[0] = on_sample * gain
                         move = spacing * trial.ladder[step]
                         z_cam = path[0, 2] + move * path[1, 2]
                         inverse_z = 1 / z_cam if z_cam != 0 else 1.0
                         u = inverse_z * (path[0, 0] + move * path[1, 0])
                         v = inverse_z * (path[0, 1] + move * path[1, 1])
-                        on_u, on_v, more = spread(
+                        on_u, on_v, by_level = spread(
                             gray.finest,
                             gray.coarser,
-                            found.finest,
-                            found.coarser,
+                            gradients.finest,
+                            gradients.coarser,
                             levels,
                             fractions,
                             projection.rows[view],
@@ -270,9 +270,9 @@ def pull_back(
                             on_channel,
                             on_pixels > 0,
                         )
-                        on_level += more
+                        on_level += by_level
                         if z_cam == 0:
-                            continue  # no place in the picture
+                            continue  # no position in the picture
                         a, b = on_u * inverse_z, on_v * inverse_z
                         c = -(a * u + b * v)
                         on_path[0, 0] += a
@@ -284,44 +284,44 @@ def pull_back(
                         on_move = a * path[1, 0] + b * path[1, 1] + c * path[1, 2]
                         on_spacing += on_move * trial.ladder[step]
                     if gain != 0:
-                        found.gains[patch, view] += on_gain / gain
-                    # The level is the logarithm of the footprint, and half that of the facing.
+                        gradients.gains[patch, view] += on_gain / gain
+                    # The level is the logarithm of the footprint plus half that of the facing.
                     on_level /= math.log(2)
                     on_spacing += on_level / spacing
-                    found.focals[view] += on_level / focals[view]
+                    gradients.focals[view] += on_level / focals[view]
                     if path[0, 2] > FLOOR:
                         on_path[0, 2] -= on_level / path[0, 2]
                     facing = choice.facings[view]
                     if facing > trial.min_facing:
                         on_facing = 0.5 * on_level / facing
-                        center = projection.centers_patch[both]
-                        away = 0.0
+                        center = projection.centers_patch[index]
+                        distance = 0.0
                         for axis in range(3):
-                            away += (center[axis] - place[axis]) ** 2
-                        away = math.sqrt(away)
+                            distance += (center[axis] - point[axis]) ** 2
+                        distance = math.sqrt(distance)
                         for axis in range(3):
-                            way = (center[axis] - place[axis]) / away
-                            on_along[axis] += on_facing * way
-                            part = on_facing * (along[axis] - facing * way) / away
-                            found.centers_patch[both, axis] += part
-                            on_place[axis] -= part
-                    m, by_m = projection.image_from_patch[both], found.image_from_patch[both]
+                            direction = (center[axis] - point[axis]) / distance
+                            on_along[axis] += on_facing * direction
+                            on_center = on_facing * (along[axis] - facing * direction) / distance
+                            gradients.centers_patch[index, axis] += on_center
+                            on_point[axis] -= on_center
+                    m, by_m = projection.image_from_patch[index], gradients.image_from_patch[index]
                     for i in range(3):
                         for axis in range(3):
-                            on_place[axis] += on_path[0, i] * m[i, axis]
+                            on_point[axis] += on_path[0, i] * m[i, axis]
                             on_along[axis] += on_path[1, i] * m[i, axis]
-                            by_m[i, axis] += on_path[0, i] * place[axis]
+                            by_m[i, axis] += on_path[0, i] * point[axis]
                             by_m[i, axis] += on_path[1, i] * along[axis]
                         by_m[i, 3] += on_path[0, i]
-                    on_light, light = found.lights[patch, view], shaded.lights[patch, view]
+                    on_light, light = gradients.lights[patch, view], shaded.lights[patch, view]
                     on_light[0] += on_lit[slot]
                     for axis in range(3):
                         on_light[1 + axis] += on_lit[slot] * normal[axis]
                         on_normal[axis] += on_lit[slot] * light[1 + axis]
-                found.origin[patch, 0] += on_place[0]
-                found.origin[patch, 1] += on_place[1]
-                found.depth[patch, row, column] += on_place[2]
-                found.spacing[patch] += on_spacing + on_place[0] * column + on_place[1] * row
+                gradients.origin[patch, 0] += on_point[0]
+                gradients.origin[patch, 1] += on_point[1]
+                gradients.depth[patch, row, column] += on_point[2]
+                gradients.spacing[patch] += on_spacing + on_point[0] * column + on_point[1] * row
                 for axis in range(3):
-                    found.outward[patch, row, column, axis] += on_along[axis]
-        found.scale[patch] -= on_per_scale * per_scale * per_scale
+                    gradients.outward[patch, row, column, axis] += on_along[axis]
+        gradients.scale[patch] -= on_per_scale * per_scale * per_scale

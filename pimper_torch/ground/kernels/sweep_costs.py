@@ -1,6 +1,6 @@
 """Costs of all height hypotheses of a bucket's samples: twin of ``method.sweep.sweep``.
 
-Arguments are documented there; images are laid out as in ``ground.kernels.resampling``.
+Arguments are documented there; pyramids are stored as in ``ground.kernels.resampling``.
 """
 
 import math
@@ -23,9 +23,9 @@ def _gray(pixels: Array, levels: Array, fractions: Array, level: int, u: float, 
     """Sample one level of a photograph's pyramid."""
     tall, wide = levels[level, 0], levels[level, 1]
     x, y = u * fractions[level, 1] - 0.5, v * fractions[level, 0] - 0.5
-    at, right, below, across, down = corners(tall, wide, x, y)
+    index, right, below, across, down = corners(tall, wide, x, y)
     start = levels[level, 2] if level > 0 else 0
-    return bilinear(pixels, start + at, right, below, across, down)
+    return bilinear(pixels, start + index, right, below, across, down)
 
 
 @compiled(fast=True)
@@ -41,7 +41,7 @@ def _inconsistency(
 ) -> None:
     """See :func:`~pimper_torch.method.sweep.costs.inconsistency`; for one sample.
 
-    All heights side by side: they are what is vectorized.
+    The inner loops run over the heights, to be vectorized.
     """
     albedo, square, product, factors = work
     heights, middle, one = len(cost), (count - 1) // 2, np.float32(1)
@@ -83,11 +83,11 @@ def _inconsistency(
 
 
 @compiled("int64(float32[::1], int64[::1], float32[::1])")
-def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
+def _demote_repeated_poses(ratings: Array, poses: Array, demoted: Array) -> int:
     """See :func:`~pimper_torch.method.sweep.costs.poses_first`; views of rating 0 are not usable.
 
     Returns:
-        How many poses have a usable view.
+        Number of poses with a usable view.
     """
     distinct = 0
     for view in range(len(ratings)):
@@ -105,7 +105,7 @@ def _after_other_poses(ratings: Array, poses: Array, demoted: Array) -> int:
 
 
 class Shading(NamedTuple):
-    """Normals that light shades, lights of every patch and view, and factors of radiance."""
+    """Normals, lights of every patch and view, and factors of radiance."""
 
     normals: signatures.Floats4
     lights: signatures.Floats3
@@ -113,14 +113,14 @@ class Shading(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """The heights of every sample that are tried.
+    """Height hypotheses of every sample, and the limits of the views that evaluate them.
 
     Attributes:
         tested: Samples that may be swept.
-        valid: Where a view has the sample.
+        valid: Whether a view has the sample.
         scale: Of the robust loss, for every patch.
-        ladder: In units of the samples' spacing.
-        poses: Number of each view's pose; empty where every view has its own.
+        ladder: Heights in units of the samples' spacing.
+        poses: Pose index of each view; empty if all poses differ.
         num_views: Maximum number of views of a sample.
         min_views: A sample with fewer views is not swept.
         min_facing: Lower bound of the cosine that shrinks footprints.
@@ -137,14 +137,14 @@ class Trial(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The views that a sample is compared in, and room to choose them.
+    """Chosen views of a sample, and workspace to choose them.
 
     Attributes:
-        views: The best first.
+        views: Chosen views, best first.
         score: Of these.
-        shading: Of albedo 1, in every view; facings and footprints where a view may be chosen.
-        ratings: Of every view, 0 where it may not.
-        demoted: Ratings, less one for each better view of the same pose.
+        shading: Of albedo 1, in every view; facings and footprints are set for candidates only.
+        ratings: Of every view; 0 if it is no candidate.
+        demoted: Ratings, minus one for each better view of the same pose.
     """
 
     views: signatures.Integers1
@@ -158,7 +158,7 @@ class Choice(NamedTuple):
 
 @compiled()
 def empty_choice(views: int, limit: int) -> Choice:
-    """Return a choice of ``limit`` out of some views, to be made."""
+    """Return an uninitialized choice of at most ``limit`` of the views."""
     return Choice(
         np.empty(limit, np.int64),
         np.empty(limit, np.float32),
@@ -185,7 +185,7 @@ def choose(
     """Choose the views of a sample.
 
     Returns:
-        How many; 0 where the sample is not swept.
+        Their number; 0 if the sample is not swept.
     """
     _, image_from_patch, centers_patch = projection
     origin, spacing, depth, outward = samples
@@ -231,7 +231,7 @@ def choose(
         facings[view], footprints[view] = facing, footprint
         rating = facing * min(footprint, 1.0) * min(shading[view] / mean_shading, 1.0)
         ratings[view] = np.float32(rating)
-    num_distinct = _after_other_poses(ratings, poses, demoted)
+    num_distinct = _demote_repeated_poses(ratings, poses, demoted)
     num_chosen = 0
     for view in range(views):
         rating = demoted[view]
@@ -261,19 +261,19 @@ def look_up(
     gain: float,
     radiance: Array,
 ) -> None:
-    """Look a sample up in a view at all heights.
+    """Sample a view at all heights of a sample.
 
     Args:
-        row: Of the photograph among the pictures.
-        path: Images of the sample and of its outward normal, homogeneous.
+        row: Of the photograph in the pyramids.
+        path: Homogeneous projections of the sample and of its outward normal.
         spacing: Unit of the ladder.
-        gain: One over the view's exposure.
-        radiance: Set to ``gain`` times the picture, for every height.
+        gain: Inverse of the view's exposure.
+        radiance: Result: ``gain`` times the photograph, for every height.
     """
     level, blend = blended_level(squared_footprint, len(levels))
     coarse = gray.coarser[row]
     fine = coarse if level > 0 else gray.finest[row]
-    more = level + (1 if blend > 0 else 0)
+    coarser_level = level + (1 if blend > 0 else 0)
     for step in range(len(ladder)):
         move = spacing * ladder[step]
         z_cam = path[0, 2] + move * path[1, 2]
@@ -282,7 +282,7 @@ def look_up(
         v = inverse_z * (path[0, 1] + move * path[1, 1])
         value = _gray(fine, levels, fractions, level, u, v)
         if blend > 0:
-            value += blend * (_gray(coarse, levels, fractions, more, u, v) - value)
+            value += blend * (_gray(coarse, levels, fractions, coarser_level, u, v) - value)
         radiance[step] = gain * value
 
 
@@ -290,7 +290,7 @@ def look_up(
 def trace(
     m: Array, samples: signatures.Samples, patch: int, row: int, column: int, path: Array
 ) -> None:
-    """Project a sample, and its outward normal, by a 3x4 matrix."""
+    """Project a sample and its outward normal by a 3x4 matrix."""
     origin, spacing, depth, outward = samples
     x = origin[patch, 0] + spacing[patch] * column
     y = origin[patch, 1] + spacing[patch] * row
@@ -319,7 +319,7 @@ def costs(
 
     Args:
         levels: Height, width and offset of every level.
-        swept: Result, zero before: 1 where a sample has costs.
+        swept: Result, zero before: 1 for samples with costs.
     """
     patches, views, height, width = trial.valid.shape
     heights, limit = len(trial.ladder), min(trial.num_views, views)
@@ -329,12 +329,12 @@ def costs(
     fractions = shrinkage(levels)
     radiance = np.empty((limit, heights), np.float32)
     ranked = np.empty((limit, heights), np.float32)
-    one, other, third = (
+    albedo, square, product = (
         np.empty(heights, np.float32),
         np.empty(heights, np.float32),
         np.empty(heights, np.float32),
     )
-    work, evaluated = (one, other, third, np.empty(heights)), np.empty(heights)
+    work, evaluated = (albedo, square, product, np.empty(heights)), np.empty(heights)
     path = np.empty((2, 3))
     for patch in range(patches):
         per_scale = np.float32(1) / trial.scale[patch]

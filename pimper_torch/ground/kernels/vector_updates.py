@@ -1,7 +1,6 @@
 """Fused vector updates of conjugate gradients, in place.
 
-Vectors have one column per right-hand side, in float64; those of the preconditioner may be in
-float32.
+Vectors have one column per right-hand side, in float64; those of the preconditioner may be float32.
 """
 
 import numpy as np
@@ -19,7 +18,7 @@ _REALS = ("float32[:,::1]", "float64[:,::1]")
 
 @compiled(*(f"void({_WIDE}, {real}, {_WIDE}, int64, int64)" for real in _REALS))
 def dots(a: Array, b: Array, sums: Array, first: int, last: int) -> None:
-    """Write the inner products of the blocks of rows from ``first`` up to ``last``."""
+    """Write the inner products of the blocks ``first:last`` of rows."""
     for block in range(first, last):
         for column in range(a.shape[1]):
             total = 0.0
@@ -35,7 +34,7 @@ def dots(a: Array, b: Array, sums: Array, first: int, last: int) -> None:
     )
 )
 def step(
-    found: Array,
+    solution: Array,
     residual: Array,
     direction: Array,
     image: Array,
@@ -44,10 +43,10 @@ def step(
     first: int,
     last: int,
 ) -> None:
-    """Update solution and residual along the directions; copy the residual, rounded."""
+    """Update solution and residual along the directions; write the residual to ``rounded``, too."""
     for row in range(first, last):
         for column in range(len(step_length)):
-            found[row, column] += step_length[column] * direction[row, column]
+            solution[row, column] += step_length[column] * direction[row, column]
             remaining = residual[row, column] - step_length[column] * image[row, column]
             residual[row, column] = remaining
             rounded[row, column] = remaining
@@ -55,7 +54,7 @@ def step(
 
 @compiled(*(f"void({_WIDE}, {real}, float64[::1], int64, int64)" for real in _REALS))
 def new_direction(direction: Array, z: Array, beta: Array, first: int, last: int) -> None:
-    """Set the directions to ``z + beta * direction``, ``z`` the preconditioned residual."""
+    """Set the directions to ``z + beta * direction``, with the preconditioned residual ``z``."""
     for row in range(first, last):
         for column in range(len(beta)):
             direction[row, column] = z[row, column] + beta[column] * direction[row, column]

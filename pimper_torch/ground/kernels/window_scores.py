@@ -1,4 +1,4 @@
-"""Window correlations of all hypotheses of inverse depth."""
+"""Window correlations for all hypotheses of inverse depth."""
 
 import math
 
@@ -10,7 +10,7 @@ from pimper_torch.ground.kernels.compile import compiled
 _ROW = "float32[::1]"
 
 
-# Loops of one written row and few read ones: only those become vector instructions.
+# Only loops that write one row and read a few are vectorized.
 @compiled(f"void({_ROW}, {_ROW}, {_ROW}, {_ROW}, float32, float32, float32)")
 def _project(
     coordinates: NDArray[np.float32],
@@ -23,12 +23,12 @@ def _project(
 ) -> None:
     """Compute one coordinate of a row of pixels in a source view."""
     tiny, min_ratio, zero = np.float32(np.finfo(np.float32).tiny), np.float32(1e-6), np.float32(0)
-    half, behind = np.float32(0.5), np.float32(-1e9)  # left of every picture
+    half, behind = np.float32(0.5), np.float32(-1e9)  # outside every picture
     for x in range(len(coordinates)):
         q = max(field[x] + offset, tiny)
         ratio = depth[x] + shift_depth * q
-        at = (ray[x] + shift * q) / max(ratio, min_ratio) - half
-        coordinates[x] = at if ratio > zero else behind
+        coordinate = (ray[x] + shift * q) / max(ratio, min_ratio) - half
+        coordinates[x] = coordinate if ratio > zero else behind
 
 
 @compiled(
@@ -36,34 +36,34 @@ def _project(
 )
 def _look_up(
     values: NDArray[np.float32],
-    there: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
     across: NDArray[np.float32],
     down: NDArray[np.float32],
-    wanted: NDArray[np.bool_],
+    needed: NDArray[np.bool_],
     tone: NDArray[np.float32],
     usable: NDArray[np.bool_],
 ) -> None:
-    """Sample a source bilinearly at a row of points; mark where the nearest pixel is usable."""
+    """Sample a source bilinearly at a row of points; mark points with a usable nearest pixel."""
     height, width = tone.shape
     zero, half = np.float32(0), np.float32(0.5)
     right, bottom = np.float32(width - 1), np.float32(height - 1)
     for x in range(len(values)):
-        if not wanted[x]:
+        if not needed[x]:
             continue
         u, v = min(max(across[x], zero), right), min(max(down[x], zero), bottom)
         column, line = np.uint32(u), np.uint32(v)
-        beside = np.uint32(min(column + 1, width - 1))
-        below = np.uint32(min(line + 1, height - 1))
-        part_u, part_v = u - np.float32(column), v - np.float32(line)
+        next_column = np.uint32(min(column + 1, width - 1))
+        next_line = np.uint32(min(line + 1, height - 1))
+        fraction_u, fraction_v = u - np.float32(column), v - np.float32(line)
         upper = tone[line, column]
-        upper += part_u * (tone[line, beside] - upper)
-        lower = tone[below, column]
-        lower += part_u * (tone[below, beside] - lower)
-        values[x] = upper + part_v * (lower - upper)
+        upper += fraction_u * (tone[line, next_column] - upper)
+        lower = tone[next_line, column]
+        lower += fraction_u * (tone[next_line, next_column] - lower)
+        values[x] = upper + fraction_v * (lower - upper)
         inside = abs(across[x] - u) <= half and abs(down[x] - v) <= half
-        nearest_line = line if part_v < half else below
-        nearest_column = column if part_u < half else beside
-        there[x] = inside and usable[nearest_line, nearest_column]
+        nearest_line = line if fraction_v < half else next_line
+        nearest_column = column if fraction_u < half else next_column
+        visible[x] = inside and usable[nearest_line, nearest_column]
 
 
 @compiled(f"void({_ROW}, {_ROW}, {_ROW}, {_ROW})")
@@ -80,20 +80,20 @@ def _add_powers(
 
 
 @compiled(f"void({_ROW}, {_ROW}, {_ROW})")
-def _add(total: NDArray[np.float32], one: NDArray[np.float32], other: NDArray[np.float32]) -> None:
+def _add(total: NDArray[np.float32], a: NDArray[np.float32], b: NDArray[np.float32]) -> None:
     for x in range(len(total)):
-        total[x] += one[x] * other[x]
+        total[x] += a[x] * b[x]
 
 
 @compiled(f"void({_ROW}, {_ROW})")
-def _increase(total: NDArray[np.float32], more: NDArray[np.float32]) -> None:
+def _increase(total: NDArray[np.float32], values: NDArray[np.float32]) -> None:
     for x in range(len(total)):
-        total[x] += more[x]
+        total[x] += values[x]
 
 
 @compiled(f"void({_ROW}, {_ROW}, {_ROW}, {_ROW}, {_ROW}, boolean[::1], float32)")
 def _correlate(
-    found: NDArray[np.float32],
+    scores: NDArray[np.float32],
     mean: NDArray[np.float32],
     square: NDArray[np.float32],
     product: NDArray[np.float32],
@@ -102,18 +102,18 @@ def _correlate(
     floor: float,
 ) -> None:
     zero = np.float32(0)
-    for x in range(len(found)):
+    for x in range(len(scores)):
         spread = max(square[x] - mean[x] * mean[x], zero)
-        likeness = product[x] / np.sqrt((spread + floor) * (power[x] + floor))
-        found[x] = likeness if valid_row[x] else zero
+        correlation = product[x] / np.sqrt((spread + floor) * (power[x] + floor))
+        scores[x] = correlation if valid_row[x] else zero
 
 
 @compiled(f"void({_ROW}, {_ROW})")
 def _swap(above: NDArray[np.float32], below: NDArray[np.float32]) -> None:
-    """Sort each pair, the larger value first."""
+    """Sort each pair of values, the larger one into ``above``."""
     for x in range(len(above)):
-        one, other = above[x], below[x]
-        above[x], below[x] = max(one, other), min(one, other)
+        first, second = above[x], below[x]
+        above[x], below[x] = max(first, second), min(first, second)
 
 
 @compiled(
@@ -136,34 +136,33 @@ def window_scores(
     best: int,
     scores: NDArray[np.float32],
 ) -> None:
-    """Score every pixel for the field plus each offset.
+    """Compute the score of every pixel for the field plus each offset.
 
-    Rows are processed band by band, so that a band's weights stay in the cache for all offsets
-    and sources.
+    Rows are processed in bands: a band's weights stay in the cache for all offsets and sources.
 
     Args:
         field: Inverse depths; the sum with an offset is clamped to the smallest positive float.
-        ray: See :class:`~pimper_torch.method.coarse.window_matching.Pairing`, as for ``shift``.
-        tone: Of the sources, as ``usable``.
-        weight: Of the pixels of every window, ``entry height width``; adds up to 1.
-        deviation: That weight times the tone's difference to the window's mean.
+        ray: See :class:`~pimper_torch.method.coarse.window_matching.Pairing`, also for ``shift``.
+        tone: Of the sources, like ``usable``.
+        weight: Of the pixels of every window, ``entry height width``; sums to 1.
+        deviation: This weight times the tone's difference from the window's mean.
         power: Variance of the tone in every window.
-        valid: Of the reference view; elsewhere the score is 0.
+        valid: Valid pixels of the reference view; the score of others is 0.
         floor: Added to variances: regularization of windows without texture.
-        best: The score is the mean of so many largest correlations.
+        best: The score is the mean of this number of largest correlations.
     """
     num_sources, height, width = tone.shape
     num_entries = weight.shape[0]
     side = int(math.sqrt(num_entries) + 0.5)
     radius = side // 2
     best = min(best, num_sources)
-    # Weights that are read again for every hypothesis fit a core's cache, 768 kB.
+    # The weights of a band, read for every hypothesis, fit a core's cache: 768 kB.
     band = max(8, (3 << 18) // (8 * num_entries * width))
-    seen = np.zeros((num_sources, band + 2 * radius, width + 2 * radius), dtype=np.float32)
-    there = np.zeros((num_sources, band + 2 * radius, width), dtype=np.bool_)
+    sampled = np.zeros((num_sources, band + 2 * radius, width + 2 * radius), dtype=np.float32)
+    visible = np.zeros((num_sources, band + 2 * radius, width), dtype=np.bool_)
     across, down = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     sums = np.empty((3, width), dtype=np.float32)
-    found = np.empty((num_sources, width), dtype=np.float32)
+    correlations = np.empty((num_sources, width), dtype=np.float32)
     # Range of columns with valid pixels in each row.
     first, last = np.full(height, width), np.zeros(height, dtype=np.int64)
     for y in range(height):
@@ -185,11 +184,11 @@ def window_scores(
                     offset, along = offsets[index], shift[s, 2]
                     _project(u, moved, ray[s, 0, y, low:high], depth, offset, shift[s, 0], along)
                     _project(v, moved, ray[s, 1, y, low:high], depth, offset, shift[s, 1], along)
-                    values = seen[s, row, low + radius : high + radius]
-                    wanted = valid[y, low:high]
-                    _look_up(values, there[s, row, low:high], u, v, wanted, tone[s], usable[s])
-                    seen[s, row, :radius] = seen[s, row, radius]
-                    seen[s, row, width + radius :] = seen[s, row, width + radius - 1]
+                    values = sampled[s, row, low + radius : high + radius]
+                    needed = valid[y, low:high]
+                    _look_up(values, visible[s, row, low:high], u, v, needed, tone[s], usable[s])
+                    sampled[s, row, :radius] = sampled[s, row, radius]
+                    sampled[s, row, width + radius :] = sampled[s, row, width + radius - 1]
             for y in range(top, end):
                 low, high = first[y], last[y]
                 if low >= high:
@@ -199,16 +198,16 @@ def window_scores(
                     sums[:] = 0
                     for entry in range(num_entries):
                         column = low + entry % side
-                        values = seen[s, y - top + entry // side, column : column + high - low]
+                        values = sampled[s, y - top + entry // side, column : column + high - low]
                         _add_powers(mean, square, weight[entry, y, low:high], values)
                         _add(product, deviation[entry, y, low:high], values)
-                    valid_row = there[s, y - top + radius, low:high]
-                    likeness, varied = found[s, low:high], power[y, low:high]
-                    _correlate(likeness, mean, square, product, varied, valid_row, floor)
+                    valid_row = visible[s, y - top + radius, low:high]
+                    row_scores, varied = correlations[s, low:high], power[y, low:high]
+                    _correlate(row_scores, mean, square, product, varied, valid_row, floor)
                 for rank in range(best):
                     for s in range(num_sources - 1, rank, -1):
-                        _swap(found[s - 1, low:high], found[s, low:high])
-                    _increase(scores[index, y, low:high], found[rank, low:high])
+                        _swap(correlations[s - 1, low:high], correlations[s, low:high])
+                    _increase(scores[index, y, low:high], correlations[rank, low:high])
                 for x in range(low, high):
                     mean_of_best = scores[index, y, x] / np.float32(best)
                     scores[index, y, x] = mean_of_best if valid[y, x] else np.float32(0)

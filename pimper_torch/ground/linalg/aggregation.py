@@ -34,12 +34,10 @@ _STRONG = 0.25
 # own prior: smoothing alone solves for it. A choice.
 _COUPLED = 0.05
 
-# Of the averaging step that smooths the aggregates' edges; 2/3 damps the highest frequencies
-# of an M-matrix best.
+# Of the step that smooths the aggregates' edges; 2/3 damps an M-matrix's highest frequencies best.
 _DAMPING = 2 / 3
 
-# Roots are chosen in blocks of this many unknowns, in random order within each: a choice, for which
-# a block and its neighbours fit the cache.
+# Roots are chosen in random order within blocks of this size, which fit the cache: a choice.
 _BLOCK = 4096
 
 

@@ -30,8 +30,8 @@ def continued(
         values: Of the vertices; ignored where unknown.
         edges: Between neighbours, each once.
         otherwise: Prior mean of unknown values, reached far from known ones.
-        damping: Weight of the prior mean, 1 being that of a neighbour; above 0 except in connected
-            components with a known vertex.
+        damping: Weight of the prior mean relative to a neighbour; above 0, or 0 in components with
+            a known vertex.
 
     Differentiable in the known values, and in ``otherwise`` and ``damping`` of the unknown ones.
 

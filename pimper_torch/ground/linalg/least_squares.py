@@ -53,8 +53,7 @@ def compressed_equations(
     They need no memory except that of the matrix.
 
     Args:
-        kinds: Unknowns, coefficients, targets and weights of each set, as in
-            :func:`normal_equations`.
+        kinds: Unknowns, coefficients, targets, weights of each set; see :func:`normal_equations`.
         damping: Weight of each unknown's prior; above 0.
         start: Prior mean of each unknown.
 

@@ -63,8 +63,7 @@ class Multigrid(PreparedMatrix):
 
     For millions of unknowns: memory and time are linear in the unknowns, unlike those of
     :class:`~pimper_torch.ground.linalg.sparse.SparseCholesky`. For matrices with mostly negative
-    off-diagonal entries, such as graph Laplacians. Cycles run on the CPU for any device of the
-    right-hand side.
+    off-diagonal entries, such as graph Laplacians. Cycles run on the CPU.
 
     >>> index = torch.tensor([0, 1])
     >>> grid = Multigrid(index, index, torch.tensor([2.0, 4.0]), size=2)

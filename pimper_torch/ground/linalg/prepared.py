@@ -53,8 +53,7 @@ class PreparedMatrix(ABC):
         tolerance: Maximum relative error in the energy norm; ignored by a Cholesky factor.
 
     Raises:
-        SingularSystemError: Entries that are not finite, or an unknown without a positive
-            diagonal.
+        SingularSystemError: Entries that are not finite, or a diagonal that is not positive.
     """
 
     def __init__(
@@ -87,8 +86,7 @@ class PreparedMatrix(ABC):
         independent; through a symmetric assembly it is exact.
 
         Raises:
-            SingularSystemError: The residual exceeds 1e-6 of the right-hand side, or the
-                right-hand side is not finite.
+            SingularSystemError: Residual above 1e-6 of the right-hand side, or that is not finite.
         """
         solution: Tensor = _Solve.apply(self, self._values, rhs)  # type: ignore[no-untyped-call]
         return solution

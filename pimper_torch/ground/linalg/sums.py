@@ -1,7 +1,6 @@
 """Sums that do not depend on the number of threads.
 
-Torch splits a long sum between threads, so the order of additions, and with it the last bits,
-depend on their number.
+Torch splits long sums between threads: their number changes the order of additions and last bits.
 """
 
 from jaxtyping import Float, Int, Shaped

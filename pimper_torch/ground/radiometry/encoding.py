@@ -55,8 +55,7 @@ class Encoding:
             )
 
 
-# As declared by files; as most cameras and programs write; proportional to radiance up to full
-# scale.
+# Declared by files; of most cameras and programs; proportional to radiance up to full scale.
 FROM_FILES = Encoding()
 SRGB = Encoding(response="srgb")
 LINEAR = Encoding(response="linear", saturation=1.0)

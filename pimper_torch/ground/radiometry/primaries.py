@@ -59,8 +59,7 @@ def srgb_from_primaries(primaries_xyz: Matrix3) -> Matrix3 | None:
 def primaries_of(chromaticities: Chromaticities) -> Matrix3 | None:
     """Return primaries in XYZ adapted to D50 from x and y of red, green, blue and white.
 
-    Adapted by Bradford's cone responses. ``None`` if they are linearly dependent or a y is not
-    positive.
+    Adapted by Bradford's cone responses. ``None`` if they are dependent or a y is not positive.
     """
     xy = torch.tensor(chromaticities, dtype=torch.float64)
     if not bool((xy[:, 1] > 0).all()):

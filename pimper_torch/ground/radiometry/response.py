@@ -34,8 +34,7 @@ def to_bytes(radiance: Scalars) -> UInt8[Tensor, "*batch"]:
     return (255 * srgb_from_linear(radiance)).round().to(torch.uint8)
 
 
-# Linear interpolation of a power of 2.2 between this many entries is off by up to 0.13 % of full
-# scale, half a level of 255.
+# Interpolating a power of 2.2 from this many entries is off by 0.13 %, half a level of 255.
 MIN_ENTRIES = 17
 _FULL_SCALE = {8: 255, 16: 65535}
 
@@ -96,13 +95,11 @@ class Gamma:
 class Curve:
     """A measured inverse response: a table of levels and their radiance.
 
-    Interpolated linearly, so the inverse is exact. Values above the last level have its radiance,
-    which is 1.
+    Interpolated linearly, so the inverse is exact. Values above the last level have radiance 1.
 
     Attributes:
         encoded: Levels as fractions of the file's full scale, increasing from 0.
-        radiance: Of these levels, increasing, 1 at the last; one row, or one each for red, green
-            and blue.
+        radiance: Of these levels, increasing to 1; one row, or one each for red, green and blue.
         bits: Bit depth of the files that the curve was measured on; ``None`` for any.
     """
 
@@ -114,8 +111,7 @@ class Curve:
         """Interpolate the curve; differentiable except at its entries.
 
         Args:
-            encoded: In [0, 1]. For a curve with a row per colour, colours are the third axis from
-                the end.
+            encoded: In [0, 1]; colours are the third axis from the end if each has a row.
         """
         return self._interpolate(encoded, inverse=False)
 
@@ -156,8 +152,8 @@ def curve_from_table(levels: PerEntry, radiance: Float[Tensor, "channel entry"])
             is scaled to 1 at the last level.
 
     Raises:
-        InputError: Too few entries, entries that are not finite, not increasing or do not begin at
-            0, or an impossible last level.
+        InputError: Too few entries, or they are not finite, not increasing, or not from 0 to 1, 255
+            or a level of 16 bits.
     """
     levels, radiance = levels.double(), radiance.double()
     if len(levels) < MIN_ENTRIES:
