@@ -40,8 +40,8 @@ _BORDER_PX = 3.0  # minimum distance of rays from the photograph's border
 _MIN_LENGTH_PX = 24.0  # shorter silhouettes are specks
 _CORNER_PX = 6  # a corner is a turn of the tangent between this far behind and this far ahead
 _MAX_CONVEX_DEG = 90.0  # maximum turn where the silhouette bends around the object
-# Maximum turn where it bends into the object: a silhouette has a concave corner, without a normal,
-# where one part of the surface occludes another.
+# Maximum turn where it bends into the object: the silhouette has a concave corner, without a
+# normal, at an occlusion of the surface by itself.
 _MAX_CONCAVE_DEG = 40.0
 
 

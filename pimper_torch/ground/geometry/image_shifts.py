@@ -8,7 +8,7 @@ from pimper_torch.ground.shapes import Map
 
 
 def shift_between(texture: Map, other: Map) -> tuple[Float[Tensor, "2"], Float[Tensor, ""]]:
-    """Estimate the integer shift in pixels from one texture to another.
+    """Estimate the integer shift in pixels between two textures.
 
     Args:
         texture: Mean zero, 0 where unknown; the same holds for ``other``.

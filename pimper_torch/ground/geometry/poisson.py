@@ -38,7 +38,7 @@ def poisson_surface(
         point_weight: Weight of the points relative to the smoothness.
 
     Returns:
-        Vertices and faces, counter-clockwise from outside; no faces if there is no surface. It is
+        Vertices and faces, counter-clockwise from outside; without a surface, no faces. It is
         closed even where there are no points: the caller removes parts without support.
 
     Raises:

@@ -203,7 +203,7 @@ def _assemble(vertices: Corners, facets: Facets, cuts: _Cuts, spacing: PerFacet)
 def _fanned(
     faces: Faces, facet: Int[Tensor, " face"], cuts: _Cuts
 ) -> tuple[Int[Tensor, "piece 3"], Int[Tensor, " piece"]]:
-    """Cut faces along finely cut edges into fans, one edge of their facet after another."""
+    """Cut faces along finely cut edges into fans, edge by edge of their facet."""
     for slot in range(3):
         edge = cuts.edge[facet, slot]
         cut = cuts.cut(edge[:, None].expand_as(faces), faces)

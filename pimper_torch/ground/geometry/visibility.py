@@ -54,7 +54,7 @@ class Hits(Record):
     ) -> "Hits":
         """Recompute the intersections with the same faces, in the dtype of the rays.
 
-        Differentiable in vertices, origins and directions. Rays in the plane of a face keep theirs.
+        Differentiable in vertices, origins and directions. Rays in a face's plane are not changed.
         """
         hit = self.face >= 0
         a, b, c = vertices[faces[self.face.clamp_min(0)]].unbind(dim=-2)

@@ -115,7 +115,7 @@ class UnboundedHull(Hull):
         return torch.full_like(points_world[..., 0], torch.inf)
 
     def holds(self, points_world: Vectors, tolerance: float = 0.0) -> Bool[Tensor, "*batch"]:
-        """Return whether points are above all planes; there is no tolerance for planes."""
+        """Return whether points are above all planes; the tolerance does not apply to planes."""
         heights = points_world @ self.normals_world.to(points_world).mT
         return (heights > self.offsets.to(points_world)).all(dim=-1)
 

@@ -25,7 +25,7 @@ _BRADFORD = torch.tensor(
 )
 _D50 = torch.tensor([0.9642, 1.0, 0.8249], dtype=torch.float64)
 # Choices: maximum deviation of the rows' sums from 1, for primaries with a profile's rounded white;
-# minimum weight at which a saturated colour saturates another one, and minimum determinant.
+# minimum weight at which a saturated colour saturates others, and minimum determinant.
 _MAX_OFF_WHITE, _MIXED = 0.1, 0.01
 # x and y of red, green, blue and white.
 Chromaticities = Sequence[tuple[float, float]]
