@@ -1,7 +1,5 @@
 """OpenCV operations on masks and photographs."""
 
-import math
-
 import cv2
 import numpy as np
 import torch
@@ -59,8 +57,8 @@ def warped(
     """
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centres
     matrix = np.linalg.inv(half) @ homography.double().numpy() @ half
-    flags, pixels = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, picture.numpy()
-    result = cv2.warpPerspective(pixels, matrix, size_px, flags=flags, borderValue=math.nan)
+    flags, pixels, nan = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, picture.numpy(), float("nan")
+    result = cv2.warpPerspective(pixels, matrix, size_px, flags=flags, borderValue=nan)
     return torch.from_numpy(result)
 
 
