@@ -175,7 +175,7 @@ def forget_casters() -> None:
 
 
 def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
-    """Cast a ray through every pixel of a view.
+    """Cast a ray through every pixel of a view; the caster of a mesh is cached.
 
     Returns:
         Hits of shape ``height width``; ``distance`` is depth along the camera's z.

@@ -18,6 +18,7 @@ def welded(vertices: Vertices, faces: Faces) -> tuple[Float[Tensor, "kept 3"], F
 
     Returns:
         The first vertex at each position, in order, and all faces, which may now repeat a vertex.
+        A mesh without duplicates is unchanged.
 
     >>> corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     >>> welded(corners, torch.tensor([[0, 1, 2], [3, 4, 5]]))[1]
