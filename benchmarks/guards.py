@@ -41,7 +41,7 @@ from pimper_torch.doors.io.photographs import load_views
 from pimper_torch.ground.geometry.nearest import NearestSurface
 from pimper_torch.ground.geometry.rigid import transform
 from pimper_torch.method.chains.presets import load_chain
-from pimper_torch.records import Estimate, LeftOut, Reconstruction
+from pimper_torch.records import Estimate, Reconstruction, Removal
 from pimper_torch.runtime.errors import PimperError
 from pimper_torch.runtime.ledger import GUARDS, listening
 
@@ -99,9 +99,9 @@ CHANGES: dict[str, dict[str, object]] = {
 class Heard:
     """A listener of the ledger: entries, positions of removed elements, and masks of pixels."""
 
-    entries: list[tuple[LeftOut, Tensor | None, Tensor | None]] = field(default_factory=list)
+    entries: list[tuple[Removal, Tensor | None, Tensor | None]] = field(default_factory=list)
 
-    def __call__(self, entry: LeftOut, mask: Tensor | None, places: Tensor | None) -> None:
+    def __call__(self, entry: Removal, mask: Tensor | None, places: Tensor | None) -> None:
         """Keep an entry with a sample of its positions."""
         if mask is not None and places is not None and entry.count:
             taken = places.detach()[mask.flatten()]
@@ -122,7 +122,7 @@ class Judge:
     near: float = 0.0
     shown: Tensor | None = None
 
-    def right(self, entry: LeftOut, places: Tensor | None, pixels: Tensor | None) -> float | None:
+    def right(self, entry: Removal, places: Tensor | None, pixels: Tensor | None) -> float | None:
         """Return the fraction of removed elements that were valid; ``None`` if it is unknown."""
         if entry.what == "photographs" and entry.names:
             return sum(name not in self.spoilt for name in entry.names) / len(entry.names)

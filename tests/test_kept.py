@@ -8,7 +8,7 @@ import pimper_torch as pt
 from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.records import Mesh, Surface
 from pimper_torch.runtime.errors import PimperWarning, caution
-from pimper_torch.runtime.reporting import Silent
+from pimper_torch.runtime.reporting import SilentObserver
 from pimper_torch.runtime.stage import Given
 from pimper_torch.runtime.store import digest
 
@@ -19,7 +19,7 @@ STAGES = ["silhouettes", "light", "depth_from_light", "photometry", "fuse", "rem
 STAGES += ["light", "photometry", "fuse", "extract"]
 
 
-class Listener(Silent):
+class Listener(SilentObserver):
     def __init__(self) -> None:
         self.reports = []
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import pimper_torch
-from pimper_torch.records import Failure, LeftOut
+from pimper_torch.records import Failure, Removal
 from pimper_torch.runtime.failures import collecting, distinct, skipped
 from pimper_torch.runtime.journal import noted
 from pimper_torch.runtime.ledger import GUARDS, closing_line, leave_out, left_out_of, listening
@@ -18,7 +18,7 @@ FAILED = Failure(stage="warp", what="patch", name="3", reason="numbers", done="L
 
 def entry(guard, count, total, names=()):
     what, reason = GUARDS[guard]
-    return LeftOut(guard=guard, what=what, count=count, total=total, reason=reason, names=names)
+    return Removal(guard=guard, what=what, count=count, total=total, reason=reason, names=names)
 
 
 def test_a_mask_is_counted_and_names_are_those_of_its_photographs():

@@ -6,6 +6,7 @@ from probes import small_scene
 
 import pimper_torch as pt
 from pimper_torch.method.photometry import Bilinear, Cone
+from pimper_torch.single_view import factorization
 
 
 @pytest.mark.parametrize(
@@ -15,6 +16,11 @@ from pimper_torch.method.photometry import Bilinear, Cone
 def test_former_names_of_the_package_work_with_a_warning(old, new):
     with pytest.warns(DeprecationWarning, match=f"`pimper_torch.{old}` is now `{new}`"):
         assert getattr(pt, old) is getattr(pt, new)
+
+
+def test_a_former_manifold_is_found_with_a_warning():
+    with pytest.warns(DeprecationWarning, match="`Free` is now `FreeManifold`"):
+        assert factorization.Free is factorization.FreeManifold
 
 
 def test_a_former_name_of_a_record_works_with_a_warning():

@@ -11,7 +11,7 @@ from pimper_torch.runtime import journal, reporting
 from pimper_torch.runtime.journal import aside, current
 from pimper_torch.runtime.progress import report
 from pimper_torch.runtime.reporting import (
-    Silent,
+    SilentObserver,
     accounted,
     called,
     figures,
@@ -32,7 +32,7 @@ def broken() -> Mesh:
     raise ValueError("broken on purpose")
 
 
-class Listener(Silent):
+class Listener(SilentObserver):
     def __init__(self) -> None:
         self.heard: list[str] = []
 
@@ -103,11 +103,11 @@ def test_times_of_stages_sum_to_the_time_of_the_call(monkeypatch):
     for module in (journal, reporting):
         monkeypatch.setattr(module, "time", clock)
     kept = StageReport(name="kept", seconds=1e6, peak_memory_mb=0.0, figures={}, kept=True)
-    with recorded(Silent()) as reports:
+    with recorded(SilentObserver()) as reports:
         with stage("read"), aside("keep"):  # counts as time of the stage
             clock.sleep(1)
         for _ in range(2):
-            with recorded(Silent()):
+            with recorded(SilentObserver()):
                 with aside("keep"):
                     clock.sleep(2)
                 called("first", tetrahedron)

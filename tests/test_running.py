@@ -3,7 +3,7 @@
 import pytest
 from torch import nn
 
-from pimper_torch.method.chains.running import Running
+from pimper_torch.method.chains.running import ChainRun
 from pimper_torch.runtime.errors import PimperWarning, caution
 
 
@@ -26,7 +26,7 @@ def stages():
 
 
 def running(stages):
-    return Running(names={one: name for name, one in stages.items()}, store=None)
+    return ChainRun(names={one: name for name, one in stages.items()}, store=None)
 
 
 def test_only_the_last_pass_warns_unless_one_fails(stages):

@@ -16,7 +16,7 @@ from pimper_torch.method.photometry.fit_light import FitLight
 from pimper_torch.method.photometry.lights import thinned
 from pimper_torch.method.sweep.sweep import Sweep
 from pimper_torch.records import Silhouettes, SparseScene, StageReport
-from pimper_torch.runtime.reporting import Silent
+from pimper_torch.runtime.reporting import SilentObserver
 from pimper_torch.runtime.stage import Given
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
@@ -57,7 +57,7 @@ def test_streamed_buckets_give_the_result_of_all_patches(given):
         assert_close(one, other, rtol=0, atol=0 if other.dtype == torch.bool else 1e-4 * size)
 
 
-class Listener(Silent):
+class Listener(SilentObserver):
     def __init__(self) -> None:
         self.heard: list[str] = []
         self.reports: list[StageReport] = []
@@ -82,7 +82,7 @@ def in_iterations(listener, **changes):
 
 
 def test_steps_have_the_records_of_every_pass_and_end_with_the_result():
-    chain, scene = in_iterations(Silent())
+    chain, scene = in_iterations(SilentObserver())
     shown = []
     chain.preview = lambda _, coarse: shown.append(coarse)
     steps = list(chain.steps(scene.views))
@@ -102,7 +102,7 @@ def test_steps_have_the_records_of_every_pass_and_end_with_the_result():
 
 
 def test_an_observer_receives_cameras_and_every_pass_and_changes_nothing():
-    chain, scene = in_iterations(Silent())
+    chain, scene = in_iterations(SilentObserver())
     expected = chain(scene.views)
     seen = []
     chain.watch = seen.append

@@ -103,10 +103,10 @@ class Output:
 
         from pimper_torch.cli.bars import Bars, Events
         from pimper_torch.cli.doctor.forecast import Forecast
-        from pimper_torch.runtime.reporting import Silent, recorded
+        from pimper_torch.runtime.reporting import SilentObserver, recorded
 
         forecast = forecast or Forecast()
-        display: AbstractContextManager[Observer] = nullcontext(Silent())
+        display: AbstractContextManager[Observer] = nullcontext(SilentObserver())
         if self.as_json:
             display = nullcontext(Events(self.event, 0.5, forecast))
         elif self.shows("info"):

@@ -201,7 +201,7 @@ def in_files(job: Job, views: Views, mark: given.Mark) -> given.Mark:
     """
     paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
-    def sized_pointer(pointer: given.Pointer) -> given.Pointer:
+    def sized_pointer(pointer: given.PixelMark) -> given.PixelMark:
         header = read_header(paths[views.names[given.number_of(pointer.name, views.names)]])
         given.require_inside(pointer, header.width, header.height)
         return replace(pointer, size_px=(header.width, header.height))

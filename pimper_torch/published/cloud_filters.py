@@ -13,7 +13,7 @@ from pimper_torch.ground.geometry.surfaces import barycentric_2d
 from pimper_torch.ground.shapes import Faces, Pixels, PointMask, Points
 
 PerPoint = Float[Tensor, " point"]
-Nearest = Int[Tensor, "point neighbour"]
+NearestPoints = Int[Tensor, "point neighbour"]
 
 
 def occluded_points(pixels: Pixels, points_cam: Points, observed: PointMask) -> PointMask:
@@ -125,12 +125,12 @@ def spread_to_count(pixels: Pixels, quality: PerPoint, target: int) -> Int[Tenso
     return chosen
 
 
-def _steepness(points_cam: Points, nearest: Nearest) -> Float[Tensor, "point neighbour"]:
+def _steepness(points_cam: Points, nearest: NearestPoints) -> Float[Tensor, "point neighbour"]:
     steps = points_cam[nearest] - points_cam[:, None]
     return steps[..., 2].abs() / steps[..., :2].norm(dim=-1).clamp_min(1e-12)
 
 
-def _deviation(points_cam: Points, nearest: Nearest) -> PerPoint:
+def _deviation(points_cam: Points, nearest: NearestPoints) -> PerPoint:
     """Return the distance to the neighbours' robust plane, in radii of the neighbourhood."""
     steps = (points_cam[nearest] - points_cam[:, None]).double()
     radius = steps[..., :2].norm(dim=-1).median(dim=1).values.clamp_min(1e-12)

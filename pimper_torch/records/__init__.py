@@ -1,10 +1,10 @@
 """Frozen data that travels between stages; no algorithms."""
 
-from pimper_torch.records.finished import Closed as Closed
-from pimper_torch.records.finished import Finished as Finished
+from pimper_torch.records.finished import ClosedMesh as ClosedMesh
+from pimper_torch.records.finished import FinishedMesh as FinishedMesh
 from pimper_torch.records.finished import Materials as Materials
 from pimper_torch.records.finished import Relighting as Relighting
-from pimper_torch.records.finished import Textured as Textured
+from pimper_torch.records.finished import TexturedMesh as TexturedMesh
 from pimper_torch.records.finished import ViewErrors as ViewErrors
 from pimper_torch.records.finished import ViewLights as ViewLights
 from pimper_torch.records.patches import AlignStatus as AlignStatus
@@ -33,8 +33,8 @@ from pimper_torch.records.priors import Prior as Prior
 from pimper_torch.records.priors import SilhouettePrior as SilhouettePrior
 from pimper_torch.records.reconstruction import Estimate as Estimate
 from pimper_torch.records.reconstruction import Failure as Failure
-from pimper_torch.records.reconstruction import LeftOut as LeftOut
 from pimper_torch.records.reconstruction import Reconstruction as Reconstruction
+from pimper_torch.records.reconstruction import Removal as Removal
 from pimper_torch.records.reconstruction import StageReport as StageReport
 from pimper_torch.records.record import Record as Record
 from pimper_torch.records.scene import CameraModel as CameraModel
@@ -55,4 +55,4 @@ from pimper_torch.records.views import Cameras as Cameras
 from pimper_torch.records.views import Views as Views
 from pimper_torch.runtime.renamed import renamed_names
 
-__getattr__ = renamed_names(__name__, {"Lens": "CameraModel"})
+__getattr__ = renamed_names(__name__, {"LeftOut": "Removal", "Lens": "CameraModel"})

@@ -12,7 +12,7 @@ from pimper_torch.records.scene import Mesh
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Closed(Record):
+class ClosedMesh(Record):
     """A mesh with capped borders.
 
     Attributes:
@@ -27,7 +27,7 @@ class Closed(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Finished(Record):
+class FinishedMesh(Record):
     """A surface as written to files.
 
     Attributes:
@@ -41,7 +41,7 @@ class Finished(Record):
 
     mesh: Mesh
     few: Mesh
-    closed: Closed | None
+    closed: ClosedMesh | None
     how: str
     counts: dict[str, int | float]
     caps: dict[str, int | float]
@@ -129,7 +129,7 @@ class Relighting(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Textured(Record):
+class TexturedMesh(Record):
     """A mesh with textures, as glTF requires.
 
     Attributes:

@@ -6,7 +6,7 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.records.finished import Finished, Relighting, Textured
+from pimper_torch.records.finished import FinishedMesh, Relighting, TexturedMesh
 from pimper_torch.records.patches import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
@@ -36,7 +36,7 @@ class Failure(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LeftOut(Record):
+class Removal(Record):
     """Items that a guard removed or reported; see :mod:`pimper_torch.runtime.ledger`.
 
     Attributes:
@@ -93,11 +93,11 @@ class Reconstruction(Record):
     report: tuple[StageReport, ...]
     silhouettes: Silhouettes
     failures: tuple[Failure, ...] = ()
-    left_out: tuple[LeftOut, ...] = ()
+    left_out: tuple[Removal, ...] = ()
     held_out: SparseScene | None = None
-    finished: Finished | None = None
+    finished: FinishedMesh | None = None
     relighting: Relighting | None = None
-    asset: Textured | None = None
+    asset: TexturedMesh | None = None
 
     @property
     def cameras(self) -> Cameras:

@@ -13,7 +13,7 @@ from typing import TypeVar
 import torch
 from jaxtyping import Int
 
-from pimper_torch.records.reconstruction import Failure, LeftOut
+from pimper_torch.records.reconstruction import Failure, Removal
 from pimper_torch.runtime.errors import (
     NumericalError,
     OnFailure,
@@ -63,7 +63,7 @@ def collecting(
             ) from error
         raise
     for event in events[before:]:
-        if not isinstance(event, Failure | LeftOut):
+        if not isinstance(event, Failure | Removal):
             outer.note(event)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.ground.shapes import Faces, Vertices
-from pimper_torch.records.reconstruction import LeftOut, What
+from pimper_torch.records.reconstruction import Removal, What
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.journal import Journal, current, writing
 
@@ -71,7 +71,7 @@ GUARDS: dict[str, tuple[What, str]] = {
 """All guards, in the order of the chain: the removed elements, or a warning, and the reason."""
 
 Places = Float[Tensor, "place 3"] | tuple[Vertices, Faces]
-Listener = Callable[[LeftOut, Tensor | None, Tensor | None], None]
+Listener = Callable[[Removal, Tensor | None, Tensor | None], None]
 """Receives an entry, the mask of removed elements, and their positions in the world."""
 
 # Fraction up to which the closing message is silent; chosen by hand. Pixels are not listed, because
@@ -106,7 +106,7 @@ def leave_out(
         if names:
             names = [name for name, removed in zip(names, mask.tolist(), strict=True) if removed]
     what, reason = GUARDS[guard]
-    entry = LeftOut(
+    entry = Removal(
         guard=guard, what=what, count=int(taken), total=total, reason=reason, names=tuple(names)
     )
     if journal.collects:
@@ -129,23 +129,23 @@ def added_up() -> Iterator[None]:
     events = current().so_far()
     before = len(events)
     yield
-    sums: dict[tuple[str, str, str], LeftOut] = {}
+    sums: dict[tuple[str, str, str], Removal] = {}
     for entry in left_out_of(events[before:]):
         key = entry.guard, entry.what, entry.reason
         if key in sums:
             count, total = sums[key].count + entry.count, sums[key].total + entry.total
             entry = entry.replace(count=count, total=total, names=sums[key].names + entry.names)
         sums[key] = entry
-    others = [entry for entry in events[before:] if not isinstance(entry, LeftOut)]
+    others = [entry for entry in events[before:] if not isinstance(entry, Removal)]
     events[before:] = [*others, *(sums[key] for key in sorted(sums))]  # independent of threads
 
 
-def left_out_of(entries: Sequence[object]) -> tuple[LeftOut, ...]:
+def left_out_of(entries: Sequence[object]) -> tuple[Removal, ...]:
     """Return the entries of guards, in order."""
-    return tuple(entry for entry in entries if isinstance(entry, LeftOut))
+    return tuple(entry for entry in entries if isinstance(entry, Removal))
 
 
-def closing_line(left_out: Sequence[LeftOut]) -> str:
+def closing_line(left_out: Sequence[Removal]) -> str:
     """Return one line with the removed elements of each guard's last pass; empty if negligible.
 
     >>> cut = LeftOut(guard="extract.borders", what="faces", count=6, total=60, reason="narrow")

@@ -53,7 +53,7 @@ class Observer(Protocol):
         """Receive the report of a finished stage: its cost and figures."""
 
 
-class Silent:
+class SilentObserver:
     """Observer that ignores everything."""
 
     def _hear(self, *_: object, **__: object) -> None:

@@ -21,7 +21,7 @@ from pimper_torch.ground.geometry.pinholes import look_at
 from pimper_torch.ground.geometry.rigid import rotate, transform
 from pimper_torch.ground.geometry.visibility import RayCaster
 from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear
-from pimper_torch.records import Cameras, Mesh, Textured
+from pimper_torch.records import Cameras, Mesh, TexturedMesh
 from pimper_torch.result.asset import atlas as atlases
 from pimper_torch.result.asset.atlas import MAX_SIDE, by_triangles, unwrapped
 from pimper_torch.result.asset.bake import textured
@@ -62,7 +62,7 @@ def few() -> Mesh:
 
 
 @pytest.fixture(scope="module")
-def asset(full, few) -> Textured:
+def asset(full, few) -> TexturedMesh:
     return textured(full, few)
 
 
@@ -73,7 +73,7 @@ def sampled(picture, uv):
     return found[0, :, 0].T
 
 
-def seen(asset: Textured, count: int = 50_000):
+def seen(asset: TexturedMesh, count: int = 50_000):
     """Return points all over the asset, with normals and base colours as drawn by three.js."""
     random = torch.Generator().manual_seed(1)
     face = torch.randint(len(asset.mesh.faces), (count,), generator=random)
@@ -333,7 +333,9 @@ def test_the_mask_of_unreliable_albedo_is_a_texture_of_the_glb(full, few, asset,
         assert validated(tmp_path / f"{name}.glb") == []
     assert "extras" not in tree_of(tmp_path / "sure.glb")["materials"][0]
     tree = tree_of(tmp_path / "doubtful.glb")
-    source = tree["textures"][tree["materials"][0]["extras"]["albedo_doubt"]["index"]]["source"]
+    source = tree["textures"][tree["materials"][0]["extras"]["albedo_uncertainty"]["index"]][
+        "source"
+    ]
     view = tree["bufferViews"][tree["images"][source]["bufferView"]]
     raw = (tmp_path / "doubtful.glb").read_bytes()
     start = 28 + int.from_bytes(raw[12:16], "little") + view["byteOffset"]

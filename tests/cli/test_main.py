@@ -22,7 +22,7 @@ from pimper_torch.doors.io.version import installed_version
 from pimper_torch.doors.result_folder.marker import MARKER
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig, load_config
 from pimper_torch.method.silhouettes.find import FindSilhouettes
-from pimper_torch.records import LeftOut, Mesh, Silhouettes
+from pimper_torch.records import Mesh, Removal, Silhouettes
 from pimper_torch.runtime.errors import PimperWarning, ReconstructionError
 
 
@@ -64,7 +64,7 @@ def test_a_run_writes_the_result_and_prints_its_path(reconstruct, chain, tmp_pat
 def test_a_run_ends_with_the_removals_of_guards(
     reconstruct, chain, reconstruction, tmp_path, capsys
 ):
-    gone = LeftOut(
+    gone = Removal(
         guard="sfm.missing", what="photographs", count=1, total=4, reason="none", names=("3.png",)
     )
     reduced = reconstruction.replace(left_out=(gone,))
@@ -72,7 +72,7 @@ def test_a_run_ends_with_the_removals_of_guards(
     assert reconstruct() == 0
     assert "Excluded: 3.png (sfm.missing)." in capsys.readouterr().out
     (written,) = json.loads((tmp_path / "out" / "summary.json").read_text())["left_out"]
-    assert LeftOut(**{**written, "names": tuple(written["names"])}) == gone
+    assert Removal(**{**written, "names": tuple(written["names"])}) == gone
 
 
 def test_options_override_the_preset(photos, chain, tmp_path):

@@ -16,7 +16,7 @@ from pimper_torch.ground.radiometry import Encoding, to_bytes
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
 from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.method.sfm.sparse_scene import assemble_scene
-from pimper_torch.records import CameraModel, LeftOut, Silhouettes
+from pimper_torch.records import CameraModel, Removal, Silhouettes
 
 ENCODING = Encoding(response="linear")
 
@@ -57,7 +57,7 @@ def run(reconstruction, photographs):
         reliable=torch.tensor([True, False, True]),
         source="found",
     )
-    doubted = LeftOut(
+    doubted = Removal(
         guard="silhouettes.unreliable",
         what="photographs",
         count=1,

@@ -9,7 +9,7 @@ from pimper_torch.ground.geometry.topology import face_edges
 from pimper_torch.method.fusion.equations import Equations
 from pimper_torch.method.fusion.estimate import fuse_terms
 from pimper_torch.method.fusion.expected_error import expected_error, regions
-from pimper_torch.method.fusion.normal_bias import CoarsePart
+from pimper_torch.method.fusion.normal_bias import PiecewiseLinearFit
 
 # Standard errors from 300 draws are off by 4 %; the worst of all vertices, by three times that.
 DRAWS, CLOSE = 300, 0.13
@@ -129,7 +129,7 @@ def test_detail_and_coarse_shape_share_their_noise(square):
     coarse = solved(subdivision, tied, heights(subdivision, 0.1))
     found = expected_error(fine, coarse, subdivision, facets, DRAWS)
     eye = torch.eye(len(subdivision.points)).double()
-    low = torch.stack([CoarsePart(subdivision, facets)(one) for one in eye], dim=1)
+    low = torch.stack([PiecewiseLinearFit(subdivision, facets)(one) for one in eye], dim=1)
     (_, of_fine), (_, of_coarse) = dense(fine), dense(coarse)
     answer = of_fine + low @ (of_coarse - of_fine)
     # Noise is that of the coarse solve; edges of a region share part of it.

@@ -13,7 +13,7 @@ from pimper_torch.method.photometry.cone import Cone
 from pimper_torch.method.photometry.factor_gradients import differentiable
 from pimper_torch.method.photometry.quadratics import outer
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
-from pimper_torch.single_view.factorization.low_rank import Free
+from pimper_torch.single_view.factorization.low_rank import FreeManifold
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def noisy(generator):
 
         normals = normalize(draw(patches, samples, 3), dim=-1)
         albedo = 0.6 + 0.2 * draw(patches, samples).abs()
-        if isinstance(manifold, Free):
+        if isinstance(manifold, FreeManifold):
             shading = (albedo[..., None] * normals).mT
             prior = torch.tensor([1.0, 0, 0, 1, 0, 1]).double()[:, None] - outer(normals.mT)
         else:
@@ -52,7 +52,7 @@ def solved(problem):
     return solve_variable_projection(problem, 400, 1e-15, small_steps=4)
 
 
-@pytest.mark.parametrize("manifold", [Free(), Cone()])
+@pytest.mark.parametrize("manifold", [FreeManifold(), Cone()])
 def test_implicit_gradients_match_differences_of_the_solver(noisy, manifold, generator):
     problem = noisy(manifold)
     start = solved(problem)

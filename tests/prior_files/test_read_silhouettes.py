@@ -5,7 +5,7 @@ from PIL import Image
 
 from pimper_torch.cli.options import parse
 from pimper_torch.doors.io.decode import write_deep_png
-from pimper_torch.doors.scale.given import Mark, Pointer
+from pimper_torch.doors.scale.given import Mark, PixelMark
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import ConfigError, InputError
@@ -94,7 +94,7 @@ def test_masks_of_other_photographs_are_refused(views, tmp_path, name, values, m
 
 
 def test_clicks_are_read_as_foreground_seeds(views):
-    in_files = Mark(pointers=(Pointer(name="c", x=475.0, y=3.0, size_px=(480, 320)),))
+    in_files = Mark(pointers=(PixelMark(name="c", x=475.0, y=3.0, size_px=(480, 320)),))
     prior = object_at([Mark.read("a.jpg,10.5,20.5"), in_files, in_files], views)
     assert prior.names == ("a.jpg", "c.jpg")
     assert prior.sizes_px.tolist() == [[48, 32]] * 2

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pimper_torch.doors.scale.find_scale import scale_of_bars, scale_of_cameras
-from pimper_torch.doors.scale.given import CameraDistance, Mark, Pointer, ScaleBar
+from pimper_torch.doors.scale.given import CameraDistance, Mark, PixelMark, ScaleBar
 from pimper_torch.doors.scale.marks import place_of
 from pimper_torch.ground.geometry.lens_models import distort
 from pimper_torch.ground.geometry.rigid import transform
@@ -22,7 +22,7 @@ def pointer(result, view, point_world, digits=6):
     cameras = result.cameras.to(torch.float64)
     point_cam = transform(cameras.cam_from_world[view], point_world[None])
     x, y = distort(result.scene.lenses[view], point_cam)[0].tolist()
-    return Pointer(name=f"IMG_{view}", x=round(x, digits), y=round(y, digits))
+    return PixelMark(name=f"IMG_{view}", x=round(x, digits), y=round(y, digits))
 
 
 def mark(result, point_world, *views, digits=6):
@@ -66,9 +66,9 @@ def test_a_mark_at_the_contour_is_on_the_object_and_not_on_the_table(ball):
     # The contour: rays from the eye that touch the ball.
     touching = toward / eye.norm() + down * (1 - 1 / eye.norm() ** 2).sqrt()
     touched = pointer(ball, 2, touching)
-    beside = Mark(pointers=(Pointer(name="IMG_2", x=touched.x, y=touched.y + 1.0),))
+    beside = Mark(pointers=(PixelMark(name="IMG_2", x=touched.x, y=touched.y + 1.0),))
     assert float((place_of(beside, ball) - touching).norm()) < 0.05
-    far = Mark(pointers=(Pointer(name="IMG_2", x=touched.x, y=touched.y + 40.0),))
+    far = Mark(pointers=(PixelMark(name="IMG_2", x=touched.x, y=touched.y + 40.0),))
     assert float(place_of(far, ball)[1]) == pytest.approx(-1, abs=1e-5)  # on the table
 
 

@@ -47,7 +47,7 @@ WITHOUT = {
     "ViewLights": {"direction_world", "inverse_distance", "ambient", "directed"},  # a ratio
     "Materials": {"metallic", "roughness", "specular"},
     "ViewErrors": {"psnr_db"},
-    "Textured": {"normals", "uv", "tangent", "base_color", "normal", "reflectance"},
+    "TexturedMesh": {"normals", "uv", "tangent", "base_color", "normal", "reflectance"},
 }
 
 

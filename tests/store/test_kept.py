@@ -7,7 +7,7 @@ from pimper_torch.records import Cameras, Failure, StageReport
 from pimper_torch.runtime.errors import PimperWarning, caution
 from pimper_torch.runtime.failures import collecting, skipped
 from pimper_torch.runtime.ledger import leave_out
-from pimper_torch.runtime.reporting import Silent, called, recorded
+from pimper_torch.runtime.reporting import SilentObserver, called, recorded
 from pimper_torch.runtime.store import Store, digest, kept
 
 
@@ -33,7 +33,11 @@ def found(store):
         leave_out("silhouettes.empty", torch.tensor([True, False]), names=("a", "b"))
         return cameras()
 
-    with pytest.warns(PimperWarning, match="doubtful"), collecting() as events, recorded(Silent()):
+    with (
+        pytest.warns(PimperWarning, match="doubtful"),
+        collecting() as events,
+        recorded(SilentObserver()),
+    ):
         record, _ = kept(store, "key", Cameras, lambda: called("stage", make))
     told = [event for event in events if not isinstance(event, StageReport)]
     reports = [event.replace(kept=False) for event in events if event not in told]

@@ -19,7 +19,7 @@ from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.method.sfm.sparse_scene import write_model
-from pimper_torch.records import Reconstruction, Textured
+from pimper_torch.records import Reconstruction, TexturedMesh
 from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.asset.placement import Placement, standing
 from pimper_torch.result.asset.usd import write_usdz
@@ -157,7 +157,11 @@ def write_result(
 
 
 def _placement(
-    result: Reconstruction, asset: Textured, files: MeshFiles, name: str, about: Mapping[str, Any]
+    result: Reconstruction,
+    asset: TexturedMesh,
+    files: MeshFiles,
+    name: str,
+    about: Mapping[str, Any],
 ) -> Placement:
     """Return the place of an asset in its files; of known size if ``about`` names the unit."""
     cameras, unit = result.cameras, (about.get("scale") or {}).get("unit")

@@ -18,7 +18,7 @@ _POINTER = re.compile(rf"(?P<name>.+?),(?P<x>{_NUMBER}),(?P<y>{_NUMBER})(?:\+|$)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pointer:
+class PixelMark:
     """A pixel of a photograph that shows a place.
 
     Attributes:
@@ -46,7 +46,7 @@ class Mark:
         pointers: One alone shows a place on the surface; from two on, it may be anywhere.
     """
 
-    pointers: tuple[Pointer, ...]
+    pointers: tuple[PixelMark, ...]
 
     @classmethod
     def read(cls, text: str) -> "Mark":
@@ -59,7 +59,7 @@ class Mark:
         """
         found, at = [], 0
         while match := _POINTER.match(text, at):
-            found.append(Pointer(name=match["name"], x=float(match["x"]), y=float(match["y"])))
+            found.append(PixelMark(name=match["name"], x=float(match["x"]), y=float(match["y"])))
             at = match.end()
         if not found or at < len(text) or text.endswith("+"):
             raise InputError(
@@ -136,7 +136,7 @@ def number_of(name: str, names: Sequence[str]) -> int:
     return found[0]
 
 
-def require_inside(pointer: Pointer, width: int, height: int) -> None:
+def require_inside(pointer: PixelMark, width: int, height: int) -> None:
     """Refuse a pixel outside of its photograph."""
     if not (0 <= pointer.x <= width and 0 <= pointer.y <= height):
         raise InputError(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.doors.scale.given import Mark, Pointer, number_of, require_inside
+from pimper_torch.doors.scale.given import Mark, PixelMark, number_of, require_inside
 from pimper_torch.ground.geometry import supporting_plane
 from pimper_torch.ground.geometry.lens_models import undistort_pixels
 from pimper_torch.ground.geometry.projection import project
@@ -56,7 +56,7 @@ def place_of(mark: Mark, result: Reconstruction) -> Vector:
     return _met(mark.pointers[0], result, views[0], eyes[0], rays[0])
 
 
-def _ray(pointer: Pointer, view: int, scene: SparseScene) -> Vector:
+def _ray(pointer: PixelMark, view: int, scene: SparseScene) -> Vector:
     """Return the direction behind a pixel, as long as it goes while its depth grows by 1."""
     lens = scene.lenses[view]
     width, height = pointer.size_px or (lens.width, lens.height)
@@ -104,7 +104,7 @@ def _meeting(
     return point
 
 
-def _met(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: Vector) -> Vector:
+def _met(pointer: PixelMark, result: Reconstruction, view: int, eye: Vector, ray: Vector) -> Vector:
     """Find where a ray first meets the surface, else touches it, else meets the ground."""
     mesh = result.mesh.detach().to("cpu", torch.float64)
     hits = RayCaster(mesh.vertices_world, mesh.faces).cast(eye, ray[None])
@@ -145,7 +145,7 @@ def _met(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: 
 
 
 def _beside(
-    pointer: Pointer, result: Reconstruction, mesh: Mesh, view: int, eye: Vector, ray: Vector
+    pointer: PixelMark, result: Reconstruction, mesh: Mesh, view: int, eye: Vector, ray: Vector
 ) -> Vector | None:
     """Return the point of a ray next to the nearest vertex, if the surface is near the pixel."""
     cameras = result.cameras.detach().to("cpu", torch.float64)

@@ -19,7 +19,7 @@ from pimper_torch.runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Nearest(Record):
+class NearestPoints(Record):
     """Nearest points on a surface.
 
     Attributes:
@@ -61,7 +61,7 @@ class NearestSurface:
         self._scene.set_object_triangles(np.asfortranarray(self._faces.int().numpy()), 0)
         self._scene.build(fcpw.aggregate_type.bvh_surface_area, True)
 
-    def query(self, points: Points) -> Nearest:
+    def query(self, points: Points) -> NearestPoints:
         """Return the nearest point of the surface for every point."""
         queries = points.detach().cpu().double()
         if len(self._faces):
@@ -73,7 +73,7 @@ class NearestSurface:
         else:
             face = torch.from_numpy(np.asarray(self._tree.query(queries.numpy())[1])).long()
             nearest = self._vertices[face]
-        return Nearest(
+        return NearestPoints(
             distance=(queries - nearest).norm(dim=1).to(points),
             points=nearest.to(points),
             face=face.to(points.device),

@@ -10,7 +10,7 @@ from torch import nn
 
 from pimper_torch.ground.geometry.mesh_frame import refuse_other_axes
 from pimper_torch.ground.kernels.compile import compile_ahead
-from pimper_torch.method.chains.running import Running
+from pimper_torch.method.chains.running import ChainRun
 from pimper_torch.method.coarse.depth_points import depth_points
 from pimper_torch.method.coarse.given_mesh import prepared
 from pimper_torch.method.sfm.poses import with_poses
@@ -23,20 +23,20 @@ from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
     Failure,
-    Finished,
-    LeftOut,
+    FinishedMesh,
     Mesh,
     PatchSet,
     PhotometricPatches,
     Reconstruction,
     Record,
     Relighting,
+    Removal,
     Silhouettes,
     SparseScene,
     StageReport,
     Surface,
     SweptPatches,
-    Textured,
+    TexturedMesh,
     Views,
 )
 from pimper_torch.result.asset.bake import Texture
@@ -48,7 +48,7 @@ from pimper_torch.runtime.errors import ConfigError, InputError, OnFailure
 from pimper_torch.runtime.failures import collecting, distinct, warn_of
 from pimper_torch.runtime.file_names import view_named
 from pimper_torch.runtime.ledger import left_out_of
-from pimper_torch.runtime.reporting import Observer, Silent, gathered, recorded, stage
+from pimper_torch.runtime.reporting import Observer, SilentObserver, gathered, recorded, stage
 from pimper_torch.runtime.stage import Stage, check_handed
 from pimper_torch.runtime.store import Store
 
@@ -77,7 +77,7 @@ class Step(Record):
     surface: Surface
     reports: tuple[StageReport, ...] = ()
     failures: tuple[Failure, ...] = ()
-    left_out: tuple[LeftOut, ...] = ()
+    left_out: tuple[Removal, ...] = ()
     held_out: SparseScene | None = None
 
     @property
@@ -121,10 +121,10 @@ class Chain(Stage):
     ) -> None:
         super().__init__()
         self.on_failure: OnFailure = on_failure
-        self.observer = observer or Silent()
-        self.simplify: Callable[[Mesh, MeshFiles], Finished] = Simplify()
+        self.observer = observer or SilentObserver()
+        self.simplify: Callable[[Mesh, MeshFiles], FinishedMesh] = Simplify()
         self.relight: Callable[..., Relighting] = Relight()
-        self.texture: Callable[[Mesh, Mesh, Relighting], Textured] = Texture()
+        self.texture: Callable[[Mesh, Mesh, Relighting], TexturedMesh] = Texture()
         self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
         self.watch: Callable[[SparseScene | Step], None] | None = None
         self.needed: tuple[str, ...] = ()
@@ -133,17 +133,17 @@ class Chain(Stage):
     @abstractmethod
     def passes(
         self,
-        run: Running,
+        run: ChainRun,
         views: Views | SparseScene,
         sparse_model: Path | str | None,
         mesh: Mesh | None,
     ) -> Iterator[Step]:
         """Run the stages up to the surface; yield the records of each pass, without reports."""
 
-    def running(self) -> Running:
+    def running(self) -> ChainRun:
         """Return the caller of stages for one run."""
         names = {module: name for name, module in self.named_children()}
-        return Running(names=names, store=self.store)
+        return ChainRun(names=names, store=self.store)
 
     def references(self) -> Iterator[str]:
         """Yield the names of photographs that settings of stages select as reference view."""
@@ -154,7 +154,7 @@ class Chain(Stage):
 
     def placed(
         self,
-        run: Running,
+        run: ChainRun,
         views: Views | SparseScene,
         sparse_model: Path | str | None,
         mesh: Mesh | None = None,

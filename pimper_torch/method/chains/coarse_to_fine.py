@@ -11,8 +11,8 @@ from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.ground.geometry.pyramids import prepare
 from pimper_torch.method.chains.chain import Chain, Step
 from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.method.chains.photometric import Factorizing, Photometric, Sweeping, Warping
-from pimper_torch.method.chains.running import Running
+from pimper_torch.method.chains.photometric import Factorizing, Photometric, SweepStage, WarpStage
+from pimper_torch.method.chains.running import ChainRun
 from pimper_torch.method.coarse.remesh import Remesh
 from pimper_torch.method.coarse.surface import CoarseSurface
 from pimper_torch.method.fusion.fuse import Fuse
@@ -101,11 +101,11 @@ class CoarseToFine(Chain):
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
         self.coarse_surface: Callable[..., CoarseMesh] = CoarseSurface(config.coarse_surface)
         self.decompose = Decompose(config.decompose)
-        self.warp: Warping = Warp(config.warp)
+        self.warp: WarpStage = Warp(config.warp)
         self.light: Callable[[PatchViews], Illumination] = FitLight(config.light)
         self.depth_from_light: Callable[..., OrientedPoints] = DepthFromLight()
         self.factorize: Factorizing = Factorize(config.factorize)
-        self.sweep: Sweeping = Sweep(config.sweep)
+        self.sweep: SweepStage = Sweep(config.sweep)
         self.gauge: Callable[[PhotometricPatches], PhotometricPatches] = FixGauge(config.factorize)
         self.fuse: Callable[..., Surface] = Fuse(config.fuse)
         self.repair: Callable[[Surface], Surface] = Repair()
@@ -115,7 +115,7 @@ class CoarseToFine(Chain):
 
     def passes(
         self,
-        run: Running,
+        run: ChainRun,
         views: Views | SparseScene,
         sparse_model: Path | str | None,
         mesh: Mesh | None,

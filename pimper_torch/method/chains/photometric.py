@@ -24,7 +24,7 @@ Factorizing = Callable[[PatchViews, Illumination], PhotometricPatches]
 
 
 @runtime_checkable
-class Warping(Protocol):
+class WarpStage(Protocol):
     """A stage that resamples all views on templates."""
 
     def __call__(
@@ -34,7 +34,7 @@ class Warping(Protocol):
 
 
 @runtime_checkable
-class Sweeping(Protocol):
+class SweepStage(Protocol):
     """A stage that sweeps heights under the fitted light."""
 
     def __call__(
@@ -58,7 +58,7 @@ class Photometric(Stage):
 
     name = "photometry"
 
-    def __init__(self, warp: Warping, factorize: Factorizing, sweep: Sweeping) -> None:
+    def __init__(self, warp: WarpStage, factorize: Factorizing, sweep: SweepStage) -> None:
         super().__init__()
         self.warp, self.factorize, self.sweep = warp, factorize, sweep
 

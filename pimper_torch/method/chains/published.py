@@ -8,8 +8,8 @@ from torch import nn
 from pimper_torch.ground.geometry.contours import Contours
 from pimper_torch.method.chains.chain import Chain, Step
 from pimper_torch.method.chains.chain_config import PublishedConfig
-from pimper_torch.method.chains.photometric import Factorizing, Warping
-from pimper_torch.method.chains.running import Running
+from pimper_torch.method.chains.photometric import Factorizing, WarpStage
+from pimper_torch.method.chains.running import ChainRun
 from pimper_torch.method.coarse.surface import CoarseSurface
 from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.method.patches.decompose import Decompose
@@ -63,7 +63,7 @@ class Published(Chain):
             config.coarse_surface
         )
         self.decompose = Decompose(config.decompose)
-        self.warp: Warping = Warp(config.warp)
+        self.warp: WarpStage = Warp(config.warp)
         self.light: Callable[[PatchViews], Illumination] = FitLight(config.light)
         self.factorize: Factorizing = Factorize(config.factorize)
         self.gauge: Callable[[PhotometricPatches], PhotometricPatches] = FixGauge(config.factorize)
@@ -75,7 +75,7 @@ class Published(Chain):
 
     def passes(
         self,
-        run: Running,
+        run: ChainRun,
         views: Views | SparseScene,
         sparse_model: Path | str | None,
         mesh: Mesh | None,

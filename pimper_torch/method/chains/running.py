@@ -43,7 +43,7 @@ _KERNELS: Mapping[str, Sequence[str]] = {
 
 
 @dataclass(slots=True, kw_only=True)
-class Running:
+class ChainRun:
     """Caller of a chain's stages in one run: ``run(self.fuse, heights, contours)``.
 
     The record of a stage is read from the store if an earlier run kept it there; otherwise it is

@@ -194,7 +194,7 @@ def upright_heights(information: PerVertex, facing: PerVertex) -> VertexMask:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Contacts(Record):
+class SurfacePoints(Record):
     """Points that the surface passes through.
 
     Attributes:
@@ -233,13 +233,13 @@ class BaseSurface(Record):
         return torch.as_tensor(nearest, device=self.faces.device)
 
 
-def cloud_points(points: FacetPoints, surface: BaseSurface) -> Contacts:
+def cloud_points(points: FacetPoints, surface: BaseSurface) -> SurfacePoints:
     """Return contacts with cloud points; differentiable except in the nearest vertex."""
     vertex = surface.nearest(points.points_world)
     line = surface.directions[vertex]
     covariance = points.covariance_world.to(line)
     variance = torch.einsum("pi,pij,pj->p", line, covariance, line)
-    return Contacts(
+    return SurfacePoints(
         points=points.points_world.to(line),
         lines=line,
         variance=variance,
@@ -247,7 +247,7 @@ def cloud_points(points: FacetPoints, surface: BaseSurface) -> Contacts:
     )
 
 
-def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
+def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> SurfacePoints:
     """Return contacts with the rays through the silhouettes.
 
     A ray is in the tangent plane of its contact, so the position along the ray matters little.
@@ -260,7 +260,7 @@ def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
     line = surface.directions[vertex]
     facing = (line * contours.normals_world.to(line)).sum(dim=-1)
     usable = facing.detach() > MIN_FACING
-    return Contacts(
+    return SurfacePoints(
         points=contours.points_world.to(line)[usable],
         lines=line[usable],
         variance=contours.variance.to(line)[usable] / facing[usable].square(),
@@ -268,7 +268,7 @@ def contour_tangents(contours: ContourPoints, surface: BaseSurface) -> Contacts:
     )
 
 
-def passing(contacts: Contacts, surface: BaseSurface, caster: RayCaster) -> Equations:
+def passing(contacts: SurfacePoints, surface: BaseSurface, caster: RayCaster) -> Equations:
     """Return equations for the surface to contain points; differentiable, nearest face constant."""
     points, line = contacts.points, contacts.lines
     # Intersection of the line through each point with the nearer of the faces on both sides.

@@ -40,7 +40,7 @@ _MIN_FACTOR = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Fused(Record):
+class FusedHeights(Record):
     """The heights, the noise factor of each kind of terms, and the last system.
 
     Attributes:
@@ -69,7 +69,7 @@ def fuse_terms(
     damping: PerVertex,
     iterations: int,
     factors: Sequence[Scalar] | None = None,
-) -> Fused:
+) -> FusedHeights:
     """Return the solution; solves and estimates of the noise alternate.
 
     Args:
@@ -112,7 +112,7 @@ def fuse_terms(
         )
     except SingularSystemError as error:
         _kept(error)
-    return Fused(
+    return FusedHeights(
         heights=start.double() if heights is None else heights,
         factors=tuple(noise),
         kinds=tuple(kinds),
@@ -121,7 +121,7 @@ def fuse_terms(
     )
 
 
-def fuse_like(fused: Fused, kinds: Sequence[Equations], start: PerVertex) -> Fused:
+def fuse_like(fused: FusedHeights, kinds: Sequence[Equations], start: PerVertex) -> FusedHeights:
     """Return the solution for terms with common errors, with the weights of a previous one.
 
     Residuals between vertices do not contain the common error of normals: slopes seem to have less

@@ -27,8 +27,8 @@ from pimper_torch.ground.linalg.sums import sum_at
 from pimper_torch.ground.linalg.systems import prepare
 from pimper_torch.ground.shapes import PerVertex, Scalar
 from pimper_torch.method.fusion.equations import Equations
-from pimper_torch.method.fusion.estimate import Fused
-from pimper_torch.method.fusion.normal_bias import CoarsePart
+from pimper_torch.method.fusion.estimate import FusedHeights
+from pimper_torch.method.fusion.normal_bias import PiecewiseLinearFit
 from pimper_torch.method.fusion.terms import UNMEASURED
 
 # Side of the regions of a common error, in edges of a median facet. Errors of the fused surface of
@@ -39,7 +39,11 @@ _REGION = 2.5
 
 @torch.no_grad()
 def expected_error(
-    fine: Fused, coarse: Fused, subdivision: Subdivision, facets: Int[Tensor, "facet 3"], draws: int
+    fine: FusedHeights,
+    coarse: FusedHeights,
+    subdivision: Subdivision,
+    facets: Int[Tensor, "facet 3"],
+    draws: int,
 ) -> PerVertex:
     """Return the standard error of every height of the fused surface.
 
@@ -75,7 +79,7 @@ def expected_error(
         del system
     error = solutions[0]
     for detail in solutions[1:]:
-        error = detail + CoarsePart(subdivision, facets)(error - detail)
+        error = detail + PiecewiseLinearFit(subdivision, facets)(error - detail)
     return error.square().mean(dim=1).sqrt()
 
 
@@ -126,7 +130,9 @@ def _noise(
     return variance.sqrt() * ((1 - common).sqrt() * single + common.sqrt() * shared)
 
 
-def _noise_rhs(fused: Fused, noise: list[Float[Tensor, " _"]], starts: PerVertex) -> PerVertex:
+def _noise_rhs(
+    fused: FusedHeights, noise: list[Float[Tensor, " _"]], starts: PerVertex
+) -> PerVertex:
     """Return the right-hand side for errors of the targets and of the initial heights."""
     rhs = fused.damping.double() * starts
     for kind, weight, factor, error in zip(

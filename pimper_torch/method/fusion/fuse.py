@@ -25,17 +25,17 @@ from pimper_torch.method.fusion import blocks
 from pimper_torch.method.fusion.blend import Blend, ray_directions
 from pimper_torch.method.fusion.detail import spacing_of
 from pimper_torch.method.fusion.equations import Equations
-from pimper_torch.method.fusion.estimate import Fused, fuse_like, fuse_terms
+from pimper_torch.method.fusion.estimate import FusedHeights, fuse_like, fuse_terms
 from pimper_torch.method.fusion.expected_error import expected_error
 from pimper_torch.method.fusion.fuse_config import FuseConfig
-from pimper_torch.method.fusion.normal_bias import CoarsePart, NormalBias, normal_bias
+from pimper_torch.method.fusion.normal_bias import NormalBias, PiecewiseLinearFit, normal_bias
 from pimper_torch.method.fusion.problem import FINEST, Problem, build_problem, subdivide_facets
 from pimper_torch.method.fusion.terms import (
     ROTATION,
     SLOPES,
     TERMS,
     Normals,
-    Passing,
+    PointTerm,
     Term,
     own_slope_variance,
     rotation,
@@ -339,7 +339,7 @@ class Fuse(Stage):
 
         def with_coarse_shape() -> PerVertex:
             shape = fuse_like(fused, common, problem.start_of_shape).heights
-            return detail + CoarsePart(problem.subdivision, problem.facets)(shape - detail)
+            return detail + PiecewiseLinearFit(problem.subdivision, problem.facets)(shape - detail)
 
         return solved_or(
             with_coarse_shape,
@@ -349,7 +349,7 @@ class Fuse(Stage):
             done="The surface has the coarse shape of independent errors",
         )
 
-    def _fused(self, problem: Problem, terms: "_AssembledTerms") -> Fused:
+    def _fused(self, problem: Problem, terms: "_AssembledTerms") -> FusedHeights:
         typical, iterations = problem.typical, self.config.noise_iterations
         unit = problem.spacing.new_ones((), dtype=torch.float64)
         known = any(key in typical for key in terms.keys)
@@ -367,7 +367,7 @@ class _AssembledTerms:
     @classmethod
     def of(cls, terms: tuple[Term, ...], problem: Problem) -> "_AssembledTerms":
         """Assemble the equations of all terms; those of points share a ray caster."""
-        if any(isinstance(term, Passing) and term.contacts is not None for term in terms):
+        if any(isinstance(term, PointTerm) and term.contacts is not None for term in terms):
             caster = RayCaster(problem.points, problem.subdivision.faces)
             problem = problem.replace(caster=caster)
         return cls(terms, tuple(term.equations(problem) for term in terms))

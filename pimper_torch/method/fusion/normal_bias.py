@@ -115,7 +115,7 @@ def shared_error(variance: Scalar, facet: Int[Tensor, " vertex"], known: VertexM
     return SharedError(variance=variance, count=count[facet].to(variance))
 
 
-class CoarsePart:
+class PiecewiseLinearFit:
     """Least-squares fit of a continuous function that is linear on every facet."""
 
     def __init__(self, subdivision: Subdivision, facets: Int[Tensor, "facet 3"]) -> None:

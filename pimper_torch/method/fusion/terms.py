@@ -19,7 +19,7 @@ from pimper_torch.ground.linalg.continuation import continued, enclosed
 from pimper_torch.ground.linalg.sums import total
 from pimper_torch.ground.shapes import PerVertex, Scalar
 from pimper_torch.method.fusion import equations
-from pimper_torch.method.fusion.equations import Contacts, Equations
+from pimper_torch.method.fusion.equations import Equations, SurfacePoints
 from pimper_torch.method.fusion.normal_bias import (
     MEDIAN_OF_TILT,
     common_variance,
@@ -261,7 +261,7 @@ class CloudPoints(Term):
         """Return the term of the points and the lines along which they are known."""
         del contours
         cloud = problem.cloud
-        return Passing(None if cloud is None else equations.cloud_points(cloud, problem.surface))
+        return PointTerm(None if cloud is None else equations.cloud_points(cloud, problem.surface))
 
 
 class TouchedRays(Term):
@@ -273,15 +273,15 @@ class TouchedRays(Term):
         """Return the term of the points where the rays touch the current surface."""
         tangent = contours.touching(problem.points, problem.normals)
         touched = len(tangent.ray) > 0
-        return Passing(equations.contour_tangents(tangent, problem.surface) if touched else None)
+        return PointTerm(equations.contour_tangents(tangent, problem.surface) if touched else None)
 
 
-class Passing(Term):
+class PointTerm(Term):
     """The surface passes through points; ``None`` for no points."""
 
     position = True
 
-    def __init__(self, contacts: Contacts | None) -> None:
+    def __init__(self, contacts: SurfacePoints | None) -> None:
         super().__init__()
         self.contacts = contacts
 

@@ -10,11 +10,11 @@ from pimper_torch.ground.geometry.topology import face_counts, face_edges, half_
 from pimper_torch.ground.linalg.continuation import continued
 from pimper_torch.ground.shapes import Faces, VertexValues
 from pimper_torch.method.meshing.faults import diagonal
-from pimper_torch.records import Closed, Mesh
+from pimper_torch.records import ClosedMesh, Mesh
 from pimper_torch.runtime.errors import InputError
 
 
-def closed(mesh: Mesh) -> Closed:
+def closed(mesh: Mesh) -> ClosedMesh:
     """Close every border of a mesh with a membrane, like a soap film.
 
     The given surface is unchanged, except that the mesh is made a manifold first: if fans of faces
@@ -68,7 +68,7 @@ def closed(mesh: Mesh) -> Closed:
         expected_error=extended(mesh.expected_error, extent),
     )
     measured = torch.arange(len(all_faces), device=faces.device) < len(faces)
-    return Closed(mesh=result, measured=measured, borders=len(cycles))
+    return ClosedMesh(mesh=result, measured=measured, borders=len(cycles))
 
 
 def _filled(albedo: VertexValues) -> VertexValues:

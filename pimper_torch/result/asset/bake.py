@@ -11,7 +11,7 @@ from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.visibility import Hits, RayCaster
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.ground.shapes import Mask, Vertices
-from pimper_torch.records import Mesh, Relighting, Textured
+from pimper_torch.records import Mesh, Relighting, TexturedMesh
 from pimper_torch.result.asset.atlas import Atlas, unwrapped
 from pimper_torch.result.asset.inpaint import INPAINTED, inpainted
 from pimper_torch.result.asset.tangents import frames, tangents
@@ -26,7 +26,7 @@ _TEXELS_PER_SIDE = 1.5
 class Texture(Stage):
     """Bake a surface and its materials onto a simplified mesh, see :func:`textured`."""
 
-    def forward(self, full: Mesh, few: Mesh, relighting: Relighting) -> Textured:
+    def forward(self, full: Mesh, few: Mesh, relighting: Relighting) -> TexturedMesh:
         """Bake the textures.
 
         Args:
@@ -37,7 +37,7 @@ class Texture(Stage):
 
 def textured(
     full: Mesh, few: Mesh, reflectance: Vertices | None = None, atlas: Atlas | None = None
-) -> Textured:
+) -> TexturedMesh:
     """Bake albedo and normals of a surface into textures of a simplified mesh.
 
     Implausibly bright albedo is inpainted first.
@@ -97,7 +97,7 @@ def textured(
     raster = raster[_nearest(measured.reshape(size))[0]]
     raster[(texel_faces.face >= 0) & ~measured, 6] = INPAINTED
     raster = raster.reshape(*size, -1)
-    return Textured(
+    return TexturedMesh(
         mesh=mesh,
         vertex=atlas.vertex,
         normals=normals,
@@ -111,7 +111,7 @@ def textured(
     )
 
 
-def halved(asset: Textured) -> Textured:
+def halved(asset: TexturedMesh) -> TexturedMesh:
     """Return the asset with textures of half the size."""
 
     def half(texture: Float[Tensor, "height width channel"]) -> Tensor:

@@ -9,7 +9,7 @@ from pimper_torch.ground.geometry.surfaces import face_normals
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.method.meshing.closing import closed
 from pimper_torch.method.meshing.simplify import simplify
-from pimper_torch.records import Closed, Finished, Mesh
+from pimper_torch.records import ClosedMesh, FinishedMesh, Mesh
 from pimper_torch.result.asset.mesh_files import MeshFiles
 from pimper_torch.result.viz.maps import base_color
 from pimper_torch.runtime.stage import Stage
@@ -25,10 +25,10 @@ _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
 class Simplify(Stage):
     """Simplify a surface to the vertices that its shape needs, and cap its borders if requested."""
 
-    def forward(self, mesh: Mesh, files: MeshFiles) -> Finished:
+    def forward(self, mesh: Mesh, files: MeshFiles) -> FinishedMesh:
         """Prepare a surface for writing."""
         how, moved = "", dict[str, int | float]()
-        capped: Closed | None = None
+        capped: ClosedMesh | None = None
         if isinstance(files.faces, int):
             how = "reduced"
             few, capped = _reduced_to(mesh, files.faces, files.watertight)
@@ -47,7 +47,7 @@ class Simplify(Stage):
             fraction = float(area[~capped.measured].sum() / area.sum())
             count = int((~capped.measured).sum())
             caps = {"borders": capped.borders, "faces": count, "area_fraction": fraction}
-        return Finished(
+        return FinishedMesh(
             mesh=few,
             few=reduced(few, _FACES),
             closed=capped,
@@ -57,7 +57,7 @@ class Simplify(Stage):
         )
 
 
-def _reduced_to(mesh: Mesh, faces: int, watertight: bool) -> tuple[Mesh, Closed | None]:
+def _reduced_to(mesh: Mesh, faces: int, watertight: bool) -> tuple[Mesh, ClosedMesh | None]:
     """Reduce a mesh to at most ``faces`` faces, including its caps if it gets some."""
     few = reduced(mesh, faces)
     if not watertight:

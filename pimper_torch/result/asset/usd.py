@@ -6,11 +6,11 @@ from tempfile import TemporaryDirectory
 import torch
 from PIL import Image
 
-from pimper_torch.records import Textured
+from pimper_torch.records import TexturedMesh
 from pimper_torch.result.asset.placement import Placement
 
 
-def write_usdz(asset: Textured, path: Path | str, placement: Placement) -> None:
+def write_usdz(asset: TexturedMesh, path: Path | str, placement: Placement) -> None:
     """Write a USDZ, for Apple's devices and for film: one mesh with albedo and normal map.
 
     y is up, and lengths are in metres; ``customData`` of the mesh undoes the placement. The surface

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pimper_torch.ground.radiometry import to_bytes
 from pimper_torch.ground.shapes import Scalars
-from pimper_torch.records import Textured
+from pimper_torch.records import TexturedMesh
 from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.asset.mesh_files import TextureFormat
 from pimper_torch.result.asset.placement import Placement
@@ -26,7 +26,7 @@ _QUALITY = 95
 
 
 def write_asset(
-    asset: Textured,
+    asset: TexturedMesh,
     path: Path | str,
     placement: Placement | None = None,
     texture: TextureFormat = "png",
@@ -35,7 +35,7 @@ def write_asset(
     """Write a GLB whose vertices have ``_EXPECTED_ERROR`` and ``_SUPPORT`` (confidence), if known.
 
     Unless albedo is determined everywhere, the material's ``extras`` name the texture
-    ``albedo_doubt``: black where it is determined, grey where not, white where it was inpainted.
+    ``albedo_uncertainty``: black if determined, grey if not, white if inpainted.
 
     Args:
         placement: Of the file; by default, the file is in the frame of the asset's mesh.
@@ -64,7 +64,7 @@ def write_asset(
         maps = _reflect(material, asset.reflectance, len(images))
         images += [_encoded(image, texture) for image in maps]
     if bool(asset.uncertainty.any()):
-        material["extras"] = {"albedo_doubt": {"index": len(images)}}
+        material["extras"] = {"albedo_uncertainty": {"index": len(images)}}
         images.append(_encoded(asset.uncertainty, "png"))
     data = gltf_of(
         {name: values.numpy() for name, values in attributes.items() if values is not None},
@@ -118,7 +118,7 @@ def _encoded(image: _Image, texture: TextureFormat, *, lossless: bool = True) ->
     return file.getvalue()
 
 
-def write_asset_obj(asset: Textured, path: Path | str, placement: Placement) -> None:
+def write_asset_obj(asset: TexturedMesh, path: Path | str, placement: Placement) -> None:
     """Write an OBJ, its ``.mtl`` and the two PNG files that this refers to.
 
     The first lines are comments with values that undo the placement.

@@ -6,7 +6,13 @@ from torch import Tensor
 
 from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.records import Cameras, Mesh, Silhouettes, SparseScene
-from pimper_torch.records.finished import Materials, Relighting, Textured, ViewErrors, ViewLights
+from pimper_torch.records.finished import (
+    Materials,
+    Relighting,
+    TexturedMesh,
+    ViewErrors,
+    ViewLights,
+)
 from pimper_torch.result.relighting.fit_lights import Observed, lights_of, observe_all
 from pimper_torch.result.relighting.fit_materials import materials_under
 from pimper_torch.result.relighting.lit_surface import (
@@ -95,7 +101,7 @@ class Relight(Stage):
 
 
 def judge_textures(
-    relighting: Relighting, asset: Textured, scene: SparseScene, silhouettes: Silhouettes | None
+    relighting: Relighting, asset: TexturedMesh, scene: SparseScene, silhouettes: Silhouettes | None
 ) -> Relighting:
     """Add the errors of the textured surface under the same lights."""
     surface = TexturedSurface(asset)

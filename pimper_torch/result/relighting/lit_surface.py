@@ -25,7 +25,7 @@ from torch.nn.functional import grid_sample, max_pool2d, normalize
 from pimper_torch.ground.geometry.visibility import Hits, cast_view, ray_caster
 from pimper_torch.ground.radiometry import linear_from_srgb
 from pimper_torch.ground.shapes import Scalars
-from pimper_torch.records import Cameras, Mesh, Record, Textured
+from pimper_torch.records import Cameras, Mesh, Record, TexturedMesh
 from pimper_torch.result.asset.tangents import frames
 from pimper_torch.result.viz.maps import base_color, carried_normals
 
@@ -211,7 +211,7 @@ def response(
 class TexturedSurface(LitSurface):
     """A mesh with base colours and normals from textures, interpolated between texels."""
 
-    def __init__(self, asset: Textured) -> None:
+    def __init__(self, asset: TexturedMesh) -> None:
         super().__init__(asset.mesh.replace(normals_world=asset.normals))
         self.asset = asset
 

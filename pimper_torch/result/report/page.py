@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.records import LeftOut, Mesh, Silhouettes, SparseScene, Textured
+from pimper_torch.records import Mesh, Removal, Silhouettes, SparseScene, TexturedMesh
 from pimper_torch.result.asset.bake import halved
 from pimper_torch.result.asset.placement import Placement
 from pimper_torch.result.asset.write import write_asset
@@ -91,7 +91,7 @@ def write_page(
     Path(path).write_text(_PLACE.sub(part, _read("page.html")), encoding="utf-8")
 
 
-def asset_within(asset: Textured, path: Path, placement: Placement) -> bytes:
+def asset_within(asset: TexturedMesh, path: Path, placement: Placement) -> bytes:
     """Read an asset's file, or make one with coarser textures if it is too large for a page."""
     # Half of a page of 15 MB; base64 takes a third more than bytes.
     if path.stat().st_size <= 7_500_000 or min(asset.base_color.shape[:2]) < 2:
@@ -133,7 +133,7 @@ def left_out_by_pass(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
     number = 1
     for entry in entries:
         stage = entry["guard"].split(".")[0]
-        if closing_line([LeftOut(**{**entry, "names": tuple(entry["names"])})]):
+        if closing_line([Removal(**{**entry, "names": tuple(entry["names"])})]):
             passes.setdefault(_HEADINGS.get(stage, f"Pass {number}"), []).append(entry)
         number += stage == "repair"  # ends a pass
     return [{"heading": heading, "entries": listed} for heading, listed in passes.items()]

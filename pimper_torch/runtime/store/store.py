@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from pimper_torch.records import Failure, LeftOut, Record, StageReport
+from pimper_torch.records import Failure, Record, Removal, StageReport
 from pimper_torch.records.stored import as_json, load_with_metadata, of_json, save_record
 from pimper_torch.runtime.errors import InputError, OutputError, caution
 from pimper_torch.runtime.failures import skipped
@@ -24,7 +24,7 @@ from pimper_torch.runtime.store.digest import digest
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
-_Events = tuple[str | Failure | LeftOut | StageReport, ...]
+_Events = tuple[str | Failure | Removal | StageReport, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,13 +159,13 @@ def kept(
     return record, seconds
 
 
-def _replay(event: str | Failure | LeftOut | StageReport) -> None:
+def _replay(event: str | Failure | Removal | StageReport) -> None:
     journal = current()
     if isinstance(event, str):
         caution(event)
     elif isinstance(event, Failure):
         skipped(event)
-    elif isinstance(event, LeftOut) and journal.collects:
+    elif isinstance(event, Removal) and journal.collects:
         journal.note(event)
     elif isinstance(event, StageReport) and journal.observer is not None:
         journal.observer.started(event.name)

@@ -3,22 +3,25 @@
 Problems and solvers are those of :mod:`pimper_torch.method.photometry`.
 """
 
+from pimper_torch.runtime.renamed import renamed_names
 from pimper_torch.single_view.factorization.ambiguity import Ambiguity
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.factorization.low_rank import (
-    Free,
-    Restarted,
+    FreeManifold,
+    RestartResult,
     factorize_from_many,
     low_rank_problem,
     random_left,
     singular_left,
 )
 
+__getattr__ = renamed_names(__name__, {"Free": "FreeManifold", "Restarted": "RestartResult"})
+
 __all__ = [
     "Ambiguity",
     "BasRelief",
-    "Free",
-    "Restarted",
+    "FreeManifold",
+    "RestartResult",
     "factorize_from_many",
     "low_rank_problem",
     "random_left",

@@ -37,7 +37,7 @@ Columns = Float[Tensor, "*batch rank sample"]
 
 
 @dataclass(frozen=True, slots=True)
-class Free:
+class FreeManifold:
     """Manifold of all vectors, for low-rank factorization; with rank 3, albedo times normal."""
 
     rank: int = 3
@@ -100,7 +100,7 @@ def low_rank_problem(matrix: Matrices, weight: Matrices, start: LeftFactors) -> 
         prior_mean=left,
         shading=values.new_zeros(len(values), rank, columns),
         regularization=values.new_zeros(len(values), rows),
-        manifold=Free(rank=rank),
+        manifold=FreeManifold(rank=rank),
     )
 
 
@@ -142,7 +142,7 @@ def random_left(batch: int, rows: int, rank: int, generator: torch.Generator) ->
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Restarted(Record):
+class RestartResult(Record):
     """The best of several factorizations of one matrix.
 
     Attributes:
@@ -163,7 +163,7 @@ def factorize_from_many(
     *,
     repeats: int = 2,
     max_starts: int = 50,
-) -> Restarted:
+) -> RestartResult:
     """Factorize a matrix with missing entries from random starts until the best repeats.
 
     Args:
@@ -193,6 +193,6 @@ def factorize_from_many(
         if repeated:
             break
     assert best is not None
-    return Restarted(
+    return RestartResult(
         best=best, residuals=torch.tensor(residuals, dtype=torch.float64), repeated=repeated
     )

@@ -47,7 +47,7 @@ _CHANGE, _MAX_ITERATIONS = 5e-4, 40
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Continuity(Record):
+class ContinuousSteps(Record):
     """Weights of the steps between pixels.
 
     Attributes:
@@ -62,7 +62,7 @@ class Continuity(Record):
 
 def find_discontinuities(
     steps: Steps, weight: Float[Tensor, " step"], known_weight: Map | None, heights: Map | None
-) -> Continuity:
+) -> ContinuousSteps:
     """Return the weights of continuous steps; constant to autograd.
 
     Args:
@@ -93,7 +93,7 @@ def find_discontinuities(
             scale = max(scale / 3, smallest)
         square = (fraction * residual.square()).sum() / fraction.sum().clamp_min(1)
         right, down = steps.split(fraction)
-        return Continuity(
+        return ContinuousSteps(
             right=right,
             down=down,
             convergence=Convergence(

@@ -13,7 +13,10 @@ from pimper_torch.ground.geometry.pixels import crop_intrinsics
 from pimper_torch.ground.shapes import Map, Mask, Matrix3
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.single_view.integration.discontinuities import Continuity, find_discontinuities
+from pimper_torch.single_view.integration.discontinuities import (
+    ContinuousSteps,
+    find_discontinuities,
+)
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import (
     Steps,
@@ -43,7 +46,7 @@ class IntegratedMap(Record):
 
     depth: Map
     valid: Mask
-    continuity: Continuity | None = None
+    continuity: ContinuousSteps | None = None
 
 
 def integrate_normal_map(

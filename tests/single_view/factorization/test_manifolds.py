@@ -9,9 +9,9 @@ from pimper_torch.method.photometry.cone import Cone
 from pimper_torch.method.photometry.quadratics import apply_packed
 from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
-from pimper_torch.single_view.factorization.low_rank import Free
+from pimper_torch.single_view.factorization.low_rank import FreeManifold
 
-MANIFOLDS = pytest.mark.parametrize("manifold", [Free(), Cone()])
+MANIFOLDS = pytest.mark.parametrize("manifold", [FreeManifold(), Cone()])
 
 
 def draw(generator, *shape):
