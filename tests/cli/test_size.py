@@ -102,12 +102,12 @@ def test_without_a_reference_length_the_size_is_unknown(photos, tmp_path):
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--scale-bar", "a,500,40", "b,60,40", "8"], "lies outside .* 120 x 80 pixels"),
+        (["--scale-bar", "a,500,40", "b,60,40", "8"], "is outside .* 120 x 80 pixels"),
         (
             ["--scale-bar", "a,60,40", "b,60,40", "wide"],
             "--scale-bar is 'a,60,40 b,60,40 wide'; needed: A,x,y B",
         ),
-        (["--camera-distance", "a", "e", "8"], "'e': none of the photographs is named so"),
+        (["--camera-distance", "a", "e", "8"], "'e': no photographs have this name"),
         (["--camera-distance", "a", "b", "x"], "--camera-distance is 'a b x'; needed: A B LENGTH"),
         (["--markers", "-3"], "markers is -3"),
         (["--markers", "some"], "--markers is 'some'; needed: auto.off.MM"),

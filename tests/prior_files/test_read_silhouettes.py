@@ -101,7 +101,7 @@ def test_clicks_are_read_as_foreground_seeds(views):
     assert set(prior.inside.unique().tolist()) == {0.5, 1.0}
     assert (prior.inside[0] == 1).nonzero().float().mean(dim=0).tolist() == [20, 10]
     assert (prior.inside[1] == 1).nonzero().tolist() == [[0, 46], [0, 47], [1, 46], [1, 47]]
-    with pytest.raises(InputError, match="outside of the photograph, which has 48 x 32"):
+    with pytest.raises(InputError, match="outside the photograph, which has 48 x 32"):
         object_at([Mark.read("a,60,1")], views)
     with pytest.raises(InputError, match="'e': none of the photographs"):
         object_at([Mark.read("e,6,1")], views)

@@ -212,7 +212,7 @@ def test_given_cameras_are_not_scaled_by_markers_alone(scene, reconstruction):
 
 
 def test_requested_markers_that_are_missing_give_a_warning(reconstruction):
-    with pytest.warns(pt.PimperWarning, match="No marker was found that two photographs show"):
+    with pytest.warns(pt.PimperWarning, match="No marker was found at the same position in"):
         assert find_scale(reconstruction, markers=25.0) is None
     assert find_scale(reconstruction) is None
 

@@ -97,7 +97,7 @@ def test_a_mark_inside_the_silhouette_is_not_on_the_table(ball):
         inside=inside, reliable=torch.ones(5) > 0, source="masks", planes_world=plane[None]
     )
     place = Mark.read("IMG_2,320,470")
-    with pytest.raises(InputError, match=r"IMG_2,320,470: the silhouette says .*surface is"):
+    with pytest.raises(InputError, match=r"IMG_2,320,470: this pixel is in the silhouette, but"):
         place_of(place, ball.replace(silhouettes=silhouettes))
 
 
@@ -118,12 +118,15 @@ def test_a_mark_on_uncertain_surface_gives_a_warning(ball):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("IMG_7,3,4", "'IMG_7': none of the photographs is named so; needed: one of IMG_0.jpg"),
-        ("IMG_9.jpg,3,4", "IMG_9.jpg: has no place among the cameras that were found"),
-        ("IMG_1,640.5,4", "IMG_1,640.5,4: lies outside of the photograph, which has 640 x 480"),
-        ("IMG_1,3,4", "IMG_1,3,4: the ray behind this pixel misses the surface, and the plane"),
-        ("IMG_1,3,4+IMG_1,3,4", "IMG_1,3,4: these rays differ by .* degrees; needed: 1 at least"),
-        ("IMG_0,300,200+IMG_4,300,400", r"IMG_0,300,200 is \d+ pixels from where the others"),
+        ("IMG_7,3,4", "'IMG_7': no photographs have this name; needed: one of IMG_0.jpg"),
+        ("IMG_9.jpg,3,4", "IMG_9.jpg: this photograph has no camera; needed: a registered"),
+        ("IMG_1,640.5,4", "IMG_1,640.5,4: is outside the photograph, which has 640 x 480"),
+        ("IMG_1,3,4", "IMG_1,3,4: the ray of this pixel misses the surface, and the supporting"),
+        (
+            "IMG_1,3,4+IMG_1,3,4",
+            "IMG_1,3,4: the rays of these pixels differ by .* needed: at least 1",
+        ),
+        ("IMG_0,300,200+IMG_4,300,400", r"IMG_0,300,200 is \d+ pixels from the point that"),
     ],
 )
 def test_a_mark_that_cannot_be_located_is_named(ball, text, message):
@@ -133,13 +136,13 @@ def test_a_mark_that_cannot_be_located_is_named(ball, text, message):
 
 @pytest.mark.parametrize("text", ["", "a", "a,1", "a,1,b", ",1,2", "a,1,2+", "a,nan,2"])
 def test_invalid_marks_are_refused(text):
-    with pytest.raises(InputError, match="is no place in a photograph; needed: NAME,x,y"):
+    with pytest.raises(InputError, match="is not a pixel of a photograph; needed: NAME,x,y"):
         Mark.read(text)
 
 
 def test_two_equal_marks_have_no_length(ball):
     end = mark(ball, direction(0, 0, 1), 2)
-    with pytest.raises(InputError, match="is 0 in the result and 5 mm in truth; needed: two"):
+    with pytest.raises(InputError, match="is 0 in the result, and 5 mm is given; needed: two"):
         scale_of_bars(ball, [ScaleBar(first=end, second=end, length=5.0)])
     with pytest.raises(ConfigError, match=r"length of .* is -1"):
         ScaleBar(first=end, second=end, length=-1.0)

@@ -1,6 +1,6 @@
-"""The real size of a result: from lengths that are known, and markers that were printed."""
+"""Metric scale of a result, from known lengths and printed markers."""
 
 import lazy_loader
 
-# When they are asked for, so that the command line reads settings of this room without torch.
+# Imported lazily, so that the command line reads settings of this subpackage without torch.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

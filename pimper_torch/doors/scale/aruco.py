@@ -10,69 +10,69 @@ from torch import Tensor
 from pimper_torch.ground.geometry import pixels
 from pimper_torch.ground.shapes import Map
 
-# Of 2^36 squares of random cells 587 x 4 are read as a marker where no cell may be wrong: 3 in
-# 10^8. Of DICT_4X4_50, with its 2^16, it would be 3 in 10^3.
+# Without error correction, 587 x 4 of 2^36 squares of random cells are detected as a marker: 3 in
+# 10^8. DICT_4X4_50, with 2^16 squares, would have 3 in 10^3.
 _FAMILY = cv2.aruco.DICT_APRILTAG_36h11
 
 Corners = Float[Tensor, "square 4 2"]
 
 CELLS = 8
-"""Cells along a marker's side, with its black border."""
+"""Cells along a marker's side, including its black border."""
 
 
 def find_squares(picture: UInt8[Tensor, "height width"]) -> dict[int, Float[Tensor, "4 2"]]:
-    """Find AprilTags of the family 36h11 in a picture, none of whose cells is misread.
+    """Detect AprilTags of family 36h11 in an image, without error correction.
 
-    A number that occurs twice is left out: nothing says which marker is which in other pictures.
+    A code that occurs twice is skipped, because it is ambiguous in other images.
 
     Args:
         picture: Grey, encoded by a curve such as sRGB.
 
     Returns:
-        Pixels of the outer corners of each black border, by the marker's number of 587: clockwise
-        from the marker's top left, to about a pixel, as OpenCV finds them.
+        Pixels of the outer corners of each black border, by code (0 to 586): clockwise from the
+        marker's top left, as OpenCV detects them, accurate to about a pixel.
     """
     settings = cv2.aruco.DetectorParameters()
     settings.errorCorrectionRate = 0.0
     family = cv2.aruco.getPredefinedDictionary(_FAMILY)
     detector = cv2.aruco.ArucoDetector(family, settings)
-    corners, codes, _ = detector.detectMarkers(np.ascontiguousarray(picture.numpy()))
-    if codes is None:
+    corners, ids, _ = detector.detectMarkers(np.ascontiguousarray(picture.numpy()))
+    if ids is None:
         return {}
-    numbers = np.ravel(codes).tolist()
+    codes = np.ravel(ids).tolist()
     indices = torch.from_numpy(np.array(corners, np.float64).reshape(-1, 4, 2))
-    found = zip(numbers, pixels.pixels_from_indices(indices), strict=True)
-    return {code: four for code, four in found if numbers.count(code) == 1}
+    detected = zip(codes, pixels.pixels_from_indices(indices), strict=True)
+    return {code: square_corners for code, square_corners in detected if codes.count(code) == 1}
 
 
 def cells_of(code: int) -> Bool[Tensor, "8 8"]:
-    """Return the cells of a marker, true where they are black."""
+    """Return the cells of the marker with this code; true is black."""
     family = cv2.aruco.getPredefinedDictionary(_FAMILY)
     return torch.from_numpy(cv2.aruco.generateImageMarker(family, code, CELLS) < 128)
 
 
-# Reach of a profile: of a cell, as the border is one cell of black; at least pixels' own blur.
+# Half-length of a profile: in cells, as the border is one black cell; at least the pixel blur.
 _REACH, _MIN_REACH_PX = 0.6, 1.5
 
 
 def refined_corners(picture: Map, corners: Corners) -> Corners:
-    """Intersect lines through the sides of squares.
+    """Refine corners of squares by intersecting lines fitted to their sides.
 
-    Across each side profiles are read; a step is where their gradient has its centroid, whatever
-    the blur, as long as the picture is linear. OpenCV's own corners are up to half a pixel inside.
+    Profiles are sampled across each side. An edge is at the centroid of the profile's gradient,
+    whatever the blur, if the image is linear. OpenCV's corners are up to half a pixel inside.
 
     Args:
         picture: Linear radiance, black squares on white; NaN where unknown. Profiles across such
             pixels do not count.
-        corners: Pixels, to about two of them; clockwise, as seen.
+        corners: Pixels, accurate to about two pixels; clockwise in the image.
 
     Returns:
-        The same corners; NaN where most profiles of a side have no step.
+        The refined corners; NaN where most profiles of a side have no edge.
     """
-    found = corners.double()
+    refined = corners.double()
     for _ in range(4):
-        found = _refined_once(picture.double(), found)
-    return found
+        refined = _refined_once(picture.double(), refined)
+    return refined
 
 
 def _refined_once(picture: Map, corners: Corners) -> Corners:
@@ -80,35 +80,36 @@ def _refined_once(picture: Map, corners: Corners) -> Corners:
     length = along.norm(dim=-1, keepdim=True)
     outward = torch.stack([along[..., 1], -along[..., 0]], dim=-1) / length
     reach = (_REACH * length.mean(dim=(1, 2)) / CELLS).nan_to_num(0).clamp_min(_MIN_REACH_PX)
-    share = torch.linspace(0.1, 0.9, 24).to(corners)  # near a corner the other side is near
+    along_side = torch.linspace(0.1, 0.9, 24).to(corners)  # profiles at corners cross two sides
     count = 2 * int((4 * reach.max()).ceil()) + 1 if len(reach) else 3
     across = reach[:, None] * torch.linspace(-1, 1, count).to(corners)
-    base = corners[:, :, None] + share[:, None] * along[:, :, None]
-    places = base[:, :, :, None] + across[:, None, None, :, None] * outward[:, :, None, None]
-    at = pixels.indices_from_pixels(places).flip(-1).movedim(-1, 0).numpy()
-    read = map_coordinates(picture.numpy(force=True), at, order=1, mode="nearest")
-    steps = torch.from_numpy(read).diff(dim=-1).clamp_min(0)  # keeps NaN
-    middle = ((across[:, 1:] + across[:, :-1]) / 2)[:, None, None]
+    base = corners[:, :, None] + along_side[:, None] * along[:, :, None]
+    sample_pixels = base[:, :, :, None] + across[:, None, None, :, None] * outward[:, :, None, None]
+    indices = pixels.indices_from_pixels(sample_pixels).flip(-1).movedim(-1, 0).numpy()
+    profiles = map_coordinates(picture.numpy(force=True), indices, order=1, mode="nearest")
+    steps = torch.from_numpy(profiles).diff(dim=-1).clamp_min(0)  # keeps NaN
+    midpoints = ((across[:, 1:] + across[:, :-1]) / 2)[:, None, None]
     total = steps.sum(dim=-1)
-    off = (steps * middle).sum(dim=-1) / total
-    # Lines as their vectors of homogeneous coordinates: cross products join points and meet lines.
-    ends = torch.stack([corners, corners + along], dim=-2) + _line(share, off) * outward[:, :, None]
+    offsets = (steps * midpoints).sum(dim=-1) / total
+    # Homogeneous coordinates: cross products give lines through points and intersections of lines.
+    ends = torch.stack([corners, corners + along], dim=-2)
+    ends = ends + _line(along_side, offsets) * outward[:, :, None]
     lines = torch.linalg.cross(*pixels.homogeneous(ends).unbind(dim=-2))
-    meeting = torch.linalg.cross(lines.roll(1, dims=1), lines)
-    return meeting[..., :2] / meeting[..., 2:]
+    intersections = torch.linalg.cross(lines.roll(1, dims=1), lines)
+    return intersections[..., :2] / intersections[..., 2:]
 
 
 def _line(
-    share: Float[Tensor, " along"], off: Float[Tensor, "square 4 along"]
+    along_side: Float[Tensor, " along"], offsets: Float[Tensor, "square 4 along"]
 ) -> Float[Tensor, "square 4 2 1"]:
-    """Fit lines to offsets along each side with Cauchy's weights; give them at its ends."""
-    known = off.isfinite()
-    values = off.nan_to_num(0)[..., None]
-    basis = torch.stack([1 - share, share], dim=1)  # of both ends
-    predicted = off.nanmedian(dim=-1, keepdim=True).values[..., None]
+    """Fit a line to the edge offsets along each side with Cauchy weights; return it at the ends."""
+    valid = offsets.isfinite()
+    values = offsets.nan_to_num(0)[..., None]
+    basis = torch.stack([1 - along_side, along_side], dim=1)  # of both ends
+    predicted = offsets.nanmedian(dim=-1, keepdim=True).values[..., None]
     for _ in range(3):
-        weighted = basis * (known[..., None] / (1 + ((values - predicted) / 0.3).square()))
-        # Singular where next to nothing is known, which is left out below.
+        weighted = basis * (valid[..., None] / (1 + ((values - predicted) / 0.3).square()))
+        # Singular where hardly any offset is valid; such sides become NaN below.
         ends = torch.linalg.solve_ex(weighted.mT @ basis, weighted.mT @ values).result
         predicted = basis @ ends
-    return torch.where(known.double().mean(dim=-1)[..., None, None] > 0.5, ends, torch.nan)
+    return torch.where(valid.double().mean(dim=-1)[..., None, None] > 0.5, ends, torch.nan)

@@ -1,4 +1,4 @@
-"""Lengths that a person gives; needs neither torch nor photographs."""
+"""Lengths given by the user; needs neither torch nor photographs."""
 
 import re
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import InputError, some
 
 Unit = Literal["mm", "cm", "m", "in"]
-"""Units of length that results may have."""
+"""Units of length for results."""
 
 MILLIMETRES: dict[Unit, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 
@@ -19,14 +19,14 @@ _POINTER = re.compile(rf"(?P<name>.+?),(?P<x>{_NUMBER}),(?P<y>{_NUMBER})(?:\+|$)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PixelMark:
-    """A pixel of a photograph that shows a place.
+    """A pixel of a photograph.
 
     Attributes:
-        name: Of the photograph, with its suffix or without.
+        name: Name of the photograph, with or without its suffix.
         x: Pixels to the right from the corner of the top-left pixel, whose centre is (0.5, 0.5).
-        y: Pixels down from it.
-        size_px: Width and height of the photograph that the pixels are of, the right way up;
-            ``None`` for the size that it was loaded in.
+        y: Pixels down from that corner.
+        size_px: Width and height of the upright photograph to which the pixel refers; ``None``
+            for the size in which it was loaded.
     """
 
     name: str
@@ -40,33 +40,33 @@ class PixelMark:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mark:
-    """One place, pointed at in one photograph or more.
+    """A point in space, marked in one or more photographs.
 
     Attributes:
-        pointers: One alone shows a place on the surface; from two on, it may be anywhere.
+        pointers: A single pixel marks a point on the surface; two or more are triangulated.
     """
 
     pointers: tuple[PixelMark, ...]
 
     @classmethod
     def read(cls, text: str) -> "Mark":
-        """Read ``NAME,x,y``, or several of them with ``+`` between.
+        """Parse ``NAME,x,y``, or several of these joined by ``+``.
 
         >>> Mark.read("a, b.jpg,10,20.5").pointers
         (Pointer(name='a, b.jpg', x=10.0, y=20.5, size_px=None),)
         >>> str(Mark.read("1+1.jpg,10,20+c,7,8"))
         '1+1.jpg,10,20+c,7,8'
         """
-        found, at = [], 0
+        pointers, start = [], 0
         while match := _POINTER.match(text, at):
-            found.append(PixelMark(name=match["name"], x=float(match["x"]), y=float(match["y"])))
+            pointers.append(Pointer(name=match["name"], x=float(match["x"]), y=float(match["y"])))
             at = match.end()
-        if not found or at < len(text) or text.endswith("+"):
+        if not pointers or start < len(text) or text.endswith("+"):
             raise InputError(
-                f"{text!r} is no place in a photograph; needed: NAME,x,y, pixels to the right and "
-                "down from the top-left corner, such as IMG_1.jpg,1200,831.5."
+                f"{text!r} is not a pixel of a photograph; needed: NAME,x,y, in pixels to the "
+                "right and down from the top-left corner, such as IMG_1.jpg,1200,831.5."
             )
-        return cls(pointers=tuple(found))
+        return cls(pointers=tuple(pointers))
 
     def __str__(self) -> str:
         return "+".join(map(str, self.pointers))
@@ -74,10 +74,10 @@ class Mark:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaleBar:
-    """Two places, and how far apart they are.
+    """Two points and the distance between them.
 
     Attributes:
-        length: Between them, in the unit wanted.
+        length: Distance between them, in the unit of the scale.
     """
 
     first: Mark
@@ -89,17 +89,17 @@ class ScaleBar:
 
     @property
     def ends(self) -> tuple[Mark, Mark]:
-        """Both ends."""
+        """Both end points."""
         return self.first, self.second
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraDistance:
-    """Two photographs, and how far apart their cameras stood.
+    """Two photographs and the distance between their cameras.
 
     Attributes:
-        first: Name of a photograph, with its suffix or without.
-        length: Between the centres of projection, in the unit wanted.
+        first: Name of a photograph, with or without its suffix.
+        length: Distance between the centres of projection, in the unit of the scale.
     """
 
     first: str
@@ -111,37 +111,37 @@ class CameraDistance:
 
 
 def measured_in(bars: Sequence[ScaleBar], distances: Sequence[CameraDistance]) -> dict[str, None]:
-    """List the photographs that lengths name, each once, as they are named."""
+    """List the names of photographs in lengths, as given and without duplicates."""
     named = [pointer.name for bar in bars for mark in bar.ends for pointer in mark.pointers]
-    return dict.fromkeys(named + [name for one in distances for name in (one.first, one.second)])
+    return dict.fromkeys(named + [name for pair in distances for name in (pair.first, pair.second)])
 
 
 def number_of(name: str, names: Sequence[str]) -> int:
-    """Find the photograph of a name, with its suffix or without.
+    """Return the index of the photograph with this name, which may lack its suffix.
 
     Args:
-        names: Of all photographs, different from one another.
+        names: Names of all photographs, without duplicates.
 
     >>> number_of("b", ["a.jpg", "b.jpg"])
     1
     """
-    exact = [index for index, known in enumerate(names) if name == known]
-    stems = [index for index, known in enumerate(names) if name == known.rpartition(".")[0]]
-    found = exact or stems
-    if len(found) != 1:
+    exact = [index for index, candidate in enumerate(names) if name == candidate]
+    stems = [index for index, candidate in enumerate(names) if name == candidate.rpartition(".")[0]]
+    matches = exact or stems
+    if len(matches) != 1:
         raise InputError(
-            f"{name!r}: {len(found) or 'none'} of the photographs {'are' if found else 'is'} "
-            f"named so; needed: one of {some(names)}."
+            f"{name!r}: {len(matches) or 'no'} photographs have this name; needed: one of "
+            f"{some(names)}."
         )
-    return found[0]
+    return matches[0]
 
 
 def require_inside(pointer: PixelMark, width: int, height: int) -> None:
-    """Refuse a pixel outside of its photograph."""
+    """Raise an error if a pixel is outside its photograph."""
     if not (0 <= pointer.x <= width and 0 <= pointer.y <= height):
         raise InputError(
-            f"{pointer}: lies outside of the photograph, which has {width} x {height} pixels; "
-            "needed: pixels to the right and down from its top-left corner, the right way up."
+            f"{pointer}: is outside the photograph, which has {width} x {height} pixels; needed: "
+            "pixels to the right and down from the top-left corner of the upright photograph."
         )
 
 

@@ -1,4 +1,4 @@
-"""Positions of the places that a person points at in photographs."""
+"""Positions in space of points marked in photographs."""
 
 from collections.abc import Sequence
 
@@ -16,48 +16,48 @@ from pimper_torch.ground.shapes import Vector
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
 
-# Confidence of a surface below which a warning says that it may be elsewhere. A choice: a half is
-# that of normals which are 8 degrees off.
+# Confidence of the surface below which a warning is given. A choice: normals with an error of 8
+# degrees have one half.
 _UNSURE = 0.5
 
-# Rays of one place: how far they may pass each other, and the least angle between some two.
+# Rays to one point: largest error, as a fraction of the longer side, and least angle between some.
 _PASSING = 0.01
 _MIN_ANGLE_DEG = 1.0
 
 
 def view_of(name: str, scene: SparseScene) -> int:
-    """Find a photograph among those that have a camera."""
+    """Return the index of a photograph among those that have a camera."""
     names = scene.views.names
     if number_of(name, (*names, *scene.unregistered)) >= len(names):
         raise InputError(
-            f"{name}: has no place among the cameras that were found; needed: a photograph that "
-            "has. Measure in another one."
+            f"{name}: this photograph has no camera; needed: a registered photograph. Measure in "
+            "another one."
         )
     return number_of(name, names)
 
 
 def place_of(mark: Mark, result: Reconstruction) -> Vector:
-    """Find where a mark is, world frame, float64.
+    """Return the position of a mark in the world frame, in float64.
 
-    A mark in one photograph is where its ray first meets the surface; if it misses the surface, on
-    the supporting plane, where silhouettes or the cloud determine one. A mark in several is where
-    their rays meet, on the surface or not.
+    The ray of a mark in one photograph is intersected with the surface; if it misses the surface,
+    with the supporting plane, if silhouettes or the cloud determine one. The rays of a mark in
+    several photographs are intersected with each other, on the surface or not.
 
     Args:
-        mark: Pixels of the photographs as they were loaded: the right way up, before undistortion.
+        mark: Pixels of the photographs as they were loaded: upright, before undistortion.
     """
     views = [view_of(pointer.name, result.scene) for pointer in mark.pointers]
     rays = torch.stack(
-        [_ray(one, view, result.scene) for one, view in zip(mark.pointers, views, strict=True)]
+        [_ray(*pointed, result.scene) for pointed in zip(mark.pointers, views, strict=True)]
     )
     eyes = invert_rigid(result.cameras.cam_from_world[views].detach().cpu().double())[:, :3, 3]
     if len(views) > 1:
-        return _meeting(mark, result.scene, views, eyes, rays)
-    return _met(mark.pointers[0], result, views[0], eyes[0], rays[0])
+        return _intersect_rays(mark, result.scene, views, eyes, rays)
+    return _hit(mark.pointers[0], result, views[0], eyes[0], rays[0])
 
 
 def _ray(pointer: PixelMark, view: int, scene: SparseScene) -> Vector:
-    """Return the direction behind a pixel, as long as it goes while its depth grows by 1."""
+    """Return the world direction of a pixel's ray, scaled to a depth of 1."""
     lens = scene.lenses[view]
     width, height = pointer.size_px or (lens.width, lens.height)
     require_inside(pointer, width, height)
@@ -67,45 +67,45 @@ def _ray(pointer: PixelMark, view: int, scene: SparseScene) -> Vector:
     plane = undistort_pixels(lens, pixel)[0]
     if not bool(plane.isfinite().all()):
         raise InputError(
-            f"{pointer}: its lens ({lens.model}) images nothing there. Point at the place in "
-            "another photograph, nearer to the middle."
+            f"{pointer}: no ray of its lens ({lens.model}) reaches this pixel. Mark the point in "
+            "another photograph, nearer to the centre."
         )
     rotation = scene.cameras.cam_from_world[view, :3, :3].detach().cpu().double()
     return torch.cat([plane, torch.ones_like(plane[:1])]) @ rotation
 
 
-def _meeting(
+def _intersect_rays(
     mark: Mark,
     scene: SparseScene,
     views: Sequence[int],
     eyes: Float[Tensor, "ray 3"],
     rays: Float[Tensor, "ray 3"],
 ) -> Vector:
-    """Find the point nearest to rays in the least-squares sense."""
+    """Return the least-squares intersection of rays."""
     unit = rays / rays.norm(dim=1, keepdim=True)
     widest = float((unit @ unit.mT).clamp(-1, 1).acos().rad2deg().max())
     if widest < _MIN_ANGLE_DEG:
         raise InputError(
-            f"{mark}: these rays differ by {widest:.2g} degrees; needed: {_MIN_ANGLE_DEG:g} at "
-            "least. Point at the place in photographs that were taken farther apart."
+            f"{mark}: the rays of these pixels differ by {widest:.2g} degrees; needed: at least "
+            f"{_MIN_ANGLE_DEG:g}. Mark the point in photographs from viewpoints farther apart."
         )
-    across = torch.eye(3).double() - unit[:, :, None] * unit[:, None, :]
-    point = torch.linalg.solve(across.sum(dim=0), (across @ eyes[..., None]).sum(dim=0)[:, 0])
+    projector = torch.eye(3).double() - unit[:, :, None] * unit[:, None, :]
+    point = torch.linalg.solve(projector.sum(dim=0), (projector @ eyes[..., None]).sum(dim=0)[:, 0])
     offset = point - eyes
-    off = (across @ offset[..., None])[..., 0].norm(dim=1) / offset.norm(dim=1)
-    for pointer, view, one in zip(mark.pointers, views, off.tolist(), strict=True):
+    sines = (projector @ offset[..., None])[..., 0].norm(dim=1) / offset.norm(dim=1)
+    for pointer, view, sine in zip(mark.pointers, views, sines.tolist(), strict=True):
         lens = scene.lenses[view]
         focal = float(scene.cameras.intrinsics[view, 0, 0])
-        if one * focal > _PASSING * max(lens.width, lens.height):
+        if sine * focal > _PASSING * max(lens.width, lens.height):
             raise InputError(
-                f"{mark}: {pointer} is {one * focal:.0f} pixels from where the others place it; "
-                f"needed: one place in all of them, to {_PASSING:.0%} of the photograph."
+                f"{mark}: {pointer} is {sine * focal:.0f} pixels from the point that the others "
+                f"mark; needed: the same point in all, within {_PASSING:.0%} of the longer side."
             )
     return point
 
 
-def _met(pointer: PixelMark, result: Reconstruction, view: int, eye: Vector, ray: Vector) -> Vector:
-    """Find where a ray first meets the surface, else touches it, else meets the ground."""
+def _hit(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: Vector) -> Vector:
+    """Return the first point of a ray on the surface, else near its border, else on the plane."""
     mesh = result.mesh.detach().to("cpu", torch.float64)
     hits = RayCaster(mesh.vertices_world, mesh.faces).cast(eye, ray[None])
     if int(hits.face) >= 0:
@@ -113,24 +113,22 @@ def _met(pointer: PixelMark, result: Reconstruction, view: int, eye: Vector, ray
         a, b, c = mesh.vertices_world[corners]
         if float(torch.linalg.cross(b - a, c - a) @ ray) > 0:
             raise InputError(
-                f"{pointer}: the ray behind this pixel goes through an opening of the surface. "
-                "Point at a part that the result shows, or at the place in two photographs: "
-                "NAME1,x,y+NAME2,x,y."
+                f"{pointer}: the ray of this pixel goes through an opening of the surface. Mark a "
+                "point on the surface, or mark this point in two photographs: NAME1,x,y+NAME2,x,y."
             )
-        sure = None if mesh.confidence is None else float(mesh.confidence[corners].mean())
-        if sure is not None and sure < _UNSURE:
+        confidence = None if mesh.confidence is None else float(mesh.confidence[corners].mean())
+        if confidence is not None and confidence < _UNSURE:
             caution(
-                f"{pointer}: photographs hardly determine the surface there: its confidence is "
-                f"{sure:.2f}, and {_UNSURE:g} or more is needed for a size to rely on. Point at a "
-                "part that more photographs show, or at the place in two of them: "
-                "NAME1,x,y+NAME2,x,y.",
+                f"{pointer}: the photographs hardly determine the surface there: its confidence is "
+                f"{confidence:.2f}; needed for a reliable scale: {_UNSURE:g} or more. Mark a point "
+                "in more photographs, or this point in two photographs: NAME1,x,y+NAME2,x,y.",
                 stacklevel=3,
             )
         hits = hits.refined(mesh.vertices_world, mesh.faces, eye, ray[None])
         return eye + float(hits.distance) * ray
-    beside = _beside(pointer, result, mesh, view, eye, ray)
-    if beside is not None:
-        return beside
+    near_border = _near_border(pointer, result, mesh, view, eye, ray)
+    if near_border is not None:
+        return near_border
     plane = ground(result.scene, result.silhouettes)
     if plane is not None:
         rate = float(plane.normal_world.double() @ ray)
@@ -138,46 +136,46 @@ def _met(pointer: PixelMark, result: Reconstruction, view: int, eye: Vector, ray
         if rate < 0 < height:
             return eye - height / rate * ray
     raise InputError(
-        f"{pointer}: the ray behind this pixel misses the surface, and the plane that the object "
-        "stands on is not known there. Point at the object, or at the place in two photographs: "
-        "NAME1,x,y+NAME2,x,y. What stages found is kept: the same command goes on from there."
+        f"{pointer}: the ray of this pixel misses the surface, and the supporting plane is unknown "
+        "there. Mark a point on the object, or mark this point in two photographs: "
+        "NAME1,x,y+NAME2,x,y. Finished stages are kept: the same command continues from there."
     )
 
 
 def _beside(
     pointer: PixelMark, result: Reconstruction, mesh: Mesh, view: int, eye: Vector, ray: Vector
 ) -> Vector | None:
-    """Return the point of a ray next to the nearest vertex, if the surface is near the pixel."""
+    """Return the ray's point at the depth of the vertex nearest to the pixel, if that is near."""
     cameras = result.cameras.detach().to("cpu", torch.float64)
     pose, intrinsics = cameras.cam_from_world[view], cameras.intrinsics[view]
     pixels, depth = project(mesh.vertices_world, pose, intrinsics)
     (pixel,), _ = project((eye + ray)[None], pose, intrinsics)
-    off = torch.where(depth > 0, (pixels - pixel).norm(dim=1), torch.inf)
-    nearest = int(off.argmin())
+    distance_px = torch.where(depth > 0, (pixels - pixel).norm(dim=1), torch.inf)
+    nearest = int(distance_px.argmin())
     column, row = (int(side) for side in pixel.floor())
     silhouettes = result.silhouettes
-    drawn = silhouettes.masks[view]
-    within = 0 <= row < drawn.shape[0] and 0 <= column < drawn.shape[1]
-    on = silhouettes.source != "everything" and within and bool(drawn[row, column])
+    mask = silhouettes.masks[view]
+    in_frame = 0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]
+    in_silhouette = silhouettes.source != "everything" and in_frame and bool(mask[row, column])
     longer = int(cameras.sizes_px[view].max())
-    # A surface ends a little inside of the object that it shows.
-    if float(off[nearest]) > max(2.0, 0.01 * longer if on else 0.0):
-        if on:
+    # A surface ends slightly inside the object's outline.
+    if float(distance_px[nearest]) > max(2.0, 0.01 * longer if in_silhouette else 0.0):
+        if in_silhouette:
             raise InputError(
-                f"{pointer}: the silhouette says that this pixel shows the object, but the surface "
-                "is missing there. Point at a part that the result shows, or at the place in two "
-                "photographs: NAME1,x,y+NAME2,x,y."
+                f"{pointer}: this pixel is in the silhouette, but the surface is missing there. "
+                "Mark a point on the surface, or mark this point in two photographs: "
+                "NAME1,x,y+NAME2,x,y."
             )
         return None
     return eye + float(depth[nearest]) * ray
 
 
 def ground(scene: SparseScene, silhouettes: Silhouettes) -> supporting_plane.Plane | None:
-    """Return the supporting plane of the object: the silhouettes', else that of the cloud."""
+    """Return the supporting plane from the silhouettes, else from the cloud."""
     if len(silhouettes.planes_world):
-        found = silhouettes.planes_world[0].detach().cpu()  # of the first series, whose up is up
-        length = found[:3].norm()
-        return supporting_plane.Plane(normal_world=found[:3] / length, offset=-found[3] / length)
+        plane = silhouettes.planes_world[0].detach().cpu()  # the first session's up is the world's
+        length = plane[:3].norm()
+        return supporting_plane.Plane(normal_world=plane[:3] / length, offset=-plane[3] / length)
     cameras = scene.cameras.detach().to("cpu")
     points = scene.points_world.detach()[supporting_plane.well_tracked(scene)].cpu()
     distance = float(supporting_plane.fixation(cameras.cam_from_world).distance)

@@ -1,4 +1,4 @@
-"""The factor from a result's own unit to a known one, and how well its sources agree."""
+"""Factor from scene units to a known unit, and how well its sources agree."""
 
 import math
 from collections.abc import Sequence
@@ -10,23 +10,22 @@ from pimper_torch.records import Record
 from pimper_torch.runtime.errors import InputError, caution
 
 Source = Literal["scale bars", "markers", "camera distances"]
-# From the most accurate to the least: two places that a person clicked on the surface; printed
-# corners, whose paper may be wavy; cameras, whose centres nobody can touch.
+# From most to least accurate: two points clicked on the surface; printed corners, on paper that may
+# be wavy; centres of cameras, which no ruler can reach.
 _SOURCES: tuple[Source, ...] = get_args(Source)
 
 AGREEING = 0.02
-"""Relative difference of lengths up to which they do not contradict one another. A choice: a
-ruler's millimetre in five centimetres."""
+"""Largest relative difference between consistent lengths. A choice: a ruler's millimetre in five
+centimetres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scale(Record):
-    """Factor that brings lengths to a known unit.
+    """Factor from scene units to a known unit.
 
     Attributes:
-        factor: Of a result in its own unit.
-        residual: Root mean square of what single lengths are off, as a fraction of each; NaN where
-            there is one length only.
+        factor: Multiplies lengths in scene units.
+        residual: Root mean square of the relative errors of the lengths; NaN for a single length.
     """
 
     factor: float
@@ -42,64 +41,66 @@ class Scale(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Length(Record):
-    """A distance in a result, and how long it is.
+    """A distance in a result, and its true length.
 
     Attributes:
-        found: In the result's unit.
-        known: In the unit wanted.
+        measured: In scene units.
+        true: In the unit of the scale.
+        label: Name of the distance in messages.
     """
 
-    found: float
-    known: float
-    what: str
+    measured: float
+    true: float
+    label: str
 
 
-def fitted(lengths: Sequence[Length], unit: Unit, source: Source) -> Scale:
-    r"""Find the factor by least squares, :math:`\min_f \sum (f d - L)^2`.
+def fit_scale(lengths: Sequence[Length], unit: Unit, source: Source) -> Scale:
+    r"""Fit the scale by least squares, :math:`\min_f \sum (f d - L)^2`.
 
-    A warning names lengths that contradict one another by more than :data:`AGREEING`.
+    A warning names lengths that contradict each other by more than :data:`AGREEING`.
     """
     for length in lengths:
-        if not (length.found > 0 and length.known > 0):
+        if not (length.measured > 0 and length.true > 0):
             raise InputError(
-                f"{length.what}: is {length.found:g} in the result and {length.known:g} {unit} in "
-                "truth; needed: two places apart, and a length above 0."
+                f"{length.label}: is {length.measured:g} in the result, and {length.true:g} {unit} "
+                "is given; needed: two different points, and a length above 0."
             )
-    factor = sum(one.known * one.found for one in lengths) / sum(one.found**2 for one in lengths)
-    off = [factor * one.found / one.known - 1 for one in lengths]
-    alone = len(lengths) == 1
-    residual = math.nan if alone else math.sqrt(sum(one**2 for one in off) / len(off))
-    if max(map(abs, off)) > AGREEING:
-        told = "; ".join(
-            f"{one.what} is {factor * one.found:.4g} {unit} instead of {one.known:.4g} ({by:+.1%})"
-            for one, by in zip(lengths, off, strict=True)
+    squares = sum(length.measured**2 for length in lengths)
+    factor = sum(length.true * length.measured for length in lengths) / squares
+    errors = [factor * length.measured / length.true - 1 for length in lengths]
+    single = len(lengths) == 1
+    residual = math.nan if single else math.sqrt(sum(error**2 for error in errors) / len(errors))
+    if max(map(abs, errors)) > AGREEING:
+        rows = "; ".join(
+            f"{d.label} is {factor * d.measured:.4g} {unit} instead of {d.true:.4g} ({error:+.1%})"
+            for d, error in zip(lengths, errors, strict=True)
         )
         caution(
-            f"The {source} contradict one another by more than {AGREEING:.0%}: {told}. The size is "
-            "that of least squares. Measure again what is farthest off, or leave it out.",
+            f"The {source} contradict each other by more than {AGREEING:.0%}: {rows}. The scale is "
+            "their least-squares fit. Measure the one with the largest error again, or remove it.",
             stacklevel=2,
         )
     return Scale(factor=factor, unit=unit, source=source, residual=residual, count=len(lengths))
 
 
 def most_accurate(scales: Sequence[Scale]) -> Scale | None:
-    """Take the most accurate of several scales; warn where others contradict it.
+    """Return the scale from the most accurate source, and warn if others contradict it.
 
-    Scale bars come before markers, and markers before camera distances.
+    Scale bars are preferred to markers, and markers to camera distances.
 
     Args:
-        scales: Of one result, one a source, in one unit.
+        scales: Scales of the same result in the same unit, one per source.
     """
     if not scales:
         return None
     best, *others = sorted(scales, key=lambda scale: _SOURCES.index(scale.source))
     for other in others:
-        off = other.factor / best.factor - 1
-        if abs(off) > AGREEING:
+        difference = other.factor / best.factor - 1
+        if abs(difference) > AGREEING:
             caution(
-                f"The {best.source} and the {other.source} give sizes that differ by {off:+.1%}. "
-                f"Taken are the {best.source}. Check the other lengths and their unit, and whether "
-                "a printer scaled the markers.",
+                f"The {best.source} and the {other.source} give scales that differ by "
+                f"{difference:+.1%}. The {best.source} are used. Check the other lengths and their "
+                "unit, and whether the printer scaled the markers.",
                 stacklevel=2,
             )
     return best

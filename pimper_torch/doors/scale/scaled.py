@@ -1,4 +1,4 @@
-"""A result in another unit of length."""
+"""Conversion of a result to a different unit of length."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -26,36 +26,35 @@ POWERS: Mapping[type[Record], Mapping[str, int]] = {
     records.DepthPrior: {"depth": 1, "variance": 2},
     records.Surface: {"vertices_world": 1, "expected_error": 1, "height_information": -2},
 }
-"""Which power of a length each field is; fields that are not named have no unit, or hold others."""
+"""Power of length of each field; other fields have no unit, or contain records."""
 
 POSES: Mapping[type[Record], str] = {
     records.Cameras: "cam_from_world",
     records.Templates: "patch_from_world",
 }
-"""Rigid transforms, whose shift is a length."""
+"""Rigid transforms; their translation is a length."""
 
 LAST: Mapping[type[Record], str] = {
     records.Depths: "transform",
     records.Silhouettes: "planes_world",
 }
-"""Vectors of which the last entry alone is a length."""
+"""Vectors; only their last entry is a length."""
 
 # Figures of stages in scene units.
 _FIGURES = ("mismatch", "mismatch_before")
 
 
 def scaled(record: AnyRecord, factor: float) -> AnyRecord:
-    """Return a result, or a part of one, in another unit: every length times a factor.
+    """Return a result, or a record of it, with every length multiplied by a factor.
 
-    Vertices, expected errors, cameras, cloud, templates and their heights, covariances and inverse
-    variances, the supporting plane, and ``offset_world``. Photographs, normals, albedo and lights
-    have no unit and are shared with ``record``; fields that share an object still do.
+    This includes vertices, expected errors, cameras, cloud, templates and their heights,
+    covariances and inverse variances, the supporting plane, and ``offset_world``. Photographs,
+    normals, albedo and lights have no unit and are shared with ``record``. Fields that share an
+    object still share it. Differentiable in the record's tensors.
 
     Args:
         record: Of a run, such as a :class:`~pimper_torch.records.Reconstruction`.
-        factor: Of the new unit's numbers to the old one's.
-
-    Differentiable in the record's tensors.
+        factor: Ratio of numbers in the new unit to those in the old unit.
 
     >>> import torch
     >>> from pimper_torch.records import Mesh
@@ -66,12 +65,12 @@ def scaled(record: AnyRecord, factor: float) -> AnyRecord:
             [25.4000, 25.4000,  0.0000]])
     """
     require(0 < factor < float("inf"), "factor", factor, "above 0 and finite")
-    found: AnyRecord = record if factor == 1 else _copy(record, factor, {})
-    return found
+    converted: AnyRecord = record if factor == 1 else _copy(record, factor, {})
+    return converted
 
 
 def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: ANN401 - of any field
-    """Scale the value of a field; each object once."""
+    """Scale the value of a field; each object is copied once."""
     if isinstance(value, tuple) and any(isinstance(item, Record) for item in value):
         return tuple(_copy(item, factor, copies) for item in value)
     if not isinstance(value, Record):
@@ -92,7 +91,7 @@ def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: AN
         if new is not value:
             changes[field.name] = new
     if isinstance(record, records.SparseScene):
-        changes["offset_world"] = tuple(factor * one for one in record.offset_world)
+        changes["offset_world"] = tuple(factor * length for length in record.offset_world)
     if isinstance(record, records.StageReport) and set(_FIGURES) & record.figures.keys():
         figures = record.figures
         changes["figures"] = {
