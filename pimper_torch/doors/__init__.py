@@ -1,1 +1,1 @@
-"""What comes in and goes out: photographs, cameras, meshes, folders of results, real size."""
+"""Input and output: photographs, cameras, meshes, result folders, metric scale."""

@@ -220,8 +220,8 @@ def test_the_lock_of_a_running_process_is_reported_and_kept(world):
         assert is_whole(recorder.tasks[0])
     assert found.status == "waiting"
     for said in (
-        f"{world.out / 'ball'}: another run writes there: process {os.getpid()} on {node()} since",
-        "Wait until it has ended, end it where it hangs, or write elsewhere.",
+        f"{world.out / 'ball'}: another run is writing to it: process {os.getpid()} on {node()}",
+        "Wait until it ends, end it if it hangs, or write elsewhere.",
     ):
         assert said in found.message
     assert world.begun("ball") == 1
@@ -266,7 +266,7 @@ def test_a_second_batch_into_the_same_folder_is_refused(world):
     world.add("ball")
     with (
         locked(world.out.resolve(), world.out),
-        pytest.raises(OutputError, match="another run writes there"),
+        pytest.raises(OutputError, match="another run is writing to it"),
     ):
         world.batch()
 

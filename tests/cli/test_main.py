@@ -155,7 +155,7 @@ def test_a_user_error_is_one_message(reconstruct, chain, tmp_path, capsys, argum
 def test_an_occupied_out_is_refused_before_photographs_are_read(reconstruct, tmp_path, capsys):
     assert reconstruct() == 0
     assert run("reconstruct", tmp_path / "nowhere", "-o", tmp_path / "out") == 2
-    assert "out: already holds albedo.png" in capsys.readouterr().err
+    assert "out: already contains albedo.png" in capsys.readouterr().err
     assert reconstruct("--overwrite") == 0
     assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
 

@@ -40,7 +40,7 @@ def test_an_input_in_the_results_folder_is_refused(
         given = place / ("mesh.ply" if option == "--mesh" else "sparse")
         for flags in ([], ["--overwrite"]):
             assert run("reconstruct", photos, "-o", project, option, given, *flags) == 2
-            assert f"{option} ({given}) lies in the folder" in capsys.readouterr().err
+            assert f"{option} ({given}) is inside the result folder" in capsys.readouterr().err
     assert run("reconstruct", project, "-o", project, "--overwrite") == 2
     assert "PHOTOS" in capsys.readouterr().err
     assert contents(project) == before
@@ -61,7 +61,7 @@ def test_user_files_in_a_scene_folder_are_not_overwritten(tmp_path, capsys):
         mine.unlink()
     mesh = tmp_path / "out" / "truth" / "mesh.ply"
     assert run("render", mesh, "-o", tmp_path / "out", "--overwrite") == 2
-    assert "lies in the folder of the result" in capsys.readouterr().err
+    assert "is inside the result folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_inputs_inside_the_output_of_other_commands_are_refused(project, capsys,
     assert run(*line.format(own=project, other=project.parent).split(), "--overwrite") == 2
     message = capsys.readouterr().err
     assert expected in message
-    assert "lies in the folder of the result" in message
+    assert "is inside the result folder" in message
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "demo", "render", "bench", "convert", "export"])
@@ -103,7 +103,7 @@ def test_a_folder_in_use_by_a_run_is_refused(photos, chain, tmp_path, capsys, co
         other.start()
         other.join()
     assert codes == [2]
-    assert "another run writes there: process" in capsys.readouterr().err
+    assert "another run is writing to it: process" in capsys.readouterr().err
     assert chain.given is None
     assert not (tmp_path / "out").exists()
 

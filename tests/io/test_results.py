@@ -194,7 +194,7 @@ def test_numbers_without_json_form_become_null(reconstruction):
 def test_a_failure_while_writing_keeps_the_former_result(reconstruction, tmp_path, monkeypatch):
     out = tmp_path / "out"
     write_result(reconstruction, Config(zeta=1.0), out)
-    with pytest.raises(OutputError, match=r"already holds albedo\.png"):
+    with pytest.raises(OutputError, match=r"already contains albedo\.png"):
         write_result(reconstruction, Config(zeta=2.0), out)
 
     def fail(*_):
@@ -240,7 +240,7 @@ def test_the_page_shows_the_surface_and_its_layers(reconstruction, tmp_path):
     [
         ("file", "file: is a file"),
         ("file/out", "out: cannot be written"),
-        ("new", "cannot be written, as .* refuses"),
+        ("new", "cannot be written, as .* not a writable folder"),
     ],
 )
 def test_a_folder_that_cannot_be_written_is_refused_beforehand(tmp_path, monkeypatch, name, why):

@@ -74,7 +74,7 @@ def test_the_marker_lists_the_written_files(out):
 
 
 def test_a_result_is_replaced_only_on_request(out):
-    with pytest.raises(OutputError, match=r"already holds masks, mesh\.ply, sparse"):
+    with pytest.raises(OutputError, match=r"already contains masks, mesh\.ply, sparse"):
         write(out, result("second"))
     write(out, result("second"), overwrite=True)
     assert contents(out) == result("second")  # and the mask is gone
@@ -98,11 +98,11 @@ SPOILED = {
     r"notes\.txt": lambda out: fill(out, {"notes.txt": "years of work"}),
     r"sparse/mine\.txt": lambda out: fill(out, {"sparse/mine.txt": "years of work"}),
     r"masks/old/b\.png": lambda out: fill(out, {"masks/old/b.png": "years of work"}),
-    "holds new, ": lambda out: (out / "new").mkdir(),
+    "contains new, ": lambda out: (out / "new").mkdir(),
     r"masks/a\.png \(changed since it was written\)": lambda out: change(out / "masks" / "a.png"),
     r"mesh\.ply": lambda out: link(out / "mesh.ply"),
     "sparse, ": lambda out: link(out / "sparse"),
-    "no list of what a former run wrote": lambda out: (out / MARKER).unlink(),
+    "not the list of files of a previous run": lambda out: (out / MARKER).unlink(),
 }
 
 
@@ -130,7 +130,7 @@ def test_the_marker_of_a_former_version_is_read(out):
 
 
 def test_an_output_folder_of_a_different_kind_is_not_replaced(out):
-    with pytest.raises(OutputError, match="holds a result, and is not overwritten by a scene"):
+    with pytest.raises(OutputError, match="contains a result, and is not overwritten by a scene"):
         prepare_output(out, "scene", overwrite=True)
 
 
@@ -148,7 +148,7 @@ def test_an_invalid_marker_is_not_trusted(out, change):
     if not isinstance(change, str):
         change = json.dumps(change(json.loads((out / MARKER).read_text())))
     (out / MARKER).write_bytes(change.encode("utf-8", "surrogateescape"))
-    with pytest.raises(OutputError, match="no list of what a former run wrote"):
+    with pytest.raises(OutputError, match="not the list of files of a previous run"):
         write(out, result("second"), overwrite=True)
 
 
@@ -179,11 +179,11 @@ def test_stored_stages_survive_a_replacement_without_a_copy(out):
 
 def test_a_foreign_folder_of_stages_is_refused(tmp_path):
     fill(tmp_path / "out" / STAGES, {"act_one.txt": "a play"})
-    with pytest.raises(OutputError, match="which pimper did not make"):
+    with pytest.raises(OutputError, match="is not from pimper"):
         prepare_output(tmp_path / "out", "result", overwrite=True)
     (tmp_path / "linked").mkdir()
     (tmp_path / "linked" / STAGES).symlink_to(tmp_path / "out" / STAGES)
-    with pytest.raises(OutputError, match="which pimper did not make"):
+    with pytest.raises(OutputError, match="is not from pimper"):
         prepare_output(tmp_path / "linked", "result")
 
 
@@ -312,7 +312,7 @@ def test_a_second_run_is_refused_and_a_killed_one_leaves_no_lock(out, tmp_path):
         with (
             run_that_holds(folder) as number,
             pytest.raises(
-                OutputError, match=rf"another run writes there: process {number} on .*-c"
+                OutputError, match=rf"another run is writing to it: process {number} on .*-c"
             ),
         ):
             write(folder, result("second"), overwrite=True)
@@ -326,7 +326,7 @@ def test_a_second_run_is_refused_and_a_killed_one_leaves_no_lock(out, tmp_path):
 @pytest.mark.parametrize("former", [True, False])
 def test_remains_of_a_killed_run_are_cleaned(out, tmp_path, capsys, former):
     folder = out if former else tmp_path / "fresh"
-    with run_that_holds(folder), pytest.raises(OutputError, match="another run writes there"):
+    with run_that_holds(folder), pytest.raises(OutputError, match="another run is writing to it"):
         clean_output(folder)
     assert (folder / STAGES / "mesh.pt").exists()
     assert main(["clean", str(folder), "--json"]) == 0
@@ -361,7 +361,7 @@ def test_a_second_thread_is_refused_and_a_nested_block_is_not(tmp_path):
         thread.start()
         thread.join()
         write(tmp_path / "out", result("first"))
-    assert "another run writes there" in refused[0]
+    assert "another run is writing to it" in refused[0]
     assert contents(tmp_path / "out") == result("first")
 
 
@@ -394,7 +394,7 @@ def test_the_new_folder_of_a_run_without_files_is_removed(tmp_path):
 def test_an_interrupted_run_names_the_folder_of_its_stages(tmp_path):
     with pytest.raises(KeyboardInterrupt) as raised, held_output(tmp_path / "out", "result"):
         fill(tmp_path / "out" / STAGES, {"mesh.pt": "kept"}, KeyboardInterrupt())
-    assert f"What was finished is kept in {tmp_path}/out/{STAGES}" in raised.value.__notes__[0]
+    assert f"Finished stages are kept in {tmp_path}/out/{STAGES}" in raised.value.__notes__[0]
     assert held(tmp_path / "out") == [STAGES]
     write(tmp_path / "out", result("first"))  # no --overwrite: there is no result yet
     assert contents(tmp_path / "out") == result("first")

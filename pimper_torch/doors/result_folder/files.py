@@ -1,4 +1,4 @@
-"""Single files of results: whole or not at all, and in the place of our own alone."""
+"""Output files: written completely or not at all, and replacing only files of this package."""
 
 import os
 import secrets
@@ -11,20 +11,20 @@ from pimper_torch.runtime.errors import OutputError, PimperError
 
 
 def prepare_file(path: Path, overwrite: bool, sign: str) -> None:
-    """Refuse, before the work, a file that cannot be written or is not ours.
+    """Check, before any work, that a file can be written, and is of this kind if it exists.
 
     Args:
-        sign: Text that every file of this kind holds.
+        sign: Text that every file of this kind contains.
     """
     require_name(path.resolve(), OutputError)
     if not path.resolve().parent.is_dir():
-        raise OutputError(f"{path}: its folder is not there. Make it, or write elsewhere.")
+        raise OutputError(f"{path}: its folder does not exist. Create it, or write elsewhere.")
     if not path.exists():
         return
     if not path.is_file():
-        raise OutputError(f"{path}: is no ordinary file. Write elsewhere.")
+        raise OutputError(f"{path}: is not a regular file. Write elsewhere.")
     if not overwrite:
-        raise OutputError(f"{path}: is there already. Write elsewhere, or add `--overwrite`.")
+        raise OutputError(f"{path}: already exists. Write elsewhere, or add `--overwrite`.")
     if sign.encode() not in path.read_bytes():
         raise OutputError(
             f"{path}: was not written by this command, so it is not overwritten. Write elsewhere."
@@ -33,10 +33,10 @@ def prepare_file(path: Path, overwrite: bool, sign: str) -> None:
 
 @contextmanager
 def file_written_whole(path: Path) -> Iterator[Path]:
-    """Return the name of a file to write, which takes the place of ``path`` when all went well.
+    """Yield the path of a temporary file, which replaces ``path`` if the block succeeds.
 
     Raises:
-        OutputError: The disk refuses; then what was there is there still.
+        OutputError: Writing failed; ``path`` is then unchanged.
     """
     target = path.resolve()
     fresh = target.with_name(f".pimper-{secrets.token_hex(4)}.new")
@@ -52,11 +52,7 @@ def file_written_whole(path: Path) -> Iterator[Path]:
 
 
 def require_name(name: Path | str, error: type[PimperError]) -> None:
-    """Refuse, before any work, a name that libraries and files of text cannot hold.
-
-    Args:
-        error: What is raised where it is not UTF-8.
-    """
-    shown = fspath(name).encode("utf-8", "backslashreplace").decode()
-    if shown != fspath(name):
-        raise error(f"{shown}: the name is not UTF-8; needed: one that is. Rename it.")
+    """Raise ``error`` for a name that is not UTF-8: libraries and text files cannot contain it."""
+    printable = fspath(name).encode("utf-8", "backslashreplace").decode()
+    if printable != fspath(name):
+        raise error(f"{printable}: the name is not UTF-8; needed: a name in UTF-8. Rename it.")

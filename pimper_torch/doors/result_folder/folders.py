@@ -1,9 +1,9 @@
-"""Folders of results: all of a result, or nothing, and nothing that somebody else put there.
+"""Result folders: a complete result or none, and no file of others is removed.
 
-A result is filled in ``.stages/new`` inside its folder, where the lock of the folder guards it. It
-is whole when its list is there, the last file written. Then the former result's files are removed,
-and those of the new one are renamed to their places, the list last: a folder with its list holds
-a whole result. Where a run is killed in between, the next one goes on from there.
+A result is written to ``.stages/new`` inside its folder, guarded by the folder's lock. Its list of
+files is written last and marks it as complete. Then the files of the previous result are removed,
+and the new ones are renamed to their places, the list last: a folder with its list contains a
+complete result. If a run is killed in between, the next one continues from there.
 """
 
 import os
@@ -26,46 +26,48 @@ from pimper_torch.doors.result_folder.marker import (
 from pimper_torch.doors.result_folder.stages import NEW, is_ours, kept, locked, resumption
 from pimper_torch.runtime.errors import InputError, OutputError, some
 
-# What this run holds: what it calls may write there.
+# Folders that this run has locked; nested blocks may write to them.
 _held: ContextVar[frozenset[Path]] = ContextVar("held_outputs", default=frozenset())
 
 
 def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> None:
-    """Check, before the work, that its result can be written; leaves no trace.
+    """Check, before any work, that a result can be written; changes nothing on disk.
 
     Args:
-        folder: New, or empty but for what a former run kept.
-        overwrite: Replace a former result of that kind, if nothing but its own files is there, none
-            of them changed since.
+        folder: New, or empty except for stages kept by a previous run.
+        overwrite: Accept a previous result of the same kind, if the folder contains only its
+            files and none was changed since.
     """
     folder = Path(folder)
     require_name(folder.resolve(), OutputError)
     if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; needed: a folder that is new or empty.")
+        raise OutputError(f"{folder}: is a file; needed: a new or empty folder.")
     if os.path.lexists(folder / STAGES) and not is_ours(folder / STAGES):
-        raise OutputError(f"{folder}: holds {STAGES}, which pimper did not make. Write elsewhere.")
-    place = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.exists())
-    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-        raise OutputError(f"{folder}: cannot be written, as {place} refuses. Write elsewhere.")
-    there = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
-    present = [name for name in there if name != STAGES]
+        raise OutputError(f"{folder}: {STAGES} in it is not from pimper. Write elsewhere.")
+    parent = next(path for path in (folder.resolve(), *folder.resolve().parents) if path.exists())
+    if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+        raise OutputError(
+            f"{folder}: cannot be written, as {parent} is not a writable folder. Write elsewhere."
+        )
+    entries = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+    present = [name for name in entries if name != STAGES]
     if not present:
         return
     if not overwrite:
         names = [name for name in present if name != MARKER] or present
         raise OutputError(
-            f"{folder}: already holds {some(names)}; needed: a new or empty folder. Write "
-            "elsewhere, or replace a former result by `--overwrite` (`overwrite=True`)."
+            f"{folder}: already contains {some(names)}; needed: a new or empty folder. Write "
+            "elsewhere, or replace a previous result with `--overwrite` (`overwrite=True`)."
         )
     lists = _lists(folder)
     if not lists:
         raise OutputError(
-            f"{folder}: holds {some(present)}, but no list of what a former run wrote ({MARKER}), "
-            "so it is not overwritten. Write elsewhere, or remove it yourself."
+            f"{folder}: contains {some(present)}, but not the list of files of a previous run "
+            f"({MARKER}), so it is not overwritten. Write elsewhere, or remove it yourself."
         )
-    if others := {one.kind for one in lists} - {kind}:
+    if others := {files.kind for files in lists} - {kind}:
         raise OutputError(
-            f"{folder}: holds a {others.pop()}, and is not overwritten by a {kind}. Write "
+            f"{folder}: contains a {others.pop()}, and is not overwritten by a {kind}. Write "
             "elsewhere."
         )
     _require_ours(folder, lists)
@@ -73,17 +75,17 @@ def prepare_output(folder: Path | str, kind: Kind, overwrite: bool = False) -> N
 
 @contextmanager
 def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """Hold a folder of results for a run: no other run writes there.
+    """Lock a result folder for a run, so that no other run writes to it.
 
-    What a killed run left is removed, or put in its place where it was whole. A folder that was
-    made for the block, and in which nothing was kept or written, is removed at its end. A block
-    inside another block is part of it.
+    A result that a killed run left is installed if it was complete, else removed. A folder that was
+    created for the block is removed at its end if nothing was kept or written in it. Nested blocks
+    for the same folder share the lock.
 
     Yields:
-        The folder, without links.
+        The folder, with links resolved.
 
     Raises:
-        OutputError: As :func:`prepare_output`, or another run holds the folder.
+        OutputError: As :func:`prepare_output`, or a different run has locked the folder.
     """
     folder = Path(folder)
     prepare_output(folder, kind, overwrite)
@@ -91,11 +93,11 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
     if target in _held.get():
         yield target
         return
-    made = [path for path in (target, *target.parents) if not path.exists()]
+    created = [path for path in (target, *target.parents) if not path.exists()]
     try:
         with locked(target, folder):
-            with _refused_by_the_disk(folder):
-                put_in_place(target)
+            with _disk_errors(folder):
+                install(target)
             prepare_output(folder, kind, overwrite)
             token = _held.set(_held.get() | {target})
             try:
@@ -107,27 +109,26 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
             finally:
                 _held.reset(token)
     finally:
-        for path in made:
-            with suppress(OSError):  # something was written or kept
+        for path in created:
+            with suppress(OSError):  # not empty
                 path.rmdir()
 
 
 @contextmanager
 def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> Iterator[Path]:
-    """Return a folder to fill, which becomes the result in ``folder`` when all went well.
+    """Yield an empty folder, which becomes the result in ``folder`` if the block succeeds.
 
-    A former result is replaced only when the new one is complete and on the disk. What a run kept
-    for the next one stays.
+    A previous result is replaced only when the new one is complete and on the disk. Stages kept for
+    the next run stay.
 
     Args:
-        folder: New, or empty but for what a former run kept; its parents are made.
+        folder: New, or empty except for stages kept by a previous run; its parents are created.
 
     Raises:
-        OutputError: As :func:`held_output`, or the disk refuses on the way; then nothing stays
-            behind.
+        OutputError: As :func:`held_output`, or writing failed; then no incomplete result remains.
     """
     folder = Path(folder)
-    with held_output(folder, kind, overwrite=overwrite) as target, _refused_by_the_disk(folder):
+    with held_output(folder, kind, overwrite=overwrite) as target, _disk_errors(folder):
         new = target / STAGES / NEW
         new.mkdir()
         try:
@@ -137,22 +138,22 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
             shutil.rmtree(new, ignore_errors=True)
             raise
         try:
-            put_in_place(target)
-        except OutputError as error:  # somebody wrote there meanwhile
+            install(target)
+        except OutputError as error:  # other files were written there meanwhile
             raise OutputError(f"{error} The new result is in {new}.") from error
 
 
-def put_in_place(target: Path) -> None:
-    """Put a whole result that waits in the folder of kept stages in its place; remove half a one.
+def install(target: Path) -> None:
+    """Move a complete result from the folder of kept stages to its place; remove an incomplete one.
 
-    Goes on where it was cut off: the list of the former result is set aside first, so that the
-    folder is no result until the new one's list comes as the last file.
+    An interrupted call is continued: the list of the previous result is set aside first, so the
+    folder has no list, and thus no result, until the new list is moved as the last file.
 
     Args:
         target: A folder that this process has locked.
 
     Raises:
-        OutputError: Files that we did not write are there; nothing is changed then.
+        OutputError: The folder contains files of others; then nothing is changed.
     """
     stages = target / STAGES
     new = stages / NEW
@@ -160,8 +161,8 @@ def put_in_place(target: Path) -> None:
         _require_ours(target, _lists(target))
         if (target / MARKER).exists():
             (target / MARKER).replace(stages / MARKER)
-        former = read_marker(stages)
-        for path in sort_out(target, former)[0] if former else ():
+        previous = read_marker(stages)
+        for path in sort_out(target, previous)[0] if previous else ():
             if not path.is_dir():
                 path.unlink()
             elif not any(path.iterdir()):
@@ -176,67 +177,66 @@ def put_in_place(target: Path) -> None:
 
 
 def require_apart(folder: Path | str, inputs: Mapping[str, Path | None]) -> None:
-    """Refuse inputs in the folder of the result, which would be replaced with it.
+    """Raise an error if an input is inside the result folder, and would be replaced with it.
 
     Args:
-        inputs: By what they are called. Links are followed.
+        inputs: Paths by name or option. Links are followed.
     """
     target = Path(folder).resolve()
     for name, path in inputs.items():
         if path is not None and path.resolve().is_relative_to(target):
             raise InputError(
-                f"{folder}: {name} ({path}) lies in the folder of the result, which is replaced as "
-                "a whole. Write elsewhere, or move it."
+                f"{folder}: {name} ({path}) is inside the result folder, which is replaced as a "
+                "whole. Write elsewhere, or move it."
             )
 
 
 @contextmanager
-def _refused_by_the_disk(folder: Path) -> Iterator[None]:
+def _disk_errors(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
         raise OutputError(
-            f"{folder}: writing failed ({error}); what was there before is there still. Make room "
+            f"{folder}: writing failed ({error}); its previous content is unchanged. Free space, "
             "or write elsewhere."
         ) from error
 
 
 def _lists(folder: Path) -> list[FileList]:
-    """Read the list of a result, or those of one that a new one is replacing, and of the new."""
-    whole = read_marker(folder)
-    places = (folder / STAGES, folder / STAGES / NEW) if whole is None else ()
-    return [one for one in (whole, *map(read_marker, places)) if one is not None]
+    """Read the list of a result, or, while it is being replaced, those of the old and new one."""
+    complete = read_marker(folder)
+    folders = (folder / STAGES, folder / STAGES / NEW) if complete is None else ()
+    return [files for files in (complete, *map(read_marker, folders)) if files is not None]
 
 
 def _require_ours(folder: Path, lists: list[FileList]) -> None:
-    _, strangers = sort_out(folder, *lists)
-    if strangers:
+    _, others = sort_out(folder, *lists)
+    if others:
         raise OutputError(
-            f"{folder}: holds {some(strangers)}, which is no part of a result, so it is not "
-            "overwritten. Write elsewhere, or move it away."
+            f"{folder}: contains {some(others)}, not part of a result, so it is not overwritten. "
+            "Write elsewhere, or move these away."
         )
 
 
 def require_cleanable(folder: Path | str) -> None:
-    """Refuse a folder in which there is nothing of ours."""
+    """Raise an error unless a folder contains a result or kept stages."""
     folder = Path(folder)
     if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; needed: the folder of a result.")
+        raise OutputError(f"{folder}: is a file; needed: the folder `-o OUT` of a run.")
     stages = folder / STAGES
     if not (is_ours(stages) and any(stages.iterdir())) and read_marker(folder) is None:
         found = "nothing that pimper wrote" if folder.exists() else "nothing"
-        raise OutputError(
-            f"{folder}: found {found}; needed: the folder that was given as `-o OUT` to a run."
-        )
+        raise OutputError(f"{folder}: found {found}; needed: the folder `-o OUT` of a run.")
 
 
 def clean_output(folder: Path | str) -> int:
-    """Remove what is kept in a folder for the next run into it, and what killed runs left there.
+    """Remove kept stages and leftovers of killed runs, and return the freed bytes.
 
-    A result stays. One whose writing was cut off when it was whole is brought to its place.
+    A result stays. A complete result that a killed run did not install is installed.
 
     Raises:
-        OutputError: It holds nothing of ours, another run holds it, or the disk refuses.
+        OutputError: It has neither a result nor stages, a different run has locked it, or it
+            cannot be changed.
     """
     folder = Path(folder)
     require_cleanable(folder)
@@ -246,7 +246,7 @@ def clean_output(folder: Path | str) -> int:
     try:
         with locked(target, folder):
             before = _size(target)
-            put_in_place(target)
+            install(target)
             for path in kept(target):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
             return before - _size(target)
@@ -255,5 +255,5 @@ def clean_output(folder: Path | str) -> int:
 
 
 def _size(folder: Path) -> int:
-    """Count the bytes of files in a folder; no link is followed."""
+    """Sum the bytes of files in a folder, without following links."""
     return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())

@@ -1,4 +1,4 @@
-"""The folder of kept stages inside a folder of results, and the lock in it."""
+"""Folder of kept stages inside a result folder, and its lock."""
 
 import os
 import shlex
@@ -13,15 +13,15 @@ from pimper_torch.doors.result_folder.marker import MARKER, STAGES
 from pimper_torch.runtime.errors import OutputError
 
 LOCK, NEW, HOLDER = "lock", "new", "holder.txt"
-"""Names in the folder of kept stages: its lock, a result that is being written, who holds it."""
+"""Names in the folder of kept stages: its lock, the result being written, owner of the lock."""
 PREVIEW = "preview.png"
-"""In the folder of kept stages, while a run is under way: its coarse surface."""
+"""Image of the coarse surface in the folder of kept stages, during a run."""
 
 _PASSING = (HOLDER, PREVIEW, f"{PREVIEW}.new")
 
 
 def is_ours(stages: Path) -> bool:
-    """Return whether a folder of that name was made by us, or is empty."""
+    """Return whether a folder of kept stages was created by this package, or is empty."""
     if stages.is_symlink() or not stages.is_dir():
         return False
     names = {path.name for path in stages.iterdir()}
@@ -29,28 +29,29 @@ def is_ours(stages: Path) -> bool:
 
 
 def kept(target: Path) -> list[Path]:
-    """List what is kept for the next run into ``target``."""
-    stages, own = target / STAGES, (LOCK, MARKER, NEW, *_PASSING)
-    there = sorted(stages.iterdir()) if stages.is_dir() else []
-    return [path for path in there if path.name not in own]
+    """List the stages that are kept for the next run into ``target``."""
+    stages, internal = target / STAGES, (LOCK, MARKER, NEW, *_PASSING)
+    entries = sorted(stages.iterdir()) if stages.is_dir() else []
+    return [path for path in entries if path.name not in internal]
 
 
-def resumption(shown: Path) -> str:
-    """Return a sentence on how the next run goes on from what is kept."""
+def resumption(folder: Path) -> str:
+    """Return a sentence on how the next run continues from kept stages."""
     return (
-        f"What was finished is kept in {shown / STAGES}: the same command goes on from there, and "
-        f"`pimper clean {shown}` removes it."
+        f"Finished stages are kept in {folder / STAGES}: the same command continues from there, "
+        f"and `pimper clean {folder}` removes them."
     )
 
 
 @contextmanager
-def locked(target: Path, shown: Path) -> Iterator[None]:
-    """Lock a folder of results for this process; a killed process's lock is free.
+def locked(target: Path, folder: Path) -> Iterator[None]:
+    """Lock a result folder for this process; the lock of a killed process is free.
 
     Args:
-        target: The folder, without links. It is made, and its parents are.
+        target: The folder with links resolved. It is created with its parents.
+        folder: The same as the user named it, for messages.
     """
-    # Local: a refusal of arguments does not need it.
+    # Imported here, as errors in arguments are reported without it.
     from filelock import FileLock, Timeout
 
     stages = target / STAGES
@@ -60,23 +61,23 @@ def locked(target: Path, shown: Path) -> Iterator[None]:
         stages.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except NotImplementedError as error:
-        raise OutputError(f"{shown}: its disk knows no locks. Write elsewhere.") from error
-    except (Timeout, RuntimeError) as error:  # a RuntimeError where this thread holds it
-        known = "of which nothing is known"
+        raise OutputError(f"{folder}: its disk has no locks. Write elsewhere.") from error
+    except (Timeout, RuntimeError) as error:  # RuntimeError: this thread has locked it
+        owner = "details unknown"
         with suppress(OSError):
-            known = holder.read_text(encoding="utf-8")
+            owner = holder.read_text(encoding="utf-8")
         raise OutputError(
-            f"{shown}: another run writes there: {known}. Wait until it has ended, end it where "
-            "it hangs, or write elsewhere."
+            f"{folder}: another run is writing to it: {owner}. Wait until it ends, end it if it "
+            "hangs, or write elsewhere."
         ) from error
     except OSError as error:
-        raise OutputError(f"{shown}: cannot be locked ({error}). Write elsewhere.") from error
+        raise OutputError(f"{folder}: cannot be locked ({error}). Write elsewhere.") from error
     try:
         with suppress(OSError):  # the disk is full
             command = shlex.join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])
             now = datetime.now().astimezone().isoformat(" ", "minutes")
-            told = f"process {os.getpid()} on {node()} since {now}, `{command}`"
-            holder.write_text(told, encoding="utf-8")
+            owner = f"process {os.getpid()} on {node()} since {now}, `{command}`"
+            holder.write_text(owner, encoding="utf-8")
         yield
     finally:
         with suppress(OSError):

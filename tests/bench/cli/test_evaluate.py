@@ -91,7 +91,7 @@ def test_only_a_former_report_is_replaced_and_only_on_request(ball, tmp_path, ca
     first = out.read_bytes()
     capsys.readouterr()
     assert run(ball, larger, *both, 2000) == 2
-    assert f"{out}: is there already" in capsys.readouterr().err
+    assert f"{out}: already exists" in capsys.readouterr().err
     assert out.read_bytes() == first
     assert run(ball, larger, *both, 2000, "--overwrite") == 0
     assert json.loads(out.read_text())["settings"]["samples"] == 2000

@@ -87,7 +87,7 @@ def test_the_files_do_not_depend_on_the_number_of_processes(rendering, ball, tmp
 
 
 def test_a_folder_in_use_is_refused_before_any_work(ball, rendering, tmp_path):
-    with pytest.raises(OutputError, match="already holds"):
+    with pytest.raises(OutputError, match="already contains"):
         render_scene(ball, rendering, SMALL, processes=1)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
