@@ -22,7 +22,7 @@ def toy(tmp_path):
     [
         (lambda toy: toy.expect(False, "a spoon"), r"not the layout of a toy.*a spoon.*one\.txt"),
         (lambda toy: file_in(toy.path, ("b.txt", "c.txt"), "a toy"), r"a file b\.txt or c\.txt"),
-        (lambda toy: toy.inside("x" * 9000), "names of files"),
+        (lambda toy: toy.inside("x" * 9000), "file names of at most 255 bytes"),
         *((lambda toy, name=name: toy.inside(name), "leads out of it") for name in OUT),
         *(
             (lambda toy, value=value: toy.numbers(value, 3, "x"), "3 finite numbers as x")

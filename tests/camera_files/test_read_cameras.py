@@ -169,7 +169,7 @@ def test_a_skew_is_refused_and_its_rounding_is_not(rig, tmp_path):
         ({"K": np.eye(3)}, "projections.*Found: K"),
         ({}, "no arrays"),
         ({"P": np.zeros((3, 3, 4))}, "no inverse"),
-        ({"P": np.zeros((3, 4, 3))}, "3x4 numbers a camera as P"),
+        ({"P": np.zeros((3, 4, 3))}, "3x4 numbers per camera as P"),
         ({"K": np.eye(3), "R": [np.eye(3)] * 3, "t": np.zeros((2, 3))}, "as many R as t"),
         ({"K": np.eye(3), "cam_from_world": np.zeros((3, 3, 4))}, "a rotation in"),
         ({"K": -np.eye(3), "cam_from_world": [np.eye(4)] * 3}, "as K 0"),
@@ -225,7 +225,7 @@ def test_a_missing_cloud_gives_a_warning(rig, tmp_path):
     path = rigs.of_transforms(rig, tmp_path)
     assert len(read_cloud(path)) == 0
     path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "gone.ply"}))
-    with pytest.warns(PimperWarning, match=r"names the cloud gone\.ply, which is not there"):
+    with pytest.warns(PimperWarning, match=r"names the point cloud gone\.ply, which does not"):
         assert len(read_cloud(path)) == 0
 
 

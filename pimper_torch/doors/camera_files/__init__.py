@@ -1,1 +1,1 @@
-"""Cameras as other programs write them, and the conventions that they mix up."""
+"""Readers of camera files of other programs, converted to the conventions of this package."""

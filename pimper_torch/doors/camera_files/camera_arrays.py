@@ -1,4 +1,4 @@
-"""Cameras in NumPy's archives: IDR's and NeuS's ``cameras.npz``, and plain arrays."""
+"""Cameras in NumPy archives: ``cameras.npz`` of IDR and NeuS, and plain arrays."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,22 +31,21 @@ def read_camera_arrays(
 ) -> list[PosedCamera]:
     """Read the cameras of an archive.
 
-    Either IDR's ``world_mat_0`` and so on, ``K [R t]`` as 4x4 matrices from the world to pixels,
-    with our camera axes; IDR and NeuS cast rays through whole numbers (``uv`` of ``mgrid``,
-    ``pixels_x`` of ``arange``): they count centres from 0, so half a pixel is added. Or arrays, in
-    our conventions (pixels count the centre of the top-left one as (0.5, 0.5); camera axes are x
-    right, y down, z forward):
+    Either IDR's ``world_mat_0``, ``world_mat_1``, ...: ``K [R t]`` as 4x4 matrices from the world
+    to pixels, with our camera axes. IDR and NeuS cast rays through integer coordinates (``uv`` of
+    ``mgrid``, ``pixels_x`` of ``arange``): pixel centres count from 0, so half a pixel is added.
+    Or arrays in our conventions (the centre of the top-left pixel is (0.5, 0.5); camera axes are
+    x right, y down, z forward):
 
-    - ``intrinsics`` or ``K`` (3x3, or one a camera) with ``cam_from_world`` (3x4 or 4x4 each) or
-      with ``R`` (3x3 each) and ``t`` (3 each) of ``cam_from_world``;
+    - ``intrinsics`` or ``K`` (3x3, or one per camera) with ``cam_from_world`` (3x4 or 4x4 each)
+      or with ``R`` (3x3 each) and ``t`` (3 each) of ``cam_from_world``;
     - or ``projections`` or ``P``, 3x4 each, ``K [R | t]`` up to a factor.
 
-    They belong to ``names``, if that array is there, or else to the photographs in plain order of
-    their names (``10`` before ``2``), of which there are as many, or else to their folders, of
-    which each holds the photographs of a pose.
+    They are assigned to the array ``names`` if it exists; otherwise, in plain order of the names
+    (``10`` before ``2``), to as many photographs, or folders with the photographs of a pose each.
 
     Returns:
-        Without cameras of photographs that are not there.
+        The cameras of photographs for which ``sizes_of`` has a size.
     """
     file = DataSetPath(path, _KIND)
     arrays = file.read(read_npz, "an archive of numpy.savez")
@@ -58,10 +57,10 @@ def read_camera_arrays(
     else:
         folders = {name.rpartition("/")[0] for name in photographs} - {""}
         names = sorted(folders if len(folders) == len(poses) else photographs)
-        of_poses = f" or of {len(folders)} folders" if folders else ""
+        or_folders = f" or {len(folders)} folders" if folders else ""
         file.expect(
             len(poses) == len(names),
-            f"one camera for each of {len(photographs)} photographs{of_poses}, in plain order of "
+            f"one camera for each of {len(photographs)} photographs{or_folders}, in plain order of "
             "their names, or an array `names`",
             f"{len(poses)} cameras",
         )
@@ -78,7 +77,7 @@ def read_camera_arrays(
 
 def _world_mats(arrays: Arrays, count: int, file: DataSetPath) -> Rig:
     names = [f"world_mat_{index}" for index in range(count)]
-    file.expect(set(names) <= set(arrays), f"world_mat_0 to {names[-1]}", "other numbers")
+    file.expect(set(names) <= set(arrays), f"world_mat_0 to {names[-1]}", "a gap in these numbers")
     matrices = [file.numbers(arrays[name], 16, name).reshape(4, 4)[:3] for name in names]
     intrinsics, poses = _decomposed(torch.stack(matrices), file)
     intrinsics[:, :2, 2] = pixels_from_indices(intrinsics[:, :2, 2])
@@ -98,12 +97,12 @@ def _plain(arrays: Arrays, file: DataSetPath) -> Rig:
         matrices = torch.cat([rotations, shifts.reshape(-1, 3, 1)], dim=2)
     if intrinsics is None or matrices is None or not len(matrices):
         file.refuse(
-            "world_mat_0 and so on; or intrinsics (K) with cam_from_world, or with R and t; or "
-            "projections (P)",
+            "world_mat_0, world_mat_1, ...; or intrinsics (K) with cam_from_world, or with R and "
+            "t; or projections (P)",
             some(sorted(arrays)) or "no arrays",
         )
-    several = len(intrinsics) in (1, len(matrices))
-    file.expect(several, f"1 or {len(matrices)} intrinsics", f"{len(intrinsics)}")
+    count_fits = len(intrinsics) in (1, len(matrices))
+    file.expect(count_fits, f"1 or {len(matrices)} intrinsics", f"{len(intrinsics)}")
     for index, K in enumerate(intrinsics):
         ok = bool((K.diagonal() > 0).all()) and K[2].tolist() == [0, 0, 1] and float(K[1, 0]) == 0
         file.expect(ok, f"f_x, s, c_x; 0, f_y, c_y; 0, 0, 1 as K {index}", f"{K.tolist()}")
@@ -117,18 +116,18 @@ def _plain(arrays: Arrays, file: DataSetPath) -> Rig:
 def _array(
     arrays: Arrays, names: Sequence[str], shapes: Sequence[tuple[int, ...]], file: DataSetPath
 ) -> Tensor | None:
-    """Return the first array of these names, one entry a camera; refuse one of other shapes."""
+    """Return the first array with one of these names, one entry per camera, of checked shape."""
     name = next((name for name in names if name in arrays), None)
     if name is None:
         return None
-    found = arrays[name]
-    if "K" in names and found.shape == (3, 3):
-        found = found[None]
-    ok = found.dtype.kind in "iuf" and found.shape[1:] in shapes
-    needed, there = ("x".join(map(str, shape)) for shape in (shapes[0], found.shape))
-    file.expect(ok, f"{needed} numbers a camera as {name}", there)
-    file.expect(bool(np.isfinite(found).all()), f"finite numbers as {name}", "others")
-    return torch.from_numpy(found.astype(np.float64))
+    array = arrays[name]
+    if "K" in names and array.shape == (3, 3):
+        array = array[None]
+    ok = array.dtype.kind in "iuf" and array.shape[1:] in shapes
+    needed, shape = ("x".join(map(str, shape)) for shape in (shapes[0], array.shape))
+    file.expect(ok, f"{needed} numbers per camera as {name}", shape)
+    file.expect(bool(np.isfinite(array).all()), f"finite numbers as {name}", "NaN or infinity")
+    return torch.from_numpy(array.astype(np.float64))
 
 
 def _decomposed(projections: Float[Tensor, "view 3 4"], file: DataSetPath) -> Rig:

@@ -15,14 +15,14 @@ from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import some
 
 KIND = "a Meshroom cameras.sfm"
-# Names of the distortions, as `type` before version 1.2.6 and as `distortionType` since,
-# by how many parameters they have.
+# Number of parameters of each distortion, by its name: `type` before version 1.2.6 of the file,
+# `distortionType` since.
 _PARAMETERS = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3, "brown": 5, "fisheye4": 4}
 _NONE = ("pinhole", "none")
 
 
 def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
-    """Read the cameras, which are called by the paths of their photographs.
+    """Read the cameras, named by the paths of their photographs.
 
     As AliceVision reads its own file (``sfmDataIO/jsonIO.cpp``):
 
@@ -33,20 +33,19 @@ def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
       ``fy = fx / pixelRatio``, from 1.2.5 on ``fy = fx * pixelRatio``.
     - ``principalPoint`` counts from the top-left before 1.2.1, from (width / 2, height / 2)
       since.
-    - Its images are sampled at whole numbers (``UndistortImage``): it counts centres from
+    - Images are sampled at integer coordinates (``UndistortImage``): pixel centres count from
       0, so half a pixel is added.
 
-    Views without a pose are not registered, and are left out.
+    Views without a pose are not registered and are skipped.
 
     Raises:
-        InputError: The file has another structure or describes a lens or rig that cannot be
-            read.
+        InputError: The file has a different structure, or a lens or rig that is not supported.
     """
     file = DataSetPath(path, KIND)
-    whole = file.read_json()
-    version = tuple(int(part) for part in file.numbers(whole.get("version"), 3, "version"))
+    content = file.read_json()
+    version = tuple(int(part) for part in file.numbers(content.get("version"), 3, "version"))
     poses, intrinsics = (
-        {str(entry.get(key)): entry for entry in file.objects(whole.get(section), section)}
+        {str(entry.get(key)): entry for entry in file.objects(content.get(section), section)}
         for section, key in (("poses", "poseId"), ("intrinsics", "intrinsicId"))
     )
     lenses = {
@@ -54,16 +53,16 @@ def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
         for number, (key, entry) in enumerate(intrinsics.items(), start=1)
     }
     cameras = []
-    for view in file.objects(whole.get("views"), "views"):
-        name = PureWindowsPath(str(view.get("path"))).name  # takes both kinds of slash
+    for view in file.objects(content.get("views"), "views"):
+        name = PureWindowsPath(str(view.get("path"))).name  # splits at both kinds of slash
         pose, lens = poses.get(str(view.get("poseId"))), lenses.get(str(view.get("intrinsicId")))
         if pose is None or lens is None:
             continue
         independent = str(view.get("isPoseIndependant", "true")) not in ("false", "0")
-        rig = "a pose in a rig, which cannot be read; export without rigs"
-        file.expect(independent, f"a pose of its own for {name}", rig)
-        placed = _cam_from_world(pose, name, file)
-        cameras.append(PosedCamera(name=str(view.get("path")), lens=lens, cam_from_world=placed))
+        rig = "a pose in a rig, which is not supported; export without rigs"
+        file.expect(independent, f"an independent pose for {name}", rig)
+        posed = _cam_from_world(pose, name, file)
+        cameras.append(PosedCamera(name=str(view.get("path")), lens=lens, cam_from_world=posed))
     file.expect(bool(cameras), "views with a pose and intrinsics", "none")
     return cameras
 
@@ -108,10 +107,10 @@ def _lens(
 
 
 def _distortion(entry: Mapping[str, object], file: DataSetPath) -> Distortion:
-    """Translate a distortion to COLMAP's model and its parameters after the centre.
+    """Return COLMAP's model of a distortion, and its parameters after the principal point.
 
-    AliceVision's Brown model has (k1, k2, k3, t1, t2) and is OpenCV's, its ``fisheye4`` is
-    OpenCV's fisheye: so its own exporter to COLMAP has it (``sfmDataIO/colmap.cpp``).
+    AliceVision's Brown model (k1, k2, k3, t1, t2) is OpenCV's, and its ``fisheye4`` is OpenCV's
+    fisheye, as in its own exporter to COLMAP (``sfmDataIO/colmap.cpp``).
     """
     name = str(entry.get("distortionType") or entry.get("type"))
     if name == "none" or "distortionType" not in entry:
@@ -119,13 +118,13 @@ def _distortion(entry: Mapping[str, object], file: DataSetPath) -> Distortion:
     params = entry.get("distortionParams") or []  # an empty list is written as ""
     count = len(params) if isinstance(params, list) else -1
     values = file.numbers(params, max(count, 0), "distortionParams").tolist()
-    undone = entry.get("undistortionParams") or []
-    fits = name in _NONE or count == _PARAMETERS.get(name)
+    undistortion = entry.get("undistortionParams") or []
+    count_fits = name in _NONE or count == _PARAMETERS.get(name)
     file.expect(
-        fits and not undone,
-        f"a lens that is one of {some([*_NONE, *_PARAMETERS], 10)}",
-        f"{name} with {count} parameters{' and an undistortion' if undone else ''}; export the "
-        "undistorted photographs with their cameras",
+        count_fits and not undistortion,
+        f"a distortion that is one of {some([*_NONE, *_PARAMETERS], 10)}",
+        f"{name} with {count} parameters{' and an undistortion' if undistortion else ''}; export "
+        "the undistorted photographs with their cameras",
     )
     if name == "fisheye4":
         return "OPENCV_FISHEYE", tuple(values)

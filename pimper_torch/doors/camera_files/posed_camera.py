@@ -1,4 +1,4 @@
-"""A camera as a file has it: pose, lens and what its photograph is called."""
+"""A camera of a file: pose, lens and name of its photograph."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from pimper_torch.records import CameraModel, Record
 Rig = tuple[Float[Tensor, "view 3 3"], Poses]
 """Intrinsics and ``cam_from_world``."""
 Distortion = tuple[str, tuple[float, ...]]
-"""COLMAP's model of a lens, and its parameters after those of ``K``."""
+"""COLMAP's name of a lens model, and its parameters after those of ``K``."""
 SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
-"""Width and height of photographs by their names in a file; ``None`` for those not there."""
+"""Returns width and height of photographs by their names in a file; ``None`` if missing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -26,9 +26,9 @@ class PosedCamera(Record):
     """One camera of a file.
 
     Attributes:
-        name: Of its photograph, or path, as the file has it.
+        name: Name or path of its photograph in the file.
         cam_from_world: Rigid, in float64; camera axes x right, y down, z forward.
-        lens: In our pixels (top-left centre at (0.5, 0.5)), for a size of its own.
+        lens: In our pixels (centre of the top-left pixel at (0.5, 0.5)), for its own image size.
     """
 
     name: str
@@ -38,7 +38,7 @@ class PosedCamera(Record):
 
 
 def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
-    """Let cameras share a lens's number where their lenses are equal."""
+    """Number the lenses from 1, with the same number for equal lenses."""
     lenses = list(dict.fromkeys(camera.lens for camera in cameras))
     return [
         camera.replace(lens=camera.lens.replace(camera=1 + lenses.index(camera.lens)))
@@ -47,7 +47,7 @@ def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
 
 
 def polynomial_lens(k1: float, k2: float, p1: float, p2: float, k3: float) -> Distortion:
-    """Return OpenCV's distortion as a model of COLMAP; a pinhole without any."""
+    """Return COLMAP's model of an OpenCV distortion; ``PINHOLE`` if all parameters are 0."""
     params = (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return ("FULL_OPENCV", params) if any(params) else ("PINHOLE", ())
 
@@ -55,16 +55,16 @@ def polynomial_lens(k1: float, k2: float, p1: float, p2: float, k3: float) -> Di
 def decompose_projections(projections: Float[Tensor, "view 3 4"]) -> Rig:
     r"""Split ``P ~ K [R | t]`` into intrinsics and ``cam_from_world``.
 
-    ``P`` is known up to a factor, negative ones included. The left 3x3 block is an upper
-    triangular matrix times an orthogonal one (RQ); that ``K`` has a positive diagonal and
-    ``R`` is a rotation makes the split unique. What the cameras project stays exactly the
-    same, also where a file's ``R`` was not orthogonal: the rest goes into ``K``.
+    ``P`` is known up to a factor, which may be negative. The left 3x3 block is an upper
+    triangular matrix times an orthogonal one (RQ). The split is unique, as the diagonal of ``K``
+    is positive and ``R`` is a rotation. Projections stay the same, even if ``R`` in the file was
+    not orthogonal: the remainder becomes part of ``K``.
 
     Returns:
-        ``K`` with ``K[2, 2] = 1``, its skew kept, and rigid transforms; float64.
+        ``K`` with ``K[2, 2] = 1``, including skew, and rigid transforms; float64.
 
     Raises:
-        ValueError: A left block without inverse, the matrix of no finite camera.
+        ValueError: A left block has no inverse, so the camera is not finite.
 
     Source: Hartley & Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4.
     """
@@ -73,7 +73,7 @@ def decompose_projections(projections: Float[Tensor, "view 3 4"]) -> Rig:
         left = matrix[:, :3]
         determinant = float(np.linalg.det(left))
         size = float(np.linalg.norm(left))
-        # Rows of K [R | t] differ by the focal length in pixels, cubes of it at most.
+        # Rows of K [R | t] differ by factors of the focal length in pixels, at most its cube.
         if not np.isfinite(size) or abs(determinant) <= 1e-13 * size**3:
             raise ValueError(f"the left 3x3 block of number {index} has no inverse")
         proper = matrix if determinant > 0 else -matrix

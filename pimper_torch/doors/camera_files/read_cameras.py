@@ -1,4 +1,4 @@
-"""Cameras of a file, whichever program wrote it."""
+"""Cameras of a file in any supported format."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ from pimper_torch.runtime.errors import InputError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraFormat:
-    """A format of files of cameras.
+    """A format of camera files.
 
     Attributes:
-        name: What such a file is usually called.
-        program: What writes it, or what it holds.
-        suffixes: Of its files, in lower case.
-        read: Reads a file. It is handed the path, the photographs' names, for cameras that go by
-            the order of these, and a function that looks up sizes, for cameras without any.
+        name: Usual name of such a file.
+        program: Programs that write it, or its content.
+        suffixes: Suffixes of its files, in lower case.
+        read: Reads a file. Its arguments are the path; the names of the photographs, for cameras
+            assigned by their order; and a function that returns sizes, for cameras without a size.
         owns: Whether a file with one of the suffixes is of this format; by default all are.
     """
 
@@ -54,25 +54,25 @@ FORMATS = [
     ),
     CameraFormat(name="cameras.npz", program="arrays", suffixes=(".npz",), read=read_camera_arrays),
 ]
-"""All formats: the first one that owns a file reads it."""
+"""All formats; a file is read by the first format that owns it."""
 
 
 def read_cameras(path: Path, photographs: Sequence[str], sizes_of: SizesOf) -> list[PosedCamera]:
     """Read the cameras of a file in one of :data:`FORMATS`.
 
     Args:
-        photographs: Their names, for cameras that go by the order of these.
-        sizes_of: Photographs that a file names, for cameras without a size.
+        photographs: Names of the photographs, for cameras assigned by their order.
+        sizes_of: Sizes of the photographs that a file names, for cameras without a size.
 
     Raises:
-        InputError: The file is of no such format, or its reader refuses it.
+        InputError: The file has none of these formats, or is invalid.
     """
     suffix = path.suffix.lower()
     for each in FORMATS:
         if suffix in each.suffixes and each.owns(path):
             return each.read(path, photographs, sizes_of)
-    known = ", ".join(f"{each.name} ({each.program})" for each in FORMATS)
+    supported = ", ".join(f"{each.name} ({each.program})" for each in FORMATS)
     raise InputError(
-        f"{path}: is no file of cameras; needed: the folder of a COLMAP model, or a file of one "
-        f"of these formats: {known}."
+        f"{path}: is not a camera file; needed: the folder of a COLMAP model, or a file in one "
+        f"of these formats: {supported}."
     )

@@ -1,4 +1,4 @@
-"""Cameras of NeRF's ``transforms.json``, of Blender, instant-ngp and nerfstudio."""
+"""Cameras of NeRF's ``transforms.json``, as written by Blender, instant-ngp and nerfstudio."""
 
 import math
 from collections.abc import Mapping
@@ -23,21 +23,21 @@ from pimper_torch.runtime.errors import InputError, caution
 
 KIND = "a transforms.json set"
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-"""OpenGL's camera has y up and looks along -z."""
+"""Converts OpenGL's camera axes, with y up and the view along -z."""
 
 _POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 
 def has_frames(path: Path) -> bool:
-    """Return whether a JSON file has frames, by which this format is known."""
-    return "frames" in DataSetPath(path, "a file of cameras").read_json()
+    """Return whether a JSON file has frames, which identify this format."""
+    return "frames" in DataSetPath(path, "a camera file").read_json()
 
 
 def read_frames(path: Path) -> list[dict[str, object]]:
-    """Return the frames, each with what the whole file says."""
+    """Return the frames, each with the values of the file for keys that it lacks."""
     file = DataSetPath(path, KIND)
-    whole = file.read_json()
-    frames = [{**whole, **frame} for frame in file.objects(whole.get("frames"), "frames")]
+    content = file.read_json()
+    frames = [{**content, **frame} for frame in file.objects(content.get("frames"), "frames")]
     for frame in frames:
         name = frame.get("file_path")
         file.expect(isinstance(name, str) and name != "", "a text as file_path", repr(name))
@@ -45,45 +45,45 @@ def read_frames(path: Path) -> list[dict[str, object]]:
 
 
 def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
-    """Read the cameras; a file that says no sizes takes those of the photographs.
+    """Read the cameras; sizes that the file lacks are those of the photographs.
 
     ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
     The focal length is ``fl_x``, ``fl_y`` in pixels, or follows from ``camera_angle_x``; the
     principal point ``cx``, ``cy`` is the centre of the image unless given. All of these, and
     ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may be in the file
-    or in a frame. instant-ngp and nerfstudio take them from COLMAP and cast rays through
+    or in a frame. instant-ngp and nerfstudio use COLMAP's values and cast rays through
     x + 0.5 (nerfstudio, "Data conventions" and ``Cameras.get_image_coords``), and Blender's
-    centre is that of the image's area: their pixels are ours.
+    centre is that of the image's area: their pixel coordinates are ours.
 
     Args:
-        sizes_of: Of photographs, by ``file_path``.
+        sizes_of: Returns sizes of photographs by ``file_path``.
 
     Returns:
-        In the file's order; without frames whose size is not known.
+        In the order of the file; without frames of unknown size.
     """
     frames = read_frames(path)
     names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]
     sizes = [_stated_size(frame) for frame in frames]
-    read = sizes if all(sizes) else sizes_of(names)
+    photograph_sizes = sizes if all(sizes) else sizes_of(names)
     cameras = [
         _camera(frame, name, size, DataSetPath(path, KIND))
-        for frame, name, *both in zip(frames, names, sizes, read, strict=True)
-        if (size := both[0] or both[1])
+        for frame, name, *options in zip(frames, names, sizes, photograph_sizes, strict=True)
+        if (size := options[0] or options[1])
     ]
     return number_lenses(cameras)
 
 
 def read_cloud(path: Path) -> Points:
-    """Read the points of the PLY file that is named as ``ply_file_path``, as nerfstudio does.
+    """Read the points of the PLY file ``ply_file_path``, as nerfstudio does.
 
-    They are in the frame of the cameras. Those that are nowhere are left out.
+    They are in the frame of the cameras. Points that are not finite are skipped.
 
     Args:
-        path: A file of cameras, of this format or another one.
+        path: A camera file of any format.
 
     Returns:
-        Float64; none where no file is named, or where it is not there, of which a
-        :class:`~pimper_torch.runtime.errors.PimperWarning` warns.
+        Float64; empty if no file is named, or if it is missing, with a
+        :class:`~pimper_torch.runtime.errors.PimperWarning`.
     """
     nothing = torch.zeros(0, 3, dtype=torch.float64)
     if path.suffix.lower() != ".json":
@@ -93,20 +93,20 @@ def read_cloud(path: Path) -> Points:
         return nothing
     cloud = DataSetPath(DataSetPath(path.parent, KIND).inside(name), KIND)
     if not cloud.path.is_file():
-        caution(f"{path}: names the cloud {name}, which is not there. It is left out.")
+        caution(f"{path}: names the point cloud {name}, which does not exist. It is not used.")
         return nothing
     points = torch.from_numpy(cloud.read(_ply_points, "a PLY file"))
     return points[(points.abs() < 1e30).all(dim=1)]  # false for NaN
 
 
 def _ply_points(path: Path) -> np.ndarray:
-    # Of bytes, so that nothing but the file itself is opened.
-    found = trimesh.load(BytesIO(path.read_bytes()), file_type="ply", process=False)
-    return np.array(found.vertices, dtype=np.float64).reshape(-1, 3)
+    # From bytes, so that no other file is opened.
+    cloud = trimesh.load(BytesIO(path.read_bytes()), file_type="ply", process=False)
+    return np.array(cloud.vertices, dtype=np.float64).reshape(-1, 3)
 
 
 def _stated_size(frame: Mapping[str, object]) -> tuple[int, int] | None:
-    """Return a frame's width and height, where the file says them."""
+    """Return the width and height that a frame states, if any."""
     sides = frame.get("w"), frame.get("h")
     if not all(type(side) in (int, float) and 0 < float(str(side)) < math.inf for side in sides):
         return None
@@ -147,8 +147,8 @@ def _lens(
 
     width, height = size_px
     focal, focal_y = focal_px("x", width), focal_px("y", height)
-    what = f"fl_x or camera_angle_x, in the file or for {name}"
-    file.expect(focal > 0 or focal_y > 0, what, "neither, or no positive one")
+    needed = f"fl_x or camera_angle_x, in the file or for {name}"
+    file.expect(focal > 0 or focal_y > 0, needed, "neither, or none above 0")
     fx, fy = focal or focal_y, focal_y or focal
     pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
@@ -156,6 +156,7 @@ def _lens(
     fisheye = model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True
     file.expect(fisheye or model in _POLYNOMIAL, f"a camera_model of {_POLYNOMIAL}", model)
     file.expect(fisheye or k4 == 0, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
-    bent = ("OPENCV_FISHEYE", (k1, k2, k3, k4)) if fisheye else polynomial_lens(k1, k2, p1, p2, k3)
-    kind, params = bent
+    kind, params = polynomial_lens(k1, k2, p1, p2, k3)
+    if fisheye:
+        kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
     return CameraModel(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)

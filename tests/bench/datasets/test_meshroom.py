@@ -116,8 +116,11 @@ def test_distortions_are_read(save, lens_of, kind, params, x, y):
     ("options", "needed"),
     [
         ({"version": "1.2"}, "3 finite numbers as version"),
-        ({"intrinsic": NEW | {"type": "equidistant"}}, "a lens that is one of"),
-        ({"intrinsic": NEW | {"type": "radial3", "distortionParams": ["1"]}}, "a lens that is one"),
+        ({"intrinsic": NEW | {"type": "equidistant"}}, "a distortion that is one of"),
+        (
+            {"intrinsic": NEW | {"type": "radial3", "distortionParams": ["1"]}},
+            "a distortion that is one",
+        ),
         ({"intrinsic": NEW | {"undistortionParams": ["1"]}}, "and an undistortion"),
         ({"intrinsic": NEW | {"focalLength": "-1"}}, "a positive focal length"),
         ({"intrinsic": NEW | {"focalLength": "1e308"}}, "a positive focal length"),

@@ -132,7 +132,7 @@ def test_the_largest_of_several_components_is_read(save):
     folder = save()
     text = (folder / "cameras.xml").read_text().replace("</cameras>", f"{third}</camera></cameras>")
     (folder / "cameras.xml").write_text(text)
-    message = "2 components, each in a frame of its own; read is that of 2 cameras, not that of 1"
+    message = "2 components with separate frames. The component of 2 cameras is used, not that of 1"
     with pytest.warns(PimperWarning, match=message):
         assert read_camera_file(folder).views.names == ("a.png", "b.png")
 
