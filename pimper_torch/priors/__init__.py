@@ -1,6 +1,6 @@
-"""Conventions of guessed maps, found by the scene, and guesses of networks."""
+"""Maps of networks as priors, and their conventions, determined by the scene."""
 
 import lazy_loader
 
-# When they are asked for, so that the command line reads settings of this room without torch.
+# Imported lazily, so that the command line reads settings of this subpackage without torch.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

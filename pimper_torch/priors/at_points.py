@@ -1,4 +1,4 @@
-"""Values of guessed maps where views observe points of the cloud."""
+"""Pixels of prior maps at which views observe points of the cloud."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,44 +16,44 @@ class AtPoints(Record):
     """Observations of points in views that have a map.
 
     Attributes:
-        place: Map, row and column: the pixel of the map that shows the point.
-        pixels: Of the undistorted photograph.
+        index: Map, row and column of the map's pixel at the point.
+        pixels: In the undistorted photograph.
         depth: Of the point, along the camera's axis.
     """
 
     point: Int[Tensor, " observation"]
     view: Int[Tensor, " observation"]
-    place: Int[Tensor, "observation 3"]
+    index: Int[Tensor, "observation 3"]
     pixels: Float[Tensor, "observation 2"]
     depth: Float[Tensor, " observation"]
 
 
 def at_points(
-    prior: MapPrior, known: Bool[Tensor, "map height width"], scene: SparseScene
+    prior: MapPrior, valid: Bool[Tensor, "map height width"], scene: SparseScene
 ) -> AtPoints:
-    """Find where maps of undistorted photographs show the points that their views observe.
+    """Return the observations of points in views with a map of the undistorted photograph.
 
     Args:
-        known: Pixels with a value; observations at others are left out.
+        valid: Pixels with a value; observations at other pixels are skipped.
     """
     point, view = scene.observation_point, scene.observation_view
     poses, intrinsics = scene.cameras.cam_from_world[view], scene.cameras.intrinsics[view]
     pixels, depth = project(scene.points_world[point, None], poses, intrinsics)
     pixels, depth = pixels[:, 0], depth[:, 0]
-    place, within = places(prior, scene, view, pixels)
-    within &= known[place.unbind(dim=-1)] & (depth > 0)
-    return AtPoints(point=point, view=view, place=place, pixels=pixels, depth=depth).take(within)
+    index, within = map_indices(prior, scene, view, pixels)
+    within &= valid[index.unbind(dim=-1)] & (depth > 0)
+    return AtPoints(point=point, view=view, index=index, pixels=pixels, depth=depth).take(within)
 
 
-def places(
+def map_indices(
     prior: MapPrior,
     scene: SparseScene,
     view: Int[Tensor, " pixel"],
     pixels: Float[Tensor, "pixel 2"],
 ) -> tuple[Int[Tensor, "pixel 3"], Bool[Tensor, " pixel"]]:
-    """Return map, row and column of pixels of undistorted photographs, and which are in a map."""
-    number = {name: index for index, name in enumerate(prior.names)}
-    maps = torch.tensor([number.get(name, -1) for name in scene.views.names]).to(view)[view]
+    """Return map, row and column of pixels in undistorted photographs, and which are in a map."""
+    map_of = {name: index for index, name in enumerate(prior.names)}
+    maps = torch.tensor([map_of.get(name, -1) for name in scene.views.names]).to(view)[view]
     sizes = prior.sizes_px[maps]
     inside = (pixels >= 0) & (pixels < scene.cameras.sizes_px[view])
     column_row = (pixels / scene.cameras.sizes_px[view] * sizes).nan_to_num(-1).long()
@@ -61,51 +61,51 @@ def places(
     return torch.cat([maps[:, None], column_row.flip(-1)], dim=1), inside.all(dim=-1) & (maps >= 0)
 
 
-def layouts(prior: MapPrior, scene: SparseScene) -> Iterator[tuple[str, Int[Tensor, " map"]]]:
-    """List how maps may be turned against their photographs, as numbers of EXIF."""
+def exif_errors(prior: MapPrior, scene: SparseScene) -> Iterator[tuple[str, Int[Tensor, " map"]]]:
+    """List wrong orientations of maps, as EXIF orientations that correct them."""
     tags, count = scene.views.orientations, len(prior.names)
     if tags is not None:
-        own = tags[[scene.views.names.index(name) for name in prior.names]]
-        if bool((own != 1).any()):
-            yield "of the pixels that files store, before EXIF turns these", own
+        map_tags = tags[[scene.views.names.index(name) for name in prior.names]]
+        if bool((map_tags != 1).any()):
+            yield "for the pixels as stored, without EXIF's orientation", map_tags
     yield "mirrored left to right", torch.full((count,), 2)
     yield "mirrored top to bottom", torch.full((count,), 4)
 
 
-def turned(
-    place: Int[Tensor, "pixel 3"], prior: MapPrior, orientations: Int[Tensor, " map"]
+def reoriented(
+    index: Int[Tensor, "pixel 3"], prior: MapPrior, orientations: Int[Tensor, " map"]
 ) -> Int[Tensor, "pixel 3"]:
-    """Return the pixels that come to places when maps are turned as EXIF says."""
-    tag, last = orientations.to(place)[place[:, 0]], prior.sizes_px[place[:, 0]].to(place) - 1
+    """Return the index in the given map of each pixel of the map reoriented as EXIF says."""
+    tag, last = orientations.to(index)[index[:, 0]], prior.sizes_px[index[:, 0]].to(index) - 1
     mirrored, flipped = _flips(tag)
-    row = torch.where(flipped, last[:, 1] - place[:, 1], place[:, 1])
-    column = torch.where(mirrored, last[:, 0] - place[:, 2], place[:, 2])
-    across = tag >= 5  # of square maps: others are refused where they are read
-    found = torch.where(across, column, row), torch.where(across, row, column)
-    return torch.stack([place[:, 0], found[0].minimum(last[:, 1]), found[1].minimum(last[:, 0])], 1)
+    row = torch.where(flipped, last[:, 1] - index[:, 1], index[:, 1])
+    column = torch.where(mirrored, last[:, 0] - index[:, 2], index[:, 2])
+    transposed = tag >= 5  # only square maps: others are an error when they are read
+    row, column = torch.where(transposed, column, row), torch.where(transposed, row, column)
+    return torch.stack([index[:, 0], row.minimum(last[:, 1]), column.minimum(last[:, 0])], 1)
 
 
-def turned_vectors(
+def reoriented_vectors(
     vectors: Float[Tensor, "pixel 3"], orientations: Int[Tensor, " pixel"]
 ) -> Float[Tensor, "pixel 3"]:
-    """Turn vectors, in axes x right, y down, like the pixels of maps that EXIF turns."""
+    """Reorient vectors, in axes x right, y down, with the pixels of their maps."""
     tag = orientations[:, None]
-    found = torch.where(tag >= 5, vectors[:, [1, 0, 2]], vectors)
+    transposed = torch.where(tag >= 5, vectors[:, [1, 0, 2]], vectors)
     signs = [1 - 2 * flips.to(vectors) for flips in _flips(tag)]
-    return found * torch.cat([*signs, torch.ones_like(signs[0])], dim=-1)
+    return transposed * torch.cat([*signs, torch.ones_like(signs[0])], dim=-1)
 
 
 def _flips(
-    tag: Int[Tensor, "*place"],
-) -> tuple[Bool[Tensor, "*place"], Bool[Tensor, "*place"]]:
-    """Return whether EXIF exchanges left and right, and top and bottom, after rows and columns."""
+    tag: Int[Tensor, "*pixel"],
+) -> tuple[Bool[Tensor, "*pixel"], Bool[Tensor, "*pixel"]]:
+    """Return whether EXIF flips left and right, and top and bottom, after transposing."""
     return (tag % 4 == 2) | (tag % 4 == 3), (tag == 3) | (tag == 4) | (tag >= 7)
 
 
 def means_by(
     values: Float[Tensor, "*row observation"], group: Int[Tensor, " observation"]
 ) -> Float[Tensor, "*row group"]:
-    """Average over the observations of each group that has some."""
-    _, own, count = torch.unique(group, return_inverse=True, return_counts=True)
-    sums = values.new_zeros(*values.shape[:-1], len(count)).index_add(-1, own, values)
+    """Average over the observations of each group that occurs, in increasing order of groups."""
+    _, row, count = torch.unique(group, return_inverse=True, return_counts=True)
+    sums = values.new_zeros(*values.shape[:-1], len(count)).index_add(-1, row, values)
     return sums / count

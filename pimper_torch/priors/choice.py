@@ -1,7 +1,7 @@
-"""When one reading of data is believed in the place of another.
+"""Significance test for the conventions of maps.
 
-A candidate is the data as another convention has it. Its score says how well it fits the
-photographs: at each of many places, or as the fraction of them that it explains.
+A candidate is the data under a different convention. Its scores measure how well it fits the
+scene, one score per point of the cloud or outline.
 """
 
 from collections.abc import Sequence
@@ -9,42 +9,42 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-# How much more maps must score, turned or with channels exchanged, than as they are: a choice. Of
-# normals of rendered scenes (potatoes, jar, balls, mug, 12 of 160x120) without noise and with 25
-# degrees, maps of the object alone included, mirrored, half turned and exchanged ones are found so,
-# but for those of a jar that is its own mirror image.
-_MORE = 0.05
+# Least gain in score for maps that are reoriented or have channels exchanged: a choice. It finds
+# all mirrored, half turned and exchanged normals of rendered scenes (potatoes, jar, balls, mug, 12
+# of 160x120) without noise and with 25 degrees, including maps of the object alone, except those of
+# the jar, which is its own mirror image.
+_MIN_GAIN = 0.05
 
 
-def surely_better(one: Float[Tensor, " place"], other: Float[Tensor, " place"]) -> bool:
-    """Return whether one candidate scores higher than another by 4 standard errors of the mean.
+def clearly_better(scores: Float[Tensor, " point"], baseline: Float[Tensor, " point"]) -> bool:
+    """Return whether the mean of scores exceeds a baseline's by 4 standard errors.
 
-    Of fewer than 8 places none does.
+    ``False`` for fewer than 8 points.
     """
-    differences = one - other
+    differences = scores - baseline
     if len(differences) < 8:
         return False
     error = differences.std() / len(differences) ** 0.5
     return float(differences.mean() / error.clamp_min(1e-9)) > 4
 
 
-def better_otherwise(
-    plain: Float[Tensor, " place"],
-    others: Sequence[tuple[str, Float[Tensor, "reading place"]]],
+def better_change(
+    unchanged: Float[Tensor, " point"],
+    changes: Sequence[tuple[str, Float[Tensor, "reading point"]]],
     least: float = 0.0,
 ) -> str:
-    """Name the change of maps with which they surely fit better than as they are, if any.
+    """Return the name of the change with which maps fit significantly better, else "".
 
-    Scores are 0 where maps say nothing.
+    Scores are 0 where maps have no value.
 
     Args:
-        others: Changes, and the scores of all readings of maps that are so changed.
-        least: Mean score, where maps say something, that makes a change credible.
+        changes: Names of changes, and the scores of all readings of maps with that change.
+        least: Least mean score, where maps have values, for a change to be credible.
     """
-    if len(plain) == 0 or not others:
+    if len(unchanged) == 0 or not changes:
         return ""
-    fits = [(what, scores[scores.mean(dim=1).argmax()]) for what, scores in others]
-    what, fit = max(fits, key=lambda one: float(one[1].mean()))
-    share = float((fit != 0).float().mean())
-    needed = max(least * share, float(plain.mean()) + _MORE * share)
-    return what if float(fit.mean()) > needed and surely_better(fit, plain) else ""
+    best_readings = [(name, scores[scores.mean(dim=1).argmax()]) for name, scores in changes]
+    name, best = max(best_readings, key=lambda change: float(change[1].mean()))
+    fraction = float((best != 0).float().mean())
+    needed = max(least * fraction, float(unchanged.mean()) + _MIN_GAIN * fraction)
+    return name if float(best.mean()) > needed and clearly_better(best, unchanged) else ""

@@ -1,7 +1,7 @@
-"""The meaning of depth maps, by the cloud: depth or one over it, along which way, up to what.
+"""Conventions of depth maps, determined by the cloud: inverse or not, axis or ray, gauge.
 
-A reading relates values ``d`` of a map to depth ``t`` of the points that the view observes:
-``t = a d + b`` with ``a`` above 0, where ``t`` is depth, distance, or one over either.
+A reading relates values ``d`` of a map to the depth of observed points: ``t = a d + b`` with ``a``
+above 0, where ``t`` is depth along the axis or the ray, or its inverse.
 """
 
 from typing import Literal
@@ -13,8 +13,8 @@ from torch import Tensor
 from pimper_torch.ground.geometry.pixels import pixel_centers
 from pimper_torch.ground.geometry.projection import rays_through
 from pimper_torch.ground.shapes import Scalar
-from pimper_torch.priors.at_points import AtPoints, at_points, layouts, means_by, turned
-from pimper_torch.priors.choice import better_otherwise, surely_better
+from pimper_torch.priors.at_points import AtPoints, at_points, exif_errors, means_by, reoriented
+from pimper_torch.priors.choice import better_change, clearly_better
 from pimper_torch.records import DepthPrior, SparseScene
 from pimper_torch.runtime.errors import InputError, caution, some
 
@@ -23,130 +23,129 @@ Gauge = Literal["scene", "scale", "affine"]
 _READINGS: dict[tuple[bool, Along], str] = {
     (False, "axis"): "depth along the camera's axis",
     (False, "ray"): "depth along the ray",
-    (True, "axis"): "one over depth (disparity) along the camera's axis",
-    (True, "ray"): "one over depth (disparity) along the ray",
+    (True, "axis"): "inverse depth (disparity) along the camera's axis",
+    (True, "ray"): "inverse depth (disparity) along the ray",
 }
 _GAUGES: dict[Gauge, str] = {
     "scene": "in the scene's unit",
-    "scale": "up to a factor a map",
-    "affine": "up to a factor and an offset a map",
+    "scale": "up to a factor per map",
+    "affine": "up to a factor and an offset per map",
 }
 _OURS = (False, "axis", "scene")
-# Choices: points of a map that a line is fitted to at least; steps of reweighting; by how much the
-# median error must grow for a stated gauge to be wrong; relative depth of a relief that estimators
-# are too coarse for; relative depth that clouds are good to at best.
-_FEWEST, _STEPS, _WORSE, _FLAT, _ROUGH = 8, 20, 2.0, 0.03, 3e-4
+# Choices: least number of points for a line fit; reweighting steps; least factor between median
+# errors that refutes a stated gauge; relative depth of a relief that is too flat for networks; best
+# relative accuracy of clouds.
+_MIN_POINTS, _STEPS, _WORSE, _FLAT, _CLOUD_ERROR = 8, 20, 2.0, 0.03, 3e-4
 
 
 def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPrior:
-    """Decide the meaning of depth, and convert it to scene units along the camera's axis.
+    """Resolve the conventions of depth, and convert it to scene units along the camera's axis.
 
-    If it is left open it is found, and a warning states it: whether it is one over depth, along the
-    axis unless along the ray fits far better, and the simplest gauge that fits. Factors and offsets
-    are those that fit the cloud, map by map; standard errors are at least a map's error there. A
-    map that shows too few points is left out.
+    If they are not stated they are determined, with a warning that states them: whether depth is
+    inverse, along the axis unless along the ray fits far better, and the simplest gauge that fits.
+    Factors and offsets are fitted to the cloud, map by map; standard errors are at least a map's
+    error there. A map with too few points is excluded.
 
     Args:
-        prior: Of undistorted photographs. Depth in scene units along the axis is kept as it is.
+        prior: Of undistorted photographs. Depth in scene units along the axis is not changed.
 
     Raises:
         InputError: A reading fits far better than the stated one, maps fit far better mirrored or
-            as EXIF turns them, none is better than no depth at all, or the cloud decides nothing.
+            reoriented by EXIF, none fits better than constant depth, or the cloud does not decide.
     """
     where = f"The depth of {len(prior.names)} photographs ({some(prior.names, most=1)})"
-    lines, errors, seen = _compared(prior.detach(), scene)
-    ways, gauges = tuple(_READINGS), tuple(_GAUGES)
-    told = errors.shape[-1] >= _FEWEST
-    medians = errors.median(dim=-1).values if told else errors.new_zeros(len(ways) + 1, 1)
-    size = medians[:, -1].min().clamp_min(_ROUGH)
-    worth = means_by(size / (size + errors), seen.point)
+    lines, errors, observed = _fit_readings(prior.detach(), scene)
+    readings, gauges = tuple(_READINGS), tuple(_GAUGES)
+    enough = errors.shape[-1] >= _MIN_POINTS
+    medians = errors.median(dim=-1).values if enough else errors.new_zeros(len(readings) + 1, 1)
+    size = medians[:, -1].min().clamp_min(_CLOUD_ERROR)
+    scores = means_by(size / (size + errors), observed.point)
     best = int(medians[:-1, -1].argmin())
 
-    def at(reading: int, gauge: int = -1) -> str:
+    def error(reading: int, gauge: int = -1) -> str:
         return f"{float(medians[reading, gauge]):.1%}"
 
-    if not told and (prior.inverse, prior.along, prior.gauge) == _OURS:
+    if not enough and (prior.inverse, prior.along, prior.gauge) == _OURS:
         return prior
-    if what := _better_turned(prior.detach(), scene, size):
-        raise InputError(f"{where} is {what}: the cloud shows it. Turn maps like the photographs.")
-    helps = told and surely_better(worth[best, -1], worth[-1, -1])
-    if medians[-1, -1] > _FLAT and not helps:
+    if change := _better_orientation(prior.detach(), scene, size):
+        raise InputError(f"{where} is {change}, as the cloud shows. Turn it like the photographs.")
+    informative = enough and clearly_better(scores[best, -1], scores[-1, -1])
+    if medians[-1, -1] > _FLAT and not informative:
         raise InputError(
-            f"{where} fits the cloud no better than a plane across the view, as depth or as one "
-            "over depth. Photographs and maps may be mixed up, or maps be of another size."
+            f"{where} fits the point cloud no better than constant depth, as depth or as inverse "
+            "depth. Photographs and maps may be mixed up, or maps may have a different size."
         )
-    if not told or (prior.inverse is None and not helps):
+    if not enough or (prior.inverse is None and not informative):
         raise InputError(
-            f"{where}: too few points of the cloud show its meaning; needed: {_FEWEST} in each "
-            "map, at several depths. State whether it is one over depth (`inverse`), and its "
-            "`gauge`, or give it in scene units."
+            f"{where}: too few points of the cloud determine its meaning; needed: {_MIN_POINTS} in "
+            "each map, at several depths. State `inverse` and `gauge`, or give it in scene units."
         )
     if prior.inverse is not None:
-        stated, gauge = ways.index((prior.inverse, prior.along)), gauges.index(prior.gauge)
-        if helps and surely_better(worth[best, -1], worth[stated, -1]):
+        stated, gauge = readings.index((prior.inverse, prior.along)), gauges.index(prior.gauge)
+        if informative and clearly_better(scores[best, -1], scores[stated, -1]):
             raise InputError(
-                f"{where} is {_READINGS[ways[best]]}, given as {_READINGS[ways[stated]]}: the "
-                f"cloud shows it (median error {at(best)} against {at(stated)}). State the first."
+                f"{where} is {_READINGS[readings[best]]}, given as {_READINGS[readings[stated]]} "
+                f"(median errors at the cloud: {error(best)}, {error(stated)}). State the first."
             )
         worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
-        if helps and worse and surely_better(worth[stated, -1], worth[stated, gauge]):
+        if informative and worse and clearly_better(scores[stated, -1], scores[stated, gauge]):
             raise InputError(
                 f"{where} is not depth {_GAUGES[prior.gauge]}: its median error at the cloud is "
-                f"{at(stated, gauge)}, and {at(stated)} {_GAUGES['affine']} (`gauge` affine)."
+                f"{error(stated, gauge)}, and {error(stated)} {_GAUGES['affine']} (`gauge` affine)."
             )
         best = stated
     else:
-        plain = ways.index((ways[best][0], "axis"))
-        if not surely_better(worth[best, -1], worth[plain, -1]):
-            best = plain
-        gauge = [surely_better(worth[best, -1], one) for one in worth[best]].index(False)
+        on_axis = readings.index((readings[best][0], "axis"))
+        if not clearly_better(scores[best, -1], scores[on_axis, -1]):
+            best = on_axis
+        gauge = [clearly_better(scores[best, -1], row) for row in scores[best]].index(False)
         caution(
-            f"{where} is taken to be {_READINGS[ways[best]]} {_GAUGES[gauges[gauge]]}, as the "
-            f"cloud shows: its median error at {errors.shape[-1]} observations is "
-            f"{at(best, gauge)}. `inverse`, `along` and `gauge` state it.",
+            f"{where} is interpreted as {_READINGS[readings[best]]} {_GAUGES[gauges[gauge]]}, "
+            f"which fits the point cloud best: its median error at {errors.shape[-1]} observations "
+            f"is {error(best, gauge)}. If this is wrong, state `inverse`, `along` and `gauge`.",
             stacklevel=4,
         )
-    inverse, along = ways[best]
+    inverse, along = readings[best]
     if (inverse, along, gauges[gauge]) == _OURS:
         return prior.replace(inverse=inverse, along=along, gauge=gauges[gauge])
-    off = lines.new_zeros(len(prior.names))
-    for one in torch.unique(seen.place[:, 0]).tolist():
-        off[one] = 1.4826 * errors[best, gauge, seen.place[:, 0] == one].median()  # of Gaussians
-    return _in_scene(prior, scene, along, inverse, lines[best, gauge], off)
+    deviation, maps = lines.new_zeros(len(prior.names)), observed.index[:, 0]
+    for index in torch.unique(maps).tolist():
+        deviation[index] = 1.4826 * errors[best, gauge, maps == index].median()  # of Gaussians
+    return _to_scene_depth(prior, scene, along, inverse, lines[best, gauge], deviation)
 
 
-def _lengths(pixels: Tensor, scene: SparseScene, views: Tensor) -> Tensor:
-    """Return how long rays through pixels ``view pixel 2`` are for a depth of 1."""
+def _ray_lengths(pixels: Tensor, scene: SparseScene, views: Tensor) -> Tensor:
+    """Return the lengths of rays through pixels ``view pixel 2`` to a depth of 1."""
     poses, intrinsics = scene.cameras.cam_from_world[views], scene.cameras.intrinsics[views]
     return rays_through(pixels, poses.to(pixels), intrinsics.to(pixels)).norm(dim=-1)
 
 
-def _in_scene(
-    prior: DepthPrior, scene: SparseScene, along: Along, inverse: bool, lines: Tensor, off: Tensor
+def _to_scene_depth(
+    prior: DepthPrior, scene: SparseScene, along: Along, inverse: bool, lines: Tensor, least: Tensor
 ) -> DepthPrior:
     """Convert values to depth along the camera's axis in scene units; differentiable in them.
 
     Args:
-        lines: Factor and offset of each map; NaN where too few points show them.
-        off: Relative error of each map at the points: the least standard error.
+        lines: Factor and offset of each map; NaN where too few points determine them.
+        least: Least relative standard error of each map: its error at the points.
     """
-    parts = torch.cat([lines.nan_to_num(0), off[:, None]], dim=1).to(prior.depth)
-    slope, offset, off = parts.mT[..., None, None]
-    truth = slope * prior.depth + offset
-    known = prior.variance.isfinite() & (truth > 0)
-    truth = torch.where(known, truth, 1)
-    relative = slope * torch.where(known, prior.variance, 1).sqrt() / truth
-    depth = 1 / truth if inverse else truth
+    terms = torch.cat([lines.nan_to_num(0), least[:, None]], dim=1).to(prior.depth)
+    slope, offset, least = terms.mT[..., None, None]
+    fitted = slope * prior.depth + offset
+    valid = prior.variance.isfinite() & (fitted > 0)
+    fitted = torch.where(valid, fitted, 1)
+    relative = slope * torch.where(valid, prior.variance, 1).sqrt() / fitted
+    depth = 1 / fitted if inverse else fitted
     if along == "ray":
         views = torch.tensor([scene.views.names.index(name) for name in prior.names])
         zoom = (scene.cameras.sizes_px[views] / prior.sizes_px)[:, None, None]
         height, width = depth.shape[1:]
-        places = pixel_centers(width, height, like=depth) * zoom.to(depth)
-        depth = depth / _lengths(places.flatten(1, 2), scene, views).view_as(depth)
-    variance = (depth * torch.maximum(relative, off)).square()
+        pixels = pixel_centers(width, height, like=depth) * zoom.to(depth)
+        depth = depth / _ray_lengths(pixels.flatten(1, 2), scene, views).view_as(depth)
+    variance = (depth * torch.maximum(relative, least)).square()
     return prior.replace(
-        depth=torch.where(known, depth, 0),
-        variance=torch.where(known, variance, torch.inf),
+        depth=torch.where(valid, depth, 0),
+        variance=torch.where(valid, variance, torch.inf),
         along="axis",
         inverse=False,
         gauge="scene",
@@ -154,83 +153,84 @@ def _in_scene(
 
 
 @torch.no_grad()
-def _compared(
+def _fit_readings(
     prior: DepthPrior, scene: SparseScene
 ) -> tuple[Float[Tensor, "reading gauge map 2"], Tensor, AtPoints]:
-    """Fit all readings, and last a plane across the view, to the cloud in every gauge.
+    """Fit all readings, and last constant depth, to the cloud in every gauge.
 
     Returns:
-        Factor and offset of each map, NaN where too few points show them; relative errors,
+        Factor and offset of each map, NaN where too few points determine them; relative errors,
         ``reading gauge observation``; and the observations.
     """
-    seen = at_points(prior, prior.variance.isfinite(), scene)
-    count = torch.bincount(seen.place[:, 0], minlength=len(prior.names))
-    seen = seen.take(count[seen.place[:, 0]] >= _FEWEST)
-    lengths = _lengths(seen.pixels[:, None], scene, seen.view)[:, 0].double()
-    values, axis = prior.depth[seen.place.unbind(dim=-1)].double(), seen.depth.double()
+    observed = at_points(prior, prior.variance.isfinite(), scene)
+    count = torch.bincount(observed.index[:, 0], minlength=len(prior.names))
+    observed = observed.take(count[observed.index[:, 0]] >= _MIN_POINTS)
+    maps = observed.index[:, 0]
+    lengths = _ray_lengths(observed.pixels[:, None], scene, observed.view)[:, 0].double()
+    values, axis = prior.depth[observed.index.unbind(dim=-1)].double(), observed.depth.double()
     truths = [axis, axis * lengths, 1 / axis, 1 / (axis * lengths)]  # as in _READINGS
     pairs = [*((values, truth) for truth in truths), (torch.zeros_like(values), axis)]
     lines = values.new_full((len(pairs), len(_GAUGES), len(prior.names), 2), torch.nan)
     lines[:, 0] = lines.new_tensor([1.0, 0.0])
     for reading, pair in enumerate(pairs):
         for gauge, offset in ((1, False), (2, True)):
-            lines[reading, gauge] = _lines(*pair, seen.place[:, 0], len(prior.names), offset)
-    own = lines[:, :, seen.place[:, 0]]
-    given, truth = (torch.stack(part)[:, None] for part in zip(*pairs, strict=True))
-    return lines, (own[..., 0] * given + own[..., 1] - truth).abs() / truth, seen
+            lines[reading, gauge] = _fit_lines(*pair, maps, len(prior.names), offset)
+    line = lines[:, :, maps]
+    values, truth = (torch.stack(rows)[:, None] for rows in zip(*pairs, strict=True))
+    return lines, (line[..., 0] * values + line[..., 1] - truth).abs() / truth, observed
 
 
 @torch.no_grad()
-def _better_turned(prior: DepthPrior, scene: SparseScene, size: Scalar) -> str:
-    """Name the turn with which maps surely fit the cloud better, up to factor and offset.
+def _better_orientation(prior: DepthPrior, scene: SparseScene, size: Scalar) -> str:
+    """Return the name of the orientation error of maps, up to factor and offset, else "".
 
     Args:
-        size: Relative error that scores a half.
+        size: Relative error with a score of one half.
     """
-    seen = at_points(prior, torch.ones_like(prior.depth, dtype=torch.bool), scene)
-    maps, axis = seen.place[:, 0], seen.depth.double()
+    observed = at_points(prior, torch.ones_like(prior.depth, dtype=torch.bool), scene)
+    maps, axis = observed.index[:, 0], observed.depth.double()
 
-    def worth(tags: Int[Tensor, " map"]) -> Float[Tensor, "reading point"]:
-        place = turned(seen.place, prior, tags).unbind(dim=-1)
-        values, known = prior.depth[place].double(), prior.variance[place].isfinite()
-        scores = []
+    def scores_of(tags: Int[Tensor, " map"]) -> Float[Tensor, "reading point"]:
+        index = reoriented(observed.index, prior, tags).unbind(dim=-1)
+        values, valid = prior.depth[index].double(), prior.variance[index].isfinite()
+        scores, count = [], len(prior.names)
         for truth in (axis, 1 / axis):
-            lines = _lines(values[known], truth[known], maps[known], len(prior.names), True)[maps]
-            error = (lines[:, 0] * values + lines[:, 1] - truth).abs() / truth
-            scores.append(torch.where(known, size / (size + error), 0).nan_to_num(0))
-        return means_by(torch.stack(scores), seen.point)
+            line = _fit_lines(values[valid], truth[valid], maps[valid], count, True)[maps]
+            error = (line[:, 0] * values + line[:, 1] - truth).abs() / truth
+            scores.append(torch.where(valid, size / (size + error), 0).nan_to_num(0))
+        return means_by(torch.stack(scores), observed.point)
 
-    plain = worth(torch.ones(len(prior.names), dtype=torch.long))
-    turns = [(what, worth(tags)) for what, tags in layouts(prior, scene)]
-    return better_otherwise(plain[plain.mean(dim=1).argmax()], turns)
+    unchanged = scores_of(torch.ones(len(prior.names), dtype=torch.long))
+    changes = [(name, scores_of(tags)) for name, tags in exif_errors(prior, scene)]
+    return better_change(unchanged[unchanged.mean(dim=1).argmax()], changes)
 
 
-def _lines(
+def _fit_lines(
     values: Float[Tensor, " observation"],
     truth: Float[Tensor, " observation"],
     maps: Int[Tensor, " observation"],
     count: int,
     offset: bool,
 ) -> Float[Tensor, "map 2"]:
-    """Fit ``a values + b``, ``a`` at least 0, to each of ``count`` maps for small absolute errors.
+    """Fit ``a values + b``, ``a`` at least 0, to each of ``count`` maps by least absolute errors.
 
     Returns:
-        Factor and offset of each map; NaN where too few points show them.
+        Factor and offset of each map; NaN where too few points determine them.
     """
     lines = values.new_full((count, 2), torch.nan)
-    for one in torch.unique(maps).tolist():
-        given, wanted = values[maps == one], truth[maps == one]
-        if len(given) < _FEWEST:
+    for index in torch.unique(maps).tolist():
+        x, y = values[maps == index], truth[maps == index]
+        if len(x) < _MIN_POINTS:
             continue
-        weight = torch.ones_like(wanted)
+        weight = torch.ones_like(y)
         for _ in range(_STEPS):
             weight = weight / weight.sum()
-            means = [(weight * each).sum() * offset for each in (given, wanted)]
-            across, along = given - means[0], wanted - means[1]
-            squares = (weight * across.square()).sum().clamp_min(1e-300)
-            slope = ((weight * across * along).sum() / squares).clamp_min(0)
-            error = (along - slope * across).abs()
-            least = 1e-3 * float(error.median()) + 1e-12 * float(wanted.mean())
+            means = [(weight * side).sum() * offset for side in (x, y)]
+            dx, dy = x - means[0], y - means[1]
+            squares = (weight * dx.square()).sum().clamp_min(1e-300)
+            slope = ((weight * dx * dy).sum() / squares).clamp_min(0)
+            error = (dy - slope * dx).abs()
+            least = 1e-3 * float(error.median()) + 1e-12 * float(y.mean())
             weight = 1 / error.clamp_min(least)
-        lines[one] = torch.stack([slope, means[1] - slope * means[0]])
+        lines[index] = torch.stack([slope, means[1] - slope * means[0]])
     return lines

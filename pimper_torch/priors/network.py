@@ -1,4 +1,4 @@
-"""Guesses of a network about photographs."""
+"""Priors from a network that predicts maps of photographs."""
 
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
@@ -32,39 +32,39 @@ def priors_of(
     linear: bool = False,
     mean: Iterable[float] = (0.0,),
     std: Iterable[float] = (1.0,),
-    **meaning: Any,  # noqa: ANN401 - those of whichever prior it becomes
+    **meaning: Any,  # noqa: ANN401 - depends on the kind of prior
 ) -> Prior:
-    """Run a network over photographs, one at a time, and return its guesses as a prior.
+    """Run a network on photographs, one at a time, and return its maps as a prior.
 
-    Differentiable in the parameters of a module, which runs in the mode that it is in.
+    Differentiable in the parameters of a module, which runs in its current mode.
 
     Args:
-        network: A module, or any function, from a picture to a map ``1 channel height width``
-            of the whole picture at any size; or to a pair of the map and its variance. Or an
-            ONNX file, whose first output is the map, and one called ``variance`` its variance.
-        views: Photographs, or a scene's undistorted ones.
-        kind: Of the guesses. ``inliers`` and ``silhouettes`` are probabilities.
-        size_px: Width and height that pictures are resized to; their own unless given.
-        linear: Whether the network takes linear radiance rather than sRGB, both in [0, 1].
-        mean: That is subtracted, one for all channels or one each.
-        std: That pictures are divided by then.
-        meaning: What else the prior has to state: of normals ``axes`` and ``error_deg``, of depth
-            ``inverse``, ``along``, ``gauge`` and ``error``, as
+        network: A module, or any function, from an image to a map ``1 channel height width`` of
+            the complete image at any size; or to a pair of the map and its variance. Or an ONNX
+            file: its first output is the map, and an output ``variance`` is the variance.
+        views: Photographs, or a scene with undistorted photographs.
+        kind: Kind of the maps. ``inliers`` and ``silhouettes`` are probabilities.
+        size_px: Width and height to which images are resized; by default they are not.
+        linear: Whether the input is linear radiance instead of sRGB, both in [0, 1].
+        mean: Subtracted from images, one value for all channels or one each.
+        std: Divisor of images after that.
+        meaning: Conventions of the prior: ``axes`` and ``error_deg`` of normals, ``inverse``,
+            ``along``, ``gauge`` and ``error`` of depth, as in
             :func:`~pimper_torch.priors.prior_files.read_maps.read_normals` and
-            :func:`~pimper_torch.priors.prior_files.read_maps.read_depth` take them; of albedo
-            ``error``, in its own units.
+            :func:`~pimper_torch.priors.prior_files.read_maps.read_depth`; ``error`` of albedo,
+            in units of albedo.
 
     Raises:
-        InputError: The file is of another kind, or the network returns something else.
+        InputError: The file is not ONNX, or the output is not a map of this kind.
         ConfigError: onnxruntime is not installed.
     """
     photographs = views.views if isinstance(views, SparseScene) else views
     means, deviations = (
-        photographs.images.new_tensor(list(part))[:, None, None] for part in (mean, std)
+        photographs.images.new_tensor(list(values))[:, None, None] for values in (mean, std)
     )
     run = network if callable(network) else _loaded(Path(network))
 
-    def guess(view: int) -> tuple[Tensor, Tensor | None]:
+    def predict(view: int) -> tuple[Tensor, Tensor | None]:
         width, height = photographs.sizes_px[view].tolist()
         picture = photographs.images[view : view + 1, :, :height, :width].expand(-1, 3, -1, -1)
         picture = picture if linear else srgb_from_linear(picture)
@@ -72,27 +72,27 @@ def priors_of(
             picture = interpolate(picture, size_px[::-1], mode="bilinear", antialias=True)
         return _map(run((picture - means) / deviations), kind)
 
-    numbers = range(photographs.num_views)
-    guesses = map(guess, numbers) if callable(network) else side_by_side(guess, numbers)
-    found = dict(zip(photographs.names, guesses, strict=True))
-    return _prior(from_maps.stacked(found, photographs is not views), kind, meaning)
+    indices = range(photographs.num_views)
+    maps = map(predict, indices) if callable(network) else side_by_side(predict, indices)
+    maps_by_name = dict(zip(photographs.names, maps, strict=True))
+    return _prior(from_maps.stacked(maps_by_name, photographs is not views), kind, meaning)
 
 
-def _map(found: Any, kind: Kind) -> tuple[Tensor, Tensor | None]:  # noqa: ANN401
+def _map(output: Any, kind: Kind) -> tuple[Tensor, Tensor | None]:  # noqa: ANN401
     """Return a map as ``height width channel``, and its variance."""
-    several = isinstance(found, tuple | list) and len(found) <= 2
+    is_pair = isinstance(output, tuple | list) and len(output) <= 2
     values, variance = (
-        one[:, None] if isinstance(one, Tensor) and one.ndim == 3 else one
-        for one in ((*found, None)[:2] if several else (found, None))
+        layer[:, None] if isinstance(layer, Tensor) and layer.ndim == 3 else layer
+        for layer in ((*output, None)[:2] if is_pair else (output, None))
     )
     channels = _CHANNELS.get(kind, (1,))
     fits = isinstance(values, Tensor) and values.ndim == 4 and values.shape[1] in channels
     if not fits or not (variance is None or variance.shape == values[:, :1].shape):
-        shape = tuple(values.shape) if isinstance(values, Tensor) else type(found).__name__
+        shape = tuple(values.shape) if isinstance(values, Tensor) else type(output).__name__
         raise InputError(
             f"The network returns {shape}; needed for {kind}: a map (1, "
             f"{' or '.join(map(str, channels))}, height, width), or a pair of it and its variance. "
-            "Wrap it in a module that returns this."
+            "Wrap the network in a module that returns this."
         )
     return values[0].movedim(0, -1), None if variance is None else variance[0, 0]
 
@@ -105,24 +105,24 @@ def _prior(maps: from_maps.Maps, kind: Kind, meaning: dict[str, Any]) -> Prior:
     }
     if kind in makers:
         return makers[kind](maps, **meaning)
-    known = maps.values.isfinite().all(dim=-1)
-    values = torch.where(known[..., None], maps.values, 0)
+    valid = maps.values.isfinite().all(dim=-1)
+    values = torch.where(valid[..., None], maps.values, 0)
     if kind == "albedo":
         error = meaning.pop("error", torch.nan)
-        told = error > 0 or bool(maps.variance.isfinite().any())
-        require(told, "error", error, "above 0, where the network returns no variance")
-        variance = from_maps.variance_of(maps, known, error**2)
+        has_error = error > 0 or bool(maps.variance.isfinite().any())
+        require(has_error, "error", error, "above 0, where the network returns no variance")
+        variance = from_maps.variance_of(maps, valid, error**2)
         return AlbedoPrior(albedo=values.movedim(-1, 1), variance=variance, **maps.about, **meaning)
     return InlierPrior(probability=values[..., 0], **maps.about, **meaning)
 
 
 def _loaded(path: Path) -> Network:
-    """Open an ONNX file; one thread a picture, so that bits do not depend on their number."""
+    """Load an ONNX file, with one thread per image, so that bits do not depend on their number."""
     if path.suffix.lower() != ".onnx":
         raise InputError(
-            f"{path}: is no ONNX file. Files of `torch.export` (.pt2) and of `torch.save` hold "
-            "pickles, which may run any program when they are loaded. If you trust it, load it "
-            "yourself and give the module: `torch.export.load(path).module()`."
+            f"{path}: is not an ONNX file. Files of `torch.export` (.pt2) and `torch.save` contain "
+            "pickles, which can run any code when they are loaded. If you trust the file, load it "
+            "yourself and pass the module: `torch.export.load(path).module()`."
         )
     if find_spec("onnxruntime") is None:
         raise ConfigError(
@@ -136,13 +136,13 @@ def _loaded(path: Path) -> Network:
         session = onnxruntime.InferenceSession(
             str(path), options, providers=["CPUExecutionProvider"]
         )
-    except Exception as error:  # its own kinds, one for each fault
+    except Exception as error:  # onnxruntime has a type for each error
         raise InputError(f"{path}: cannot be opened by onnxruntime ({error}).") from error
-    (into, *_), outputs = session.get_inputs(), [one.name for one in session.get_outputs()]
-    wanted = [outputs[0], *(name for name in outputs[1:] if name == "variance")]
+    (into, *_), outputs = session.get_inputs(), [output.name for output in session.get_outputs()]
+    names = [outputs[0], *(name for name in outputs[1:] if name == "variance")]
 
     def run(picture: Picture) -> list[Tensor]:
-        found = session.run(wanted, {into.name: picture.detach().float().cpu().numpy()})
-        return [torch.from_numpy(one).to(picture) for one in found]
+        arrays = session.run(names, {into.name: picture.detach().float().cpu().numpy()})
+        return [torch.from_numpy(array).to(picture) for array in arrays]
 
     return run

@@ -2,7 +2,7 @@
 
 import torch
 
-from pimper_torch.priors.choice import surely_better
+from pimper_torch.priors.choice import clearly_better
 
 
 def test_four_standard_errors_are_significant_and_too_few_samples_are_not(generator):
@@ -10,7 +10,7 @@ def test_four_standard_errors_are_significant_and_too_few_samples_are_not(genera
     error = (differences.var() / 400).sqrt()
     for wanted, believed in ((3.99, False), (4.01, True)):
         moved = differences - differences.mean() + wanted * error
-        # The result is independent of the unit of a score and of the order of samples.
+        # Neither the unit of a score counts, nor the order of the places.
         assert surely_better(7 * moved.flip(0), torch.zeros(400)) == believed
     assert surely_better(torch.ones(8), torch.zeros(8))
     assert not surely_better(torch.ones(7), torch.zeros(7))
@@ -18,6 +18,6 @@ def test_four_standard_errors_are_significant_and_too_few_samples_are_not(genera
 
 def test_noise_is_not_significant(generator):
     one, other = torch.randn(2, 5000, generator=generator)
-    assert not surely_better(one, other)
-    assert not surely_better(other, one)
-    assert surely_better(one + 0.2, other)
+    assert not clearly_better(one, other)
+    assert not clearly_better(other, one)
+    assert clearly_better(one + 0.2, other)

@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.doors.io.decode import rotated
 from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
-from pimper_torch.priors.at_points import turned, turned_vectors
+from pimper_torch.priors.at_points import reoriented, reoriented_vectors
 from pimper_torch.priors.conventions import resolve_prior_conventions
 from pimper_torch.records import DepthPrior, NormalPrior
 from pimper_torch.records.priors import AXES
@@ -59,7 +59,7 @@ def test_unstated_axes_are_found_and_reported(rendered, axes, degrees, outlines)
     given = noisy(rendered.world, degrees)
     if axes != "world":
         given = camera * torch.tensor(AXES[axes][0])
-    with pytest.warns(PimperWarning, match="are taken to be (camera|world) normals"):
+    with pytest.warns(PimperWarning, match="are interpreted as (camera|world) normals"):
         found = settle(scene, of_normals(scene, given, axes=None), silhouettes)
     assert found.axes == "opencv"
     assert found.frame == ("world" if axes == "world" else "camera")
@@ -75,9 +75,9 @@ def test_unstated_axes_are_found_and_reported(rendered, axes, degrees, outlines)
         ({"axes": "opengl"}, "lub", "in axes of DSINE .*, given as .* OpenGL"),
         ({"axes": "lub"}, "opencv", "axes of OpenCV, given as .* DSINE"),
         ({"frame": "world"}, "opengl", "axes of OpenGL, given as world normals"),
-        ({"axes": None}, (-1, 1, 1), "OpenCV with x reversed, as no known estimator"),
+        ({"axes": None}, (-1, 1, 1), "OpenCV with x reversed, as no known network"),
         ({"axes": None}, (1, 1, -1), "OpenCV with z reversed"),
-        ({}, "other world", "agree between views as they are: they are world normals of another"),
+        ({}, "other world", "are consistent, but in a different world frame"),
     ],
 )
 @pytest.mark.parametrize("outlines", [False, True])
@@ -112,7 +112,7 @@ def test_exchanged_channels_are_corrected_and_reported(rendered, axes, stated, o
         return
     with pytest.warns(PimperWarning) as caught:
         found = settle(scene, of_normals(scene, written, axes=stated), silhouettes)
-    assert "have red and blue exchanged, as OpenCV writes" in str(caught[0].message)
+    assert "have red and blue exchanged, as in images that OpenCV" in str(caught[0].message)
     assert len(caught) == 1 + (stated is None)
     known = found.variance.isfinite()
     assert_close(found.normals[known], camera[known])
@@ -127,7 +127,7 @@ def stored(maps, tags):
 TURNED = {
     "mirrored left to right": ([2] * 12, False),
     "mirrored top to bottom": ([4] * 12, False),
-    "of the pixels that files store, before EXIF turns these": ([3, 1, 3] * 4, True),
+    "for the pixels as stored, without EXIF's orientation": ([3, 1, 3] * 4, True),
 }
 
 
@@ -145,7 +145,7 @@ def test_rotated_normal_maps_are_refused_with_the_reason(rendered, what, alone, 
     if in_files:
         scene = scene.replace(views=scene.views.replace(orientations=torch.tensor(tags)))
     for given, axes in ((stored(camera, tags), None), (found_by_network, "opencv")):
-        with pytest.raises(InputError, match=f"are {what}. Cloud.* Turn maps and vectors"):
+        with pytest.raises(InputError, match=f"are {what}, as cloud.* Orient maps and vectors"):
             settle(scene, of_normals(scene, given, axes=axes), silhouettes)
 
 
@@ -164,13 +164,11 @@ def test_undetermined_axes_must_be_stated(rendered):
     bare = without_points(scene)
     upside_down = of_normals(bare, -rendered.camera)
     assert torch.equal(settle(bare, upside_down).normals, upside_down.normals)
-    with pytest.raises(
-        InputError, match=r"the scene does not show whether they are .* State `axes`"
-    ):
+    with pytest.raises(InputError, match=r"the scene does not show if they are .* State `axes`"):
         settle(bare, upside_down.replace(axes=None))
     depth = of_depth(bare, rendered.depth, gauge="scene")
     assert torch.equal(settle(bare, depth).depth, depth.depth)
-    with pytest.raises(InputError, match=r"too few points of the cloud show .*`inverse`"):
+    with pytest.raises(InputError, match=r"too few points of the cloud determine .*`inverse`"):
         settle(bare, depth.replace(inverse=None))
     # Contours alone also determine the axes.
     with pytest.warns(PimperWarning, match="in axes of DSINE"):
@@ -199,18 +197,21 @@ def lengths_of_rays(scene):
 
 
 DEPTHS = {
-    "metres": (lambda depth, _: 3 * depth, "depth along the camera's axis up to a factor a map"),
-    "affine": (lambda depth, _: 0.3 * depth - 0.5, "axis up to a factor and an offset a map"),
+    "metres": (lambda depth, _: 3 * depth, "depth along the camera's axis up to a factor per map"),
+    "affine": (lambda depth, _: 0.3 * depth - 0.5, "axis up to a factor and an offset per map"),
     "scene": (lambda depth, _: depth, "depth along the camera's axis in the scene's unit"),
     "disparity": (
         lambda depth, _: 4 / depth - 0.1,
-        "disparity. along the camera's .* an offset a map",
+        "disparity. along the camera's .* an offset per map",
     ),
     "inverse": (
         lambda depth, _: 4 / depth,
-        "disparity. along the camera's axis up to a factor a map",
+        "disparity. along the camera's axis up to a factor per map",
     ),
-    "distance": (lambda depth, rays: 2 * depth * rays, "depth along the ray up to a factor a map"),
+    "distance": (
+        lambda depth, rays: 2 * depth * rays,
+        "depth along the ray up to a factor per map",
+    ),
 }
 
 
@@ -224,7 +225,7 @@ def test_unstated_depth_conventions_are_found_reported_and_converted(rendered, k
     prior = of_depth(rendered.scene, given, inverse=None)
     known = prior.variance.isfinite()
     prior = prior.replace(variance=torch.where(known, (0.01 * spread) ** 2, torch.inf))
-    with pytest.warns(PimperWarning, match=f"is taken to be .*{what}, as the cloud shows: its "):
+    with pytest.warns(PimperWarning, match=f"is interpreted as .*{what}, which fits .* best: its "):
         found = settle(rendered.scene, prior)
     assert (found.inverse, found.along, found.gauge) == (False, "axis", "scene")
     assert torch.equal(found.variance.isfinite(), known)
@@ -283,10 +284,10 @@ def test_a_depth_map_without_observed_points_is_ignored(rendered):
 @pytest.mark.parametrize(
     ("kind", "stated", "what"),
     [
-        ("disparity", {}, r"one over depth \(disparity\) .*, given as depth along the camera"),
-        ("affine", {"inverse": True}, "is depth .*, given as one over depth"),
+        ("disparity", {}, r"inverse depth \(disparity\) .*, given as depth along the camera"),
+        ("affine", {"inverse": True}, "is depth .*, given as inverse depth"),
         ("distance", {}, "is depth along the ray, given as depth along the camera's axis"),
-        ("affine", {"gauge": "scale"}, "is not depth up to a factor a map: its median error"),
+        ("affine", {"gauge": "scale"}, "is not depth up to a factor per map: its median error"),
         ("metres", {"gauge": "scene"}, "is not depth in the scene's unit"),
     ],
 )
@@ -308,7 +309,7 @@ def test_rotated_depth_maps_are_refused_with_the_reason(rendered, what, alone, k
     if in_files:
         scene = scene.replace(views=scene.views.replace(orientations=torch.tensor(tags)))
     prior = of_depth(scene, stored(given, tags), inverse=None if kind == "metres" else True)
-    with pytest.raises(InputError, match=f"The depth of .* is {what}: the cloud shows it"):
+    with pytest.raises(InputError, match=f"The depth of .* is {what}, as the cloud shows"):
         settle(scene, prior)
 
 
@@ -320,7 +321,7 @@ def test_pixels_and_vectors_are_transformed_like_rotated_maps(rendered, tag):
     prior = of_normals(rendered.scene, rendered.camera).take([0, 1])
     prior = prior.replace(sizes_px=torch.tensor([[width, 4]] * 2))
     place = torch.cartesian_prod(torch.arange(2), torch.arange(4), torch.arange(width))
-    found = turned(place, prior, torch.tensor([tag, tag]))
+    found = reoriented(place, prior, torch.tensor([tag, tag]))
     assert torch.equal(maps[found.unbind(dim=1)], upright[place.unbind(dim=1)])
     # Vectors in pixels: the transformed steps to the right and down.
     corners = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 1, 0]])
@@ -328,7 +329,7 @@ def test_pixels_and_vectors_are_transformed_like_rotated_maps(rendered, tag):
         torch.stack([(upright[0] == maps[tuple(one)]).nonzero()[0] for one in corners])
     ).T
     steps = torch.stack([column[1:] - column[0], row[1:] - row[0]], dim=1).float()
-    found = turned_vectors(torch.eye(3)[:2], torch.tensor([tag, tag]))
+    found = reoriented_vectors(torch.eye(3)[:2], torch.tensor([tag, tag]))
     assert torch.equal(found[:, :2], steps)
 
 
@@ -338,7 +339,7 @@ def test_depth_unrelated_to_the_scene_is_refused(rendered, inverse):
     generator = torch.Generator().manual_seed(8)
     noise = torch.rand(12, 1, 6, 8, generator=generator)
     given = 1 + interpolate(noise, (120, 160), mode="bilinear", align_corners=False)[:, 0]
-    with pytest.raises(InputError, match="fits the cloud no better than a plane"):
+    with pytest.raises(InputError, match="fits the point cloud no better than"):
         settle(rendered.scene, of_depth(rendered.scene, given, inverse=inverse))
 
 
@@ -361,7 +362,7 @@ def test_on_a_flat_relief_stated_depth_conventions_are_used(rendered):
     assert_close(
         found.depth[5][known], torch.full_like(found.depth[5][known], 7), rtol=1e-3, atol=0
     )
-    with pytest.raises(InputError, match="too few points of the cloud show its meaning"):
+    with pytest.raises(InputError, match="too few points of the cloud determine its"):
         settle(wall, prior.replace(inverse=None))
 
 
@@ -374,7 +375,7 @@ def test_normals_unrelated_to_the_scene_give_a_warning_or_error(rendered):
     normals = normalize(random.movedim(1, -1), dim=-1)
     with pytest.warns(PimperWarning, match="hardly fit cloud, outlines and cameras, to 0.0"):
         settle(rendered.scene, of_normals(rendered.scene, normals))
-    with pytest.raises(InputError, match=r"the scene does not show whether they .* State `axes`"):
+    with pytest.raises(InputError, match=r"the scene does not show if they .* State `axes`"):
         settle(rendered.scene, of_normals(rendered.scene, normals, axes=None))
 
 

@@ -171,7 +171,7 @@ def test_an_output_named_variance_is_the_variance(views, tmp_path):
 
 @pytest.mark.parametrize("name", ["net.pt2", "net.pt", "net.safetensors"])
 def test_files_that_hold_pickles_are_refused(name, views, tmp_path):
-    with pytest.raises(InputError, match="which may run any program when they are loaded"):
+    with pytest.raises(InputError, match="which can run any code when they are loaded"):
         pt.priors_of(tmp_path / name, views, "depth")
 
 

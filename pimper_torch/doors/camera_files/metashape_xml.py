@@ -43,7 +43,8 @@ def read_metashape_cameras(path: Path) -> list[PosedCamera]:
     }
     for camera in chunk.iterfind("cameras//camera"):
         needed = f"an independent transform for {camera.get('label')}"
-        file.expect(camera.get("master_id") in (None, camera.get("id")), needed, "a rig's camera")
+        alone = camera.get("master_id") in (None, camera.get("id"))
+        file.expect(alone, needed, "a camera of a rig")
     cameras = []
     for camera in _largest_component(_aligned(chunk), path):
         label = str(camera.get("label"))
