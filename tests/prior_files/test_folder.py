@@ -101,7 +101,7 @@ def test_a_folder_with_only_one_kind_of_map_is_read_with_any_name(tmp_path):
 
 def test_a_multipage_file_and_a_file_instead_of_a_folder_are_refused(tmp_path):
     (tmp_path / "stack.tif").write_bytes(b"pages")
-    with pytest.raises(InputError, match=r"one a photograph. It holds stack\.tif. Write pages of"):
+    with pytest.raises(InputError, match=r"It contains stack\.tif. Write pages of a TIFF to"):
         numbers_of(tmp_path, FLAT)
-    with pytest.raises(InputError, match="found a file; needed: a folder of maps, one a photograp"):
+    with pytest.raises(InputError, match="found a file; needed: a folder of maps, one per photo"):
         numbers_of(tmp_path / "stack.tif", FLAT)

@@ -78,11 +78,11 @@ def test_labels_and_unknown_pixels_are_read(views, tmp_path):
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [
-        ("b.npy", 8 * SOFT - 4, "b.npy: holds values from -4 to 4; needed: the probability"),
+        ("b.npy", 8 * SOFT - 4, "b.npy: contains values from -4 to 4; needed: the probability"),
         ("b.npy", SOFT.T, "b.npy: is 16 x 24, but the photograph b.jpg is 48 x 32; it seems"),
         ("b.npy", np.stack([SOFT, SOFT, 1 - SOFT], axis=-1), "has colours"),
-        ("b.npy", np.rint(255 * SOFT / SOFT.max()), "from 0 to 255; .*Divide these levels by 255"),
-        ("b.npy", np.stack([SOFT] * 4), "a stack of 4 maps; .* under the names of their photogr"),
+        ("b.npy", np.rint(255 * SOFT / SOFT.max()), "from 0 to 255; .*Divide the values by 255"),
+        ("b.npy", np.stack([SOFT] * 4), "a stack of 4 maps; .* named like its photogr"),
         ("d.npy", SOFT, "no map for a.jpg, b.jpg, c.jpg, and no photograph for d.npy"),
         ("b.npy", np.array(["object"]), "needed: real numbers"),
     ],
@@ -103,7 +103,7 @@ def test_clicks_are_read_as_foreground_seeds(views):
     assert (prior.inside[1] == 1).nonzero().tolist() == [[0, 46], [0, 47], [1, 46], [1, 47]]
     with pytest.raises(InputError, match="outside the photograph, which has 48 x 32"):
         object_at([Mark.read("a,60,1")], views)
-    with pytest.raises(InputError, match="'e': none of the photographs"):
+    with pytest.raises(InputError, match="'e': no photographs have this name"):
         object_at([Mark.read("e,6,1")], views)
 
 

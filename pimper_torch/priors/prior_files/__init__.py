@@ -1,4 +1,4 @@
-"""Folders of maps that estimators write, as priors."""
+"""Folders of maps that networks wrote, as priors."""
 
 from pimper_torch.priors.prior_files.read_maps import read_depth as read_depth
 from pimper_torch.priors.prior_files.read_maps import read_normals as read_normals
