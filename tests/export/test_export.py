@@ -37,7 +37,7 @@ def test_formats_with_photographs_need_them(folder, photographs, tmp_path, capsy
     moved = photographs.rename(tmp_path / "moved")
     out = tmp_path / "more"
     assert run("export", folder, "-o", out, "--format", "maps", format) == 2
-    assert "Name their folder by `--photos DIR`" in capsys.readouterr().err
+    assert "Give their folder with `--photos DIR`" in capsys.readouterr().err
     assert not out.exists()
     assert run("export", folder, "-o", out, "--format", format, "--photos", moved) == 0
 
@@ -56,7 +56,7 @@ def test_an_export_into_the_result_itself_is_refused(folder, tmp_path, capsys, i
     (tmp_path / "link").symlink_to(folder)
     before = contents(folder)
     assert run("export", folder, "-o", folder / inside, "--format", "maps", "--overwrite") == 2
-    assert "RESULT (" in capsys.readouterr().err
+    assert "is inside the result folder" in capsys.readouterr().err
     assert contents(folder) == before
 
 

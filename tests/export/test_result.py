@@ -125,7 +125,7 @@ def test_a_result_is_the_same_with_and_without_photographs(folder, photographs, 
     assert torch.equal(found.mesh_cameras.cam_from_world, there.scene.cameras.cam_from_world)
     assert torch.equal(found.mesh_cameras.sizes_px, there.scene.cameras.sizes_px)
     assert found.offset_world == there.scene.offset_world
-    with pytest.raises(InputError, match="colmap holds photographs"):
+    with pytest.raises(InputError, match="colmap contains photographs"):
         write_formats(found, ["colmap"], tmp_path / "more")
 
 
@@ -136,11 +136,11 @@ def grey(path):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda out, photos: grey(photos / "b.png"), r"b\.png: has 50 x 40 .* from 60 x 40"),
+        (lambda out, photos: grey(photos / "b.png"), r"b\.png: has 50 x 40 .* but 60 x 40"),
         (lambda out, photos: (photos / "b.png").unlink(), r"photographs b\.png are not in"),
         (lambda out, photos: grey(out / "masks" / "c.png"), r"c\.png: has 50 x 40 .*: 60 x 40"),
-        (lambda out, photos: (out / "config.yaml").unlink(), r"holds no config\.yaml"),
-        (lambda out, photos: out.rename(out.parent / "away"), "is no folder"),
+        (lambda out, photos: (out / "config.yaml").unlink(), r"lacks config\.yaml"),
+        (lambda out, photos: out.rename(out.parent / "away"), "is not a folder"),
     ],
 )
 def test_a_damaged_or_mismatching_result_is_refused(folder, photographs, change, why):
@@ -162,7 +162,7 @@ def test_a_summary_without_photographs_asks_for_them(folder, photographs):
     summary = json.loads((folder / "summary.json").read_text())
     del summary["photographs"]
     (folder / "summary.json").write_text(json.dumps(summary))
-    with pytest.raises(InputError, match="does not name its photographs"):
+    with pytest.raises(InputError, match="does not name the folder of its photographs"):
         read_result(folder)
     assert read_result(folder, photographs).scene.views.num_views == 3
 

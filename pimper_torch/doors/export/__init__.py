@@ -1,4 +1,4 @@
-"""Folders of results: written, read back, and written for other programs."""
+"""Result folders: written, read, and converted for other programs."""
 
 from pimper_torch.doors.export.layouts import write_formats
 from pimper_torch.doors.export.result import Result, WrittenResult, read_result, read_written

@@ -1,4 +1,4 @@
-"""AliceVision's SfMData with maps for every view, as Meshroom and Open-RNb read it."""
+"""AliceVision's SfMData with maps of every view, for Meshroom and Open-RNb."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,15 +18,15 @@ from pimper_torch.result.viz.maps import albedo_scale, view_maps
 from pimper_torch.runtime.progress import part, track
 
 _VERSION = ("1", "2", "8")
-_SENSOR_MM = 36.0  # AliceVision's own default: focal lengths are in millimetres of it
+_SENSOR_MM = 36.0  # AliceVision's default sensor width, to which focal lengths in mm refer
 
 
 def write_alicevision(result: Result, folder: Path) -> None:
-    """Write ``cameras.sfm`` of the photographs, and beside it one file for each kind of map.
+    """Write ``cameras.sfm`` of the photographs, and one such file for each kind of map.
 
     ``normalMaps.sfm``, ``albedoMaps.sfm`` and ``masks.sfm`` have the same views with other paths.
-    Normals are EXR in OpenGL's camera axes (x right, y up, z to the viewer), as Open-RNb turns
-    them to the world; albedo is EXR, linear, scaled into [0, 1]. Photographs are undistorted.
+    Normals are EXR in OpenGL's camera axes (x right, y up, z to the viewer), which Open-RNb
+    expects; albedo is EXR, linear, scaled to [0, 1]. Photographs are undistorted.
     """
     views, cameras, scale = result.masked_views, result.cameras, albedo_scale(result.mesh)
     with part(0, 2):
@@ -51,19 +51,19 @@ def write_alicevision(result: Result, folder: Path) -> None:
 
 
 def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
-    """Write pinholes as SfMData in JSON, numbers as texts.
+    """Write pinhole cameras as SfMData in JSON, with numbers as texts.
 
     See :func:`~pimper_torch.doors.camera_files.meshroom_sfm.read_meshroom_cameras` for its
     conventions.
 
     Args:
-        cameras: Float64; a skew is left out.
-        paths: Of the pictures, one a camera, from the file's folder on.
+        cameras: Float64; skew is ignored.
+        paths: Paths of the images relative to the file's folder, one per camera.
     """
     views, intrinsics, poses = [], [], []
     sizes, centers = cameras.sizes_px.tolist(), cameras.centers_world
     for index, (path, (width, height)) in enumerate(zip(paths, sizes, strict=True)):
-        key, turn = str(index + 1), cameras.cam_from_world[index, :3, :3]
+        key, rotation = str(index + 1), cameras.cam_from_world[index, :3, :3]
         views.append(
             {
                 **dict.fromkeys(("viewId", "poseId", "frameId", "intrinsicId"), key),
@@ -75,10 +75,10 @@ def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
         )
         intrinsics.append(_intrinsic(key, cameras.intrinsics[index], width, height))
         # Column by column.
-        transform = {"rotation": _texts(turn.T.flatten()), "center": _texts(centers[index])}
+        transform = {"rotation": _texts(rotation.T.flatten()), "center": _texts(centers[index])}
         poses.append({"poseId": key, "pose": {"transform": transform, "locked": "1"}})
-    whole = {"version": _VERSION, "views": views, "intrinsics": intrinsics, "poses": poses}
-    write_json(whole, file, indent=4)
+    content = {"version": _VERSION, "views": views, "intrinsics": intrinsics, "poses": poses}
+    write_json(content, file, indent=4)
 
 
 def _intrinsic(identifier: str, K: Matrix3, width: int, height: int) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""The workspace of COLMAP's dense stereo: photographs, a model, and maps."""
+"""Workspace of COLMAP's dense stereo: photographs, a sparse model, and maps."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,14 +20,14 @@ _KINDS = ("depth_maps", "normal_maps", "consistency_graphs")
 
 
 def write_workspace(result: Result, folder: Path) -> None:
-    """Write what COLMAP's undistorter and dense stereo would: the surface as depths and normals.
+    """Write a result as COLMAP's undistorter and dense stereo would, with its depths and normals.
 
-    The undistorter itself is not run: it would resample the photographs once more.
+    The undistorter itself is not run, as it would resample the photographs once more.
 
     ``images/`` has PNG files in 8-bit sRGB, ``masks/`` masks of the same names with ``.png``
     appended, ``sparse/`` the model with its tracks. Depths are along the camera's z, normals in its
-    frame (x right, y down, z forward), both 0 where a view does not see the surface:
-    ``stereo_fusion`` and the meshers run on them.
+    frame (x right, y down, z forward), both 0 where the surface is not visible.
+    ``stereo_fusion`` and the meshers run on these maps.
     """
     scene = result.scene
     with part(0, 2):
@@ -54,24 +54,24 @@ def write_workspace(result: Result, folder: Path) -> None:
 def write_pinholes(
     scene: SparseScene, cameras: Cameras, files: Sequence[str], folder: Path
 ) -> None:
-    """Write a scene's pinholes, cloud and tracks as a model of its undistorted photographs.
+    """Write a COLMAP model of a scene's undistorted photographs: pinholes, cloud and tracks.
 
-    Points that fewer than two views see are left out: stereo programs take none.
+    Points that fewer than two views observe are excluded, as stereo programs reject them.
 
     Args:
-        cameras: Those of the scene, in the frame of ``scene.offset_world``.
-        folder: Gets the binary files; made if it is not there.
+        cameras: Cameras of the scene, in the frame of ``scene.offset_world``.
+        folder: Folder of the binary files; created if missing.
     """
     pixels = torch.empty_like(scene.observation_pixels, dtype=torch.float64)
     for view, (lens, K) in enumerate(zip(scene.lenses, cameras.intrinsics.double(), strict=True)):
-        here = scene.observation_view == view
-        ends = homogeneous(undistort_pixels(lens, scene.observation_pixels[here].double()))
-        pixels[here] = (ends @ K.mT)[:, :2]
+        in_view = scene.observation_view == view
+        ends = homogeneous(undistort_pixels(lens, scene.observation_pixels[in_view].double()))
+        pixels[in_view] = (ends @ K.mT)[:, :2]
     model = model_of_scene(scene).replace(
         names=tuple(files),
         lenses=pinhole_lenses(cameras),
         cam_from_world=cameras.cam_from_world.double(),
         observation_pixels=pixels,
     )
-    tied = (model.observed.sum(dim=1) >= 2).to(scene.points_world.device)
-    write_binary(select_views(model, range(model.num_views)), point_colors(scene)[tied], folder)
+    shared = (model.observed.sum(dim=1) >= 2).to(scene.points_world.device)
+    write_binary(select_views(model, range(model.num_views)), point_colors(scene)[shared], folder)

@@ -1,4 +1,4 @@
-"""Results in the layouts of other programs."""
+"""Export of results in the formats of other programs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -21,33 +21,33 @@ WITH_PHOTOGRAPHS: Mapping[str, Callable[[Result, Path], None]] = {
     "nerfstudio": write_nerfstudio,
     "alicevision": write_alicevision,
 }
-"""Writers of the formats that hold photographs; no other one needs them."""
+"""Writers of the formats that contain photographs."""
 
 
 def write_formats(
     result: WrittenResult, formats: Sequence[Format], folder: Path | str, axes: Axes = "opengl"
 ) -> None:
-    """Write a result in some layouts, each in a folder of its name.
+    """Write a result in several formats, each in a folder named after it.
 
     Args:
-        result: With its photographs, if one of the formats holds them.
-        axes: That normals of ``maps`` have.
+        result: With its photographs, if one of the formats contains them.
+        axes: Axes of the normals of ``maps``.
 
     Raises:
-        InputError: A format holds photographs, and the result was read without them.
+        InputError: A format contains photographs, and the result was read without them.
     """
     chosen = list(dict.fromkeys(formats))
     for index, name in enumerate(chosen):
-        place = Path(folder) / name
+        subfolder = Path(folder) / name
         with part(index, len(chosen)):
             if name == "maps":
-                write_maps(result, place, axes)
+                write_maps(result, subfolder, axes)
             elif name == "rti":
-                write_rti(result, place)
+                write_rti(result, subfolder)
             elif isinstance(result, Result):
-                WITH_PHOTOGRAPHS[name](result, place)
+                WITH_PHOTOGRAPHS[name](result, subfolder)
             else:
                 raise InputError(
-                    f"{name} holds photographs, but the result was read without them; needed: a "
+                    f"{name} contains photographs, but the result was read without them; needed: a "
                     "result of `read_result`."
                 )

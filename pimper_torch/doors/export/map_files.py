@@ -17,14 +17,14 @@ from pimper_torch.runtime.progress import track
 
 
 def write_maps(result: WrittenResult, folder: Path, axes: Axes = "opengl") -> None:
-    """Write what every view shows of the surface, under the photograph's name.
+    """Write maps of the visible surface in every view, named like the photographs.
 
     ``normals/`` has unit normals as EXR, and as 16-bit PNG of ``(n + 1) / 2``; ``depth/`` and
-    ``albedo/`` EXR; ``arrays/`` all of them and more as NPZ. What shows no surface is 0, in NPZ
-    NaN for depth. ``README.json`` describes the files.
+    ``albedo/`` EXR; ``arrays/`` all of them and more as NPZ. Pixels without surface are 0, or NaN
+    for depth in NPZ. ``README.json`` describes the files.
 
     Args:
-        axes: Of the camera, that normals have.
+        axes: Camera axes of the normals.
     """
     for kind in ("normals", "depth", "albedo", "arrays"):
         (folder / kind).mkdir(parents=True)
@@ -51,21 +51,21 @@ def write_maps(result: WrittenResult, folder: Path, axes: Axes = "opengl") -> No
         )
     about = {
         "axes": axes,
-        "normals": f"unit, {AXES[axes][1]}; PNG holds (n + 1) / 2 of 65535; 0 off the surface",
+        "normals": f"unit, {AXES[axes][1]}; PNG is 65535 (n + 1) / 2; 0 off the surface",
         "depth": "along the camera's axis, in the result's unit; 0 off the surface, NaN in NPZ",
         "albedo": "linear, primaries of sRGB, one scale for all views; 0 off the surface",
-        "cameras": "NPZ: intrinsics count the centre of the top-left pixel as (0.5, 0.5); "
-        "cam_from_world has camera axes x right, y down, z into the scene, whatever normals have",
+        "cameras": "NPZ: in intrinsics, the centre of the top-left pixel is (0.5, 0.5); "
+        "cam_from_world has camera axes x right, y down, z into the scene, for all axes of normals",
     }
     write_json(about, folder / "README.json")
 
 
 def with_axes(normals_cam: Float[Tensor, "height width 3"], axes: Axes) -> np.ndarray:
-    """Turn normals of our camera's axes to others; float32."""
-    turned = normals_cam.numpy() * np.array(AXES[axes][0], np.float32) + np.float32(0)  # no -0
-    return np.asarray(turned, np.float32)
+    """Convert normals from our camera axes to different ones; float32."""
+    normals = normals_cam.numpy() * np.array(AXES[axes][0], np.float32) + np.float32(0)  # no -0
+    return np.asarray(normals, np.float32)
 
 
 def colours(albedo: Float[Tensor, "height width channel"]) -> np.ndarray:
-    """Return three channels, of grey too; float32."""
+    """Return albedo with three channels, also if it is grey; float32."""
     return np.asarray(albedo.expand(-1, -1, 3).numpy(), np.float32)

@@ -1,4 +1,4 @@
-"""NeRF's ``transforms.json``, as nerfstudio, instant-ngp and Brush read it."""
+"""NeRF's ``transforms.json``, for nerfstudio, instant-ngp and Brush."""
 
 import math
 from pathlib import Path
@@ -33,15 +33,15 @@ def write_transforms(
     albedo: Float[Tensor, "point channel"] | None = None,
     depth_unit: float | None = None,
 ) -> None:
-    """Write ``transforms.json`` as nerfstudio reads it, with ``images/`` and ``masks/``.
+    """Write ``transforms.json`` for nerfstudio, with ``images/`` and ``masks/``.
 
-    Intrinsics that all views share stand once in the file, where instant-ngp looks for them.
+    Intrinsics that all views share are written once at the top level, where instant-ngp reads them.
 
     Args:
         views: Undistorted.
         points_world: A cloud, written as ``sparse_pc.ply`` and named in the file.
-        depth_unit: What a level of the files in ``depths/`` is, which are named for every view;
-            others write them.
+        depth_unit: Unit of the files in ``depths/``, which are named for every view, but which
+            this function does not write.
 
     Raises:
         InputError: A camera has a skew, which the format cannot represent.
@@ -67,33 +67,33 @@ def write_transforms(
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     if not shared:
         frames = [{**lens, **frame} for lens, frame in zip(lenses, frames, strict=True)]
-    whole: dict[str, object] = {"camera_model": "PINHOLE", **shared}
+    content: dict[str, object] = {"camera_model": "PINHOLE", **shared}
     if depth_unit is not None:
-        whole["depth_unit_scale_factor"] = depth_unit
+        content["depth_unit_scale_factor"] = depth_unit
     if points_world is not None:
-        whole["ply_file_path"] = "sparse_pc.ply"
+        content["ply_file_path"] = "sparse_pc.ply"
         faces = torch.zeros(0, 3, dtype=torch.long)
         points = Mesh(vertices_world=points_world, faces=faces, albedo=albedo)
         write_ply(points, folder / "sparse_pc.ply")
-    write_json({**whole, "frames": frames}, folder / "transforms.json")
+    write_json({**content, "frames": frames}, folder / "transforms.json")
 
 
 def write_nerfstudio(result: Result, folder: Path) -> None:
-    """Write :func:`write_transforms` of a result, with silhouettes for masks and with depth maps.
+    """Write a result as :func:`write_transforms`, with silhouettes as masks and with depth maps.
 
-    The cloud is made of vertices of the surface, in their colours: Gaussian splatting starts there.
+    The cloud consists of coloured vertices of the surface, as a start for Gaussian splatting.
     ``depths/`` has PNG files of 16 bits: depth along the camera's axis in units of
-    ``depth_unit_scale_factor``, 0 where a view does not see the surface. The factor is
-    nerfstudio's own, 0.001, unless depths are out of its range: then it is another power of ten,
-    and a :class:`~pimper_torch.runtime.errors.PimperWarning` names the option for it.
+    ``depth_unit_scale_factor``, 0 where the surface is not visible. The factor is nerfstudio's
+    default, 0.001, unless depths are out of its range. It is then a different power of ten, and a
+    :class:`~pimper_torch.runtime.errors.PimperWarning` names the option for it.
     """
     vertices, albedo = result.mesh.vertices_world, result.mesh.albedo
     cameras, chosen = result.mesh_cameras, thinned(len(vertices))
     unit = depth_unit(float(transform(cameras.cam_from_world, vertices)[..., 2].max()))
     if unit != _DEPTH_UNIT:
         caution(
-            f"nerfstudio: 16 bits hold depths of this result in units of {unit:g}, while "
-            f"nerfstudio expects {_DEPTH_UNIT:g}. Where it uses depths, add "
+            f"nerfstudio: 16-bit depths of this result are in units of {unit:g}, while nerfstudio "
+            f"expects {_DEPTH_UNIT:g}. For methods that use depths, add "
             f"`nerfstudio-data --depth-unit-scale-factor {unit:g}`.",
             stacklevel=3,
         )
@@ -115,7 +115,7 @@ def write_nerfstudio(result: Result, folder: Path) -> None:
 
 
 def depth_unit(farthest: float) -> float:
-    """Choose the power of ten that depths are counted in: in 16 bits, with steps of 0.1 % at most.
+    """Return the power of ten that fits depths into 16 bits, with steps of at most 0.1 %.
 
     >>> depth_unit(6.4), depth_unit(500.0), depth_unit(0.25)
     (0.001, 0.01, 0.0001)
@@ -125,5 +125,5 @@ def depth_unit(farthest: float) -> float:
 
 
 def thinned(count: int) -> Int[Tensor, " point"]:
-    """Choose at most a hundred thousand of so many points, evenly."""
+    """Return the indices of at most 100,000 of ``count`` points, evenly spaced."""
     return torch.linspace(0, count - 1, min(count, 100_000), dtype=torch.float64).round().long()

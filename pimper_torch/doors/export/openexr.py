@@ -1,4 +1,4 @@
-"""Maps as OpenEXR files: scan lines in one part, packed without loss."""
+"""Maps as OpenEXR files: scan lines in one part, losslessly compressed."""
 
 import struct
 import zlib
@@ -8,25 +8,25 @@ from pathlib import Path
 import numpy as np
 
 _START = b"\x76\x2f\x31\x01" + struct.pack("<I", 2)  # magic number, version
-_ZIP, _LINES = 3, 16  # method of packing, and how many lines it packs together
-_LINES_OF = {0: 1, 2: 1, _ZIP: _LINES}  # of all methods that are read: none, ZIPS and ZIP
+_ZIP, _LINES = 3, 16  # compression method, and number of lines in a block
+_LINES_OF = {0: 1, 2: 1, _ZIP: _LINES}  # for all supported methods: none, ZIPS and ZIP
 _KINDS = {0: "<u4", 1: "<f2", 2: "<f4"}
 _NAMES = {1: ("Y",), 3: ("R", "G", "B")}
 
 
 def write_exr(values: np.ndarray, path: Path | str, comment: str = "") -> None:
-    """Write one map or three, ``height width channel``, under the names Y, or R, G and B.
+    """Write a map ``height width channel`` as channel Y, or channels R, G and B.
 
     Args:
-        comment: What the values mean; kept in the header under ``comments``.
+        comment: Meaning of the values, written to ``comments`` in the header.
     """
     height, width, count = values.shape
     channels = sorted(zip(_NAMES[count], range(count), strict=True))
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
-    listed = b"".join(name.encode() + struct.pack("<BIIII", 0, 2, 0, 1, 1) for name, _ in channels)
+    chlist = b"".join(name.encode() + struct.pack("<BIIII", 0, 2, 0, 1, 1) for name, _ in channels)
     header = _START
     for name, kind, data in (
-        ("channels", "chlist", listed + b"\0"),
+        ("channels", "chlist", chlist + b"\0"),
         ("comments", "string", comment.encode()),
         ("compression", "compression", bytes([_ZIP])),
         ("dataWindow", "box2i", window),
@@ -38,22 +38,22 @@ def write_exr(values: np.ndarray, path: Path | str, comment: str = "") -> None:
     ):
         header += f"{name}\0{kind}\0".encode() + struct.pack("<I", len(data)) + data
     header += b"\0"
-    # In a line, one channel follows the other.
+    # A line stores its channels one after the other.
     lines = values[..., [index for _, index in channels]].transpose(0, 2, 1).astype("<f4")
     blocks = [
         struct.pack("<i", first) + _packed(lines[first : first + _LINES].tobytes())
         for first in range(0, height, _LINES)
     ]
-    at = len(header) + 8 * len(blocks)
-    table = np.cumsum([at, *(len(block) for block in blocks[:-1])]).astype("<u8")
+    start = len(header) + 8 * len(blocks)
+    table = np.cumsum([start, *(len(block) for block in blocks[:-1])]).astype("<u8")
     Path(path).write_bytes(header + table.tobytes() + b"".join(blocks))
 
 
 def read_exr(path: Path | str, max_samples: int) -> dict[str, np.ndarray]:
-    """Read the channels of scan lines in one part, each ``height width`` in float32.
+    """Read the channels of an image with scan lines in one part, ``height width`` in float32.
 
     Args:
-        max_samples: Of a picture that says it has more none is read.
+        max_samples: An image with more samples is a ``ValueError``, as is a damaged file.
     """
     data = Path(path).read_bytes()
     try:
@@ -64,31 +64,29 @@ def read_exr(path: Path | str, max_samples: int) -> dict[str, np.ndarray]:
 
 def _channels(data: bytes, max_samples: int) -> dict[str, np.ndarray]:
     if data[:4] != _START[:4]:
-        raise ValueError("it is no OpenEXR file")
+        raise ValueError("it is not an OpenEXR file")
     if struct.unpack_from("<I", data, 4)[0] & 0x1A00:
         raise ValueError("it has tiles or several parts; needed: scan lines in one part")
-    header, at = {}, 8
-    while data[at] != 0:
-        # Names have 255 bytes at most.
-        name, kind, rest, *_ = (*data[at : at + 600].split(b"\0", 2), b"", b"")
+    header, offset = {}, 8
+    while data[offset] != 0:
+        # Names have at most 255 bytes.
+        name, kind, rest, *_ = (*data[offset : offset + 600].split(b"\0", 2), b"", b"")
         (size,) = struct.unpack_from("<I", rest)
-        at += len(name) + len(kind) + 6
-        header[name] = data[at : at + size]
-        at += size
+        offset += len(name) + len(kind) + 6
+        header[name] = data[offset : offset + size]
+        offset += size
     packing = header[b"compression"][0]
     if packing not in _LINES_OF:
-        raise ValueError("it is packed otherwise than by ZIP; save it with ZIP, or unpacked")
+        raise ValueError("its compression is not ZIP; save it with ZIP or without compression")
     left, top, right, bottom = struct.unpack("<4i", header[b"dataWindow"])
     width, height, lines = right - left + 1, bottom - top + 1, _LINES_OF[packing]
     channels = dict(_listed(header[b"channels"]))
     if not (width > 0 and height > 0 and 0 < width * height * len(channels) <= max_samples):
-        raise ValueError(
-            f"it says that it has {width} x {height} pixels of {len(channels)} channels"
-        )
+        raise ValueError(f"its header states {width} x {height} pixels of {len(channels)} channels")
     row = np.dtype([(name, kind, (width,)) for name, kind in channels.items()])
     blocks = -(-height // lines)
     rows: list[np.ndarray] = []
-    for start in struct.unpack_from(f"<{blocks}Q", data, at + 1):
+    for start in struct.unpack_from(f"<{blocks}Q", data, offset + 1):
         count = min(lines, height - len(rows) * lines)
         (size,) = struct.unpack_from("<I", data, start + 4)
         packed = data[start + 8 : start + 8 + size]
@@ -96,17 +94,17 @@ def _channels(data: bytes, max_samples: int) -> dict[str, np.ndarray]:
         if len(raw) != count * row.itemsize:
             raise IndexError
         rows.append(np.frombuffer(raw, row))
-    whole = np.concatenate(rows)
-    return {name: whole[name].astype(np.float32) for name in channels}
+    samples = np.concatenate(rows)
+    return {name: samples[name].astype(np.float32) for name in channels}
 
 
 def _listed(channels: bytes) -> Iterator[tuple[str, str]]:
-    """List names and types of channels, in the order in which lines hold them."""
+    """List names and types of channels, in their order within a line."""
     while channels[0] != 0:
         name, _, rest = channels.partition(b"\0")
         kind, _, *steps = struct.unpack_from("<IIII", rest)
         if steps != [1, 1]:
-            raise ValueError("it has channels of fewer pixels; needed: a value a pixel")
+            raise ValueError("it has subsampled channels; needed: one value per pixel")
         yield name.decode("utf-8", "replace"), _KINDS[kind]
         channels = rest[16:]
 
@@ -123,10 +121,10 @@ def _unpacked(packed: bytes, size: int) -> bytes:
 
 
 def _packed(raw: bytes) -> bytes:
-    """Pack a block, its size before it: of every other byte the differences, then of the rest."""
+    """Compress a block, preceded by its size: differences of even bytes, then of odd bytes."""
     plain = np.frombuffer(raw, np.uint8)
     halves = np.concatenate([plain[::2], plain[1::2]])
     halves[1:] = np.diff(halves) + np.uint8(128)
     data = zlib.compress(halves.tobytes())
-    data = raw if len(data) >= len(raw) else data  # readers see it by the size
+    data = raw if len(data) >= len(raw) else data  # readers detect this by the size
     return struct.pack("<I", len(data)) + data

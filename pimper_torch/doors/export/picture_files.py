@@ -1,4 +1,4 @@
-"""Photographs and masks as the files of an exported data set."""
+"""Photographs and masks as image files of an exported data set."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from pimper_torch.runtime.progress import track
 
 
 def write_picture(views: Views, index: int, path: Path) -> None:
-    """Write a photograph without its padding as PNG, 8-bit sRGB; more than 1 saturates.
+    """Write a photograph without padding as 8-bit sRGB PNG; values above 1 saturate.
 
-    Folders are made. What came from 8-bit sRGB without undistortion or resizing goes back
-    to the same bytes.
+    Folders are created. A photograph from 8-bit sRGB that was neither undistorted nor resized
+    keeps its bytes.
     """
     width, height = (int(side) for side in views.sizes_px[index])
     picture = to_bytes(views.images[index, :, :height, :width].detach()).movedim(0, -1)
@@ -26,19 +26,19 @@ def write_picture(views: Views, index: int, path: Path) -> None:
 
 
 def write_mask(views: Views, index: int, path: Path) -> None:
-    """Write a photograph's mask as PNG, white on the object; all white where there is none."""
+    """Write a photograph's mask as PNG, white on the object; all white without masks."""
     width, height = (int(side) for side in views.sizes_px[index])
-    shown = views.inside if views.masks is None else views.masks
-    array = shown[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
+    masks = views.inside if views.masks is None else views.masks
+    array = masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(array).save(path)
 
 
 def write_pictures(views: Views, folder: Path, mask_suffix: str = "") -> tuple[str, ...]:
-    """Write photographs in ``images/``, and in ``masks/`` the masks of the same names if any.
+    """Write photographs to ``images/``, and masks, if any, to ``masks/`` under the same names.
 
     Args:
-        mask_suffix: Behind the names of the masks.
+        mask_suffix: Appended to the names of masks.
 
     Returns:
         The names of the photographs, see :func:`file_names`.
@@ -52,7 +52,7 @@ def write_pictures(views: Views, folder: Path, mask_suffix: str = "") -> tuple[s
 
 
 def file_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Name a PNG file for each photograph: no folders, no two the same.
+    """Return a unique name of a PNG file, without folders, for each photograph.
 
     >>> file_names(["a.jpg", "left/b.tif"])
     ('a.png', 'left_b.png')
@@ -62,27 +62,27 @@ def file_names(names: Sequence[str]) -> tuple[str, ...]:
     parts = [
         [part for part in PurePosixPath(name).parts if part not in ("/", "..")] for name in names
     ]
-    whole = ["_".join(part).replace("\\", "_") for part in parts]
-    stems = [PurePosixPath(name).stem for name in whole]
-    often = Counter(stems)
-    plain = [
-        stem if often[stem] == 1 else name.replace(".", "_")
-        for stem, name in zip(stems, whole, strict=True)
+    flat = ["_".join(part).replace("\\", "_") for part in parts]
+    stems = [PurePosixPath(name).stem for name in flat]
+    counts = Counter(stems)
+    unique = [
+        stem if counts[stem] == 1 else name.replace(".", "_")
+        for stem, name in zip(stems, flat, strict=True)
     ]
-    if len(set(plain)) < len(plain):
-        plain = [f"{index:06d}_{name}" for index, name in enumerate(plain)]
-    return tuple(f"{name}.png" for name in plain)
+    if len(set(unique)) < len(unique):
+        unique = [f"{index:06d}_{name}" for index, name in enumerate(unique)]
+    return tuple(f"{name}.png" for name in unique)
 
 
 def refuse_skew(cameras: Cameras, names: Sequence[str], kind: str) -> None:
-    """Refuse cameras whose pixels are sheared noticeably, for formats that cannot represent it."""
+    """Raise an error for cameras with noticeable skew, for formats that cannot represent it."""
     K = cameras.intrinsics.detach().cpu().double()
-    moved = (K[:, 0, 1] / K[:, 1, 1]).abs() * cameras.sizes_px[:, 1].cpu().double() / 2
-    # Less is below what calibration knows.
-    sheared = [name for name, shift in zip(names, moved.tolist(), strict=True) if shift > 0.01]
-    if sheared:
+    shifts_px = (K[:, 0, 1] / K[:, 1, 1]).abs() * cameras.sizes_px[:, 1].cpu().double() / 2
+    # Smaller shifts are below the accuracy of calibration.
+    skewed = [name for name, shift in zip(names, shifts_px.tolist(), strict=True) if shift > 0.01]
+    if skewed:
         raise InputError(
-            f"the cameras of {some(sheared)} have a skew that moves pixels by up to "
-            f"{float(moved.max()):.2g}; needed: none, as {kind} has no place for it. Export to "
-            "IDR, which keeps it."
+            f"The cameras of {some(skewed)} have a skew that moves pixels by up to "
+            f"{float(shifts_px.max()):.2g} pixels; needed: no skew, as {kind} cannot represent it. "
+            "Export to IDR, which can."
         )

@@ -1,4 +1,4 @@
-"""A folder that ``pimper reconstruct`` wrote, read back with its photographs."""
+"""Result folders of ``pimper reconstruct``, read with or without their photographs."""
 
 import warnings
 from collections.abc import Mapping
@@ -27,21 +27,21 @@ from pimper_torch.runtime.config import build, read_mapping
 from pimper_torch.runtime.errors import InputError, PimperWarning, caution, some
 
 _KIND = "a result of `pimper reconstruct`"
-_DOUBTED = ("silhouettes.unreliable", "silhouettes.empty")
+_UNRELIABLE = ("silhouettes.unreliable", "silhouettes.empty")  # guards of `left_out`
 _FILES = ("mesh.ply", "sparse", "lights.json", "config.yaml", "summary.json")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class WrittenResult(Record):
-    """All that a folder of results holds by itself, without photographs.
+    """Content of a result folder, without photographs.
 
     Attributes:
-        mesh: The surface as it was written, less ``offset_world``; float32.
-        names: Of the photographs that the surface was made from.
+        mesh: The surface of the files, minus ``offset_world``; float32.
+        names: Names of the photographs of the reconstruction.
         cameras: Pinholes of the undistorted photographs in float64, in the frame of the files.
-        offset_world: What was subtracted from that frame, see ``SparseScene.offset_world``.
-        lights_world: First-order light of every view; NaN where unknown, ``None`` where all are.
-        reference: Name of the view that the pictures of the result show.
+        offset_world: Offset subtracted from that frame, see ``SparseScene.offset_world``.
+        lights_world: First-order light of every view; NaN where unknown, ``None`` if all are.
+        reference: Name of the view in which the images of the result are rendered.
     """
 
     mesh: Mesh
@@ -54,7 +54,7 @@ class WrittenResult(Record):
 
     @property
     def mesh_cameras(self) -> Cameras:
-        """The cameras in the frame of the mesh; float32."""
+        """Cameras in the frame of the mesh; float32."""
         poses = self.cameras.cam_from_world
         if self.offset_world != NO_OFFSET:
             poses = to_local(poses, self.offset_world)
@@ -63,12 +63,12 @@ class WrittenResult(Record):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Result(WrittenResult):
-    """A folder of results, with the photographs it was made from.
+    """Content of a result folder, with the photographs of the reconstruction.
 
     Attributes:
         scene: Cameras, undistorted photographs and the sparse cloud, in the frame of the mesh;
             float32.
-        silhouettes: As they were written, 0 or 1; without planes.
+        silhouettes: Silhouettes of the files, 0 or 1; without planes.
     """
 
     scene: SparseScene
@@ -76,7 +76,7 @@ class Result(WrittenResult):
 
     @property
     def masked_views(self) -> Views:
-        """The undistorted photographs, with silhouettes for masks where there are some."""
+        """Undistorted photographs, with silhouettes as masks if there are any."""
         views = self.scene.views
         if self.silhouettes.source == "everything":
             return views
@@ -84,7 +84,7 @@ class Result(WrittenResult):
 
 
 def read_written(folder: Path | str) -> WrittenResult:
-    """Read a folder of results without its photographs, which may be gone.
+    """Read a result folder without its photographs, which may be missing.
 
     Args:
         folder: Written by ``pimper reconstruct`` or
@@ -100,34 +100,34 @@ def read_written(folder: Path | str) -> WrittenResult:
 
 
 def read_result(folder: Path | str, photographs: Path | str | None = None) -> Result:
-    """Read a folder of results, and the photographs it was made from with the same settings.
+    """Read a result folder, and its photographs with the settings of the run.
 
-    Photographs that were converted since are found by their names without suffixes, and a
-    :class:`~pimper_torch.runtime.errors.PimperWarning` says so. Another one names those that look
-    different from what ``summary.json`` keeps of them.
+    Photographs that were converted since are matched by their names without suffixes, with a
+    :class:`~pimper_torch.runtime.errors.PimperWarning`. A second warning names photographs that
+    differ from their thumbnails in ``summary.json``.
 
     Args:
         folder: As for :func:`read_written`.
-        photographs: Their folder; by default the one that ``summary.json`` names. They may be
-            larger than the run read them, and are shrunk then.
+        photographs: Folder of the photographs; by default the one that ``summary.json`` names.
+            Photographs larger than in the run are shrunk.
 
     Returns:
         On the CPU.
 
     Raises:
-        InputError: A file of the result is missing or damaged, the photographs are not where they
-            were, or one has the name of another.
+        InputError: A file of the result is missing or damaged, photographs are missing, or their
+            names were exchanged.
     """
     folder = Path(folder)
     written, model = _read(folder)
     path = photographs or written.summary.get("photographs")
     views = _photographs(folder, path, model)
     scene = assemble_scene(views, model)
-    known = written.summary.get("thumbnails")
-    if isinstance(known, Mapping):  # not in older results
-        compare_thumbnails(scene.views, known, f"{path}: photographs of {folder}")
+    thumbnails = written.summary.get("thumbnails")
+    if isinstance(thumbnails, Mapping):  # not in older results
+        compare_thumbnails(scene.views, thumbnails, f"{path}: photographs of {folder}")
     return Result(
-        **{one.name: getattr(written, one.name) for one in fields(written)},
+        **{each.name: getattr(written, each.name) for each in fields(written)},
         scene=scene,
         silhouettes=_silhouettes(
             folder, scene.views, written.summary, given=views.masks is not None
@@ -137,7 +137,7 @@ def read_result(folder: Path | str, photographs: Path | str | None = None) -> Re
 
 def _read(folder: Path) -> tuple[WrittenResult, SparseModel]:
     if missing := [name for name in _FILES if not (folder / name).exists()]:
-        found = f"holds no {some(missing)}" if folder.is_dir() else "is no folder"
+        found = f"lacks {some(missing)}" if folder.is_dir() else "is not a folder"
         raise InputError(f"{folder}: {found}; needed: a folder written by `pimper reconstruct`.")
     summary = DataSetPath(folder / "summary.json", _KIND).read_json()
     model = read_model(folder / "sparse")
@@ -161,31 +161,31 @@ def _read(folder: Path) -> tuple[WrittenResult, SparseModel]:
     return written, model
 
 
-def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
-    """Read the photographs of a model as the run read them, under the names that they had.
+def _photographs(folder: Path, photographs: object, model: SparseModel) -> Views:
+    """Read the photographs of a model as the run read them, under the same names.
 
-    The longest side of the model's pictures is that which the run shrank photographs to. What
-    reading them warns of was told by the run.
+    The longest side of the model's images is the one to which the run shrank photographs. Warnings
+    are not repeated, as the run gave them.
     """
-    if not isinstance(named, str | Path):
+    if not isinstance(photographs, str | Path):
         raise InputError(
-            f"{folder}: its summary.json does not name its photographs; needed: their folder. "
-            "Name it by `--photos DIR` (`photographs=`)."
+            f"{folder}: its summary.json does not name the folder of its photographs; needed: this "
+            "folder. Give it with `--photos DIR` (`photographs=`)."
         )
-    path = Path(named)
+    path = Path(photographs)
     files = [image_name(file, path) for file in list_images(path)] if path.is_dir() else []
     by_stem = {Path(file).with_suffix(""): file for file in files}
-    found = {name: by_stem.get(Path(name).with_suffix("")) for name in model.names}
-    if missing := [name for name, file in found.items() if file is None]:
+    file_of = {name: by_stem.get(Path(name).with_suffix("")) for name in model.names}
+    if missing := [name for name, file in file_of.items() if file is None]:
         raise InputError(
             f"{folder}: its photographs {some(missing)} are not in {path.absolute()}; needed: all "
-            f"{model.num_views} that it was made from. Name their folder by `--photos DIR` "
+            f"{model.num_views} photographs of the run. Give their folder with `--photos DIR` "
             "(`photographs=`)."
         )
-    if converted := [f"{file} for {name}" for name, file in found.items() if file != name]:
+    if converted := [f"{file} for {name}" for name, file in file_of.items() if file != name]:
         caution(
-            f"{path}: photographs were converted since {folder} was made; {some(converted)} are "
-            "read. Name the folder of the originals by `--photos DIR` (`photographs=`).",
+            f"{path}: photographs were converted since the run of {folder}; {some(converted)} are "
+            "read. Give the folder of the originals with `--photos DIR` (`photographs=`).",
             stacklevel=4,
         )
     settings = read_mapping(folder / "config.yaml").get("photographs") or {}
@@ -195,15 +195,15 @@ def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PimperWarning)
         views = load_views(path, encoding=encoding, max_size_px=longest)
-    former = {file: name for name, file in found.items()}
-    views = views.replace(names=tuple(former.get(file, file) for file in views.names))
+    name_of = {file: name for name, file in file_of.items()}
+    views = views.replace(names=tuple(name_of.get(file, file) for file in views.names))
     sizes = dict(zip(views.names, views.sizes_px.tolist(), strict=True))
     for name, lens in zip(model.names, model.lenses, strict=True):
         if sizes[name] != [lens.width, lens.height]:
             raise InputError(
-                f"{path / name}: has {sizes[name][0]} x {sizes[name][1]} pixels, but {folder} was "
-                f"made from {lens.width} x {lens.height}; needed: the same photograph. Name the "
-                "folder of the originals by `--photos DIR` (`photographs=`)."
+                f"{path / name}: has {sizes[name][0]} x {sizes[name][1]} pixels, but "
+                f"{lens.width} x {lens.height} in {folder}; needed: the same photograph. Give the "
+                "folder of the originals with `--photos DIR` (`photographs=`)."
             )
     return views
 
@@ -211,7 +211,7 @@ def _photographs(folder: Path, named: object, model: SparseModel) -> Views:
 def _silhouettes(
     folder: Path, views: Views, summary: Mapping[str, object], *, given: bool
 ) -> Silhouettes:
-    """Read the masks that were written; views whose silhouette was doubted stay so."""
+    """Read the masks of a result; silhouettes that were unreliable stay so."""
     if not (folder / "masks").is_dir():
         return Silhouettes.everything(views)
     inside = torch.zeros_like(views.images[:, 0])
@@ -222,18 +222,18 @@ def _silhouettes(
         if mask.shape != (height, width):
             raise InputError(
                 f"{path}: has {mask.shape[1]} x {mask.shape[0]} pixels; needed: {width} x "
-                f"{height}, as its photograph. Run `pimper reconstruct` again."
+                f"{height}, like its photograph. Run `pimper reconstruct` again."
             )
         inside[index, :height, :width] = mask.to(inside)
     entries = summary.get("left_out")
-    doubted = {
+    unreliable = {
         name
         for entry in (entries if isinstance(entries, list) else [])
-        if isinstance(entry, dict) and entry.get("guard") in _DOUBTED
+        if isinstance(entry, dict) and entry.get("guard") in _UNRELIABLE
         for name in entry.get("names") or ()
     }
     return Silhouettes(
         inside=inside,
-        reliable=torch.tensor([name not in doubted for name in views.names]),
+        reliable=torch.tensor([name not in unreliable for name in views.names]),
         source="masks" if given or summary.get("masks") else "found",
     )

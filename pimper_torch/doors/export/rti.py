@@ -1,4 +1,4 @@
-"""A stack for reflectance transformation imaging (RTI): one viewpoint under many lights."""
+"""Image stack for reflectance transformation imaging (RTI): one viewpoint under many lights."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,21 +16,21 @@ from pimper_torch.result.relighting.held_out import shaded
 from pimper_torch.result.relighting.lit_surface import LitSurface
 from pimper_torch.runtime.progress import track
 
-# Of directions that are even over the sphere, those more than 15 degrees above the plane of the
-# picture: lower lamps show shadows alone. A choice; the polynomial of a PTM has 6 unknowns a pixel.
+# Of directions evenly over the sphere, those more than 15 degrees above the image plane: lower
+# lights mostly cast shadows. A choice; the polynomial of a PTM has 6 unknowns per pixel.
 _LIGHTS, _OF_DIRECTIONS = 60, 162
 
 
 def write_rti(result: WrittenResult, folder: Path) -> None:
-    """Write pictures of the surface from the reference view under a dome of lights.
+    """Write images of the surface in the reference view under a dome of lights.
 
-    The pictures are predictions with cast shadows, ``light_00.jpg`` and so on, black where the
-    surface is not. ``lights.lp`` counts them in its first line; each of the others has the name of
-    a picture and the unit vector to its light: x right, y up, z to the viewer. Names are in their
-    own order, as programs match either by names or by order. The object's material is that of
-    ``summary.json`` if it has one; where it has several, the surface is matte.
+    The images ``light_00.jpg``, ``light_01.jpg``, ... are predictions with cast shadows, and black
+    off the surface. The first line of ``lights.lp`` is their number; the others have the name of
+    an image and the unit vector to its light: x right, y up, z to the viewer. Names are sorted, as
+    programs match either by name or by order. The material is that of ``summary.json`` if it has
+    exactly one; otherwise the surface is matte.
 
-    Source: parseLP in relight's ``src/lp.cpp``, which takes lines of four words.
+    Source: parseLP in relight's ``src/lp.cpp``, which reads lines of four words.
     """
     camera = result.mesh_cameras.take([result.names.index(result.reference)])
     surface = LitSurface(result.mesh)
@@ -62,12 +62,12 @@ def write_rti(result: WrittenResult, folder: Path) -> None:
 
 def _material(result: WrittenResult) -> Materials | None:
     relighting = result.summary.get("relighting")
-    found = relighting.get("materials") if isinstance(relighting, Mapping) else None
-    if not isinstance(found, list) or len(found) != 1:
+    materials = relighting.get("materials") if isinstance(relighting, Mapping) else None
+    if not isinstance(materials, list) or len(materials) != 1:
         return None
     file = DataSetPath(Path("summary.json"), "a result of `pimper reconstruct`")
-    (only,) = file.objects(found, "materials")
-    named = [only.get(name) for name in ("metallic", "roughness", "specular")]
-    values = file.numbers(named, 3, "metallic, roughness and specular")
+    (material,) = file.objects(materials, "materials")
+    entries = [material.get(name) for name in ("metallic", "roughness", "specular")]
+    values = file.numbers(entries, 3, "metallic, roughness and specular")
     everywhere = torch.zeros(len(result.mesh.vertices_world), dtype=torch.long)
     return Materials.of(everywhere, values[None].float())

@@ -182,7 +182,5 @@ def _require_shape(path: Path, values: np.ndarray, name: str, width: int, height
         if turned
         else "needed: a map of the complete photograph, with its aspect ratio, at any size"
     )
-    size = f"{map_width} x {map_height}"
-    raise InputError(
-        f"{path}: is {size}, but the photograph {name} is {width} x {height}; {remedy}."
-    )
+    size = f"{map_width} x {map_height}, but the photograph {name} is {width} x {height}"
+    raise InputError(f"{path}: is {size}; {remedy}.")

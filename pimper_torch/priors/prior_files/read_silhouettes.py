@@ -39,12 +39,9 @@ def _probability(path: Path, layer: Layer) -> np.ndarray:
         return (values > 0).astype(np.float32)
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     if low < 0 or high > 1:
-        levels = low >= 0 and high in (255, 65535)
-        advice = (
-            f"Divide the values by {high:g}, or write them as integers."
-            if levels
-            else "Apply a sigmoid to the logits of a network."
-        )
+        advice = "Apply a sigmoid to the logits of a network."
+        if low >= 0 and high in (255, 65535):
+            advice = f"Divide the values by {high:g}, or write them as integers."
         raise InputError(
             f"{path}: contains values from {low:g} to {high:g}; needed: the probability of the "
             f"object, from 0 to 1. {advice}"
