@@ -182,7 +182,7 @@ def test_a_file_that_cannot_be_read_is_refused_as_by_a_run(photos, tmp_path, cap
         Image.open(path).save(tmp_path / path.name)
     (tmp_path / "broken.png").write_bytes(b"no image")
     assert main(["doctor", str(tmp_path)]) == 2
-    assert "broken.png: holds no JPEG, PNG or TIFF image" in capsys.readouterr().err
+    assert "broken.png: is not a readable JPEG, PNG or TIFF image" in capsys.readouterr().err
 
 
 def test_without_photographs_only_the_machine_is_examined(capsys):

@@ -56,7 +56,7 @@ def test_an_export_into_the_result_itself_is_refused(folder, tmp_path, capsys, i
     (tmp_path / "link").symlink_to(folder)
     before = contents(folder)
     assert run("export", folder, "-o", folder / inside, "--format", "maps", "--overwrite") == 2
-    assert "is inside the result folder" in capsys.readouterr().err
+    assert "RESULT (" in capsys.readouterr().err
     assert contents(folder) == before
 
 

@@ -186,7 +186,7 @@ def test_a_damaged_deep_file_is_refused_by_name(tmp_path, deep, write_png16, nam
     if name == "checksum.png":
         data[-30] ^= 1
     path.write_bytes(data if name == "checksum.png" else data[:-80])
-    with pytest.raises(InputError, match=rf"{name}: cannot be read, it seems cut short, damaged"):
+    with pytest.raises(InputError, match=rf"{name}: cannot be read; it seems cut short, damaged"):
         decode(path)
 
 
@@ -195,9 +195,9 @@ def test_other_formats_are_refused_by_name(tmp_path, pixels):
     Image.fromarray(pixels).save(tmp_path / "gif.png", format="gif")
     Image.fromarray(pixels).convert("CMYK").save(tmp_path / "cmyk.jpg")
     for name, why in {
-        "text.jpg": "holds no JPEG, PNG or TIFF",
-        "gif.png": "holds no JPEG, PNG or TIFF image that can be read, but GIF",
-        "cmyk.jpg": "is CMYK, inks of a printer; needed: RGB.*ImageMagick",
+        "text.jpg": "is not a readable JPEG, PNG or TIFF",
+        "gif.png": "is not a readable JPEG, PNG or TIFF image, but GIF",
+        "cmyk.jpg": "is CMYK, for printing; needed: RGB.*ImageMagick",
         "gone.png": r"cannot be read \(No such file or directory\)",
     }.items():
         with pytest.raises(InputError, match=f"{name}: {why}"):

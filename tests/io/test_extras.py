@@ -96,5 +96,5 @@ def test_images_are_read_with_any_suffix(tmp_path, monkeypatch, suffix, name, lo
 def test_a_refusal_names_the_actual_format_of_a_file(tmp_path, start, name, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(start)
-    with pytest.raises(InputError, match=rf"a\{suffix}: holds no JPEG.*, but {name}\."):
+    with pytest.raises(InputError, match=rf"a\{suffix}: is not a readable JPEG.*, but {name}\."):
         read_header(path)

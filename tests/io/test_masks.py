@@ -66,7 +66,7 @@ def test_masks_are_found_by_name_and_mark_bright_or_opaque_pixels(photos, tmp_pa
 def test_masks_with_a_dark_object_are_inverted(photos, tmp_path, polarity):
     for name in NAMES:
         save(tmp_path / "masks" / f"{name}_mask.png", 255 - box())
-    warned = pytest.warns(PimperWarning, match="masks: the masks are bright.*taken to be dark")
+    warned = pytest.warns(PimperWarning, match="masks: the masks are bright.*dark pixels are treated")
     with warned if polarity == "auto" else nullcontext():
         masks = load_views(photos, masks=tmp_path / "masks", mask_object=polarity).masks
     shown = torch.from_numpy((polarity == "bright") != SHOWN)
@@ -139,7 +139,7 @@ def test_alpha_is_the_mask_unless_masks_are_given(photos, tmp_path, pixels):
     assert load_views(photos).masks is None  # a fully opaque alpha is not a mask
     alpha[:4] = 0
     save(photos / "2.png", np.concatenate([pixels, alpha], axis=-1))
-    with pytest.warns(PimperWarning, match=r"1 of 3 photographs.*\(2\.png\).*taken for masks"):
+    with pytest.warns(PimperWarning, match=r"1 of 3 photographs.*\(2\.png\).*used as masks"):
         masks = load_views(photos).masks
     assert masks[0].all()
     assert torch.equal(masks[1], torch.from_numpy(alpha[..., 0] > 0))

@@ -138,7 +138,7 @@ def test_reading_reports_progress(photos):
         ("nowhere", "nowhere: found nothing; needed: a folder"),
         ("a.png", r"a\.png: found a file; needed: a folder"),
         ("empty", r"no images; it is empty.*\.jpg.*\.tiff"),
-        ("gif", r"no images; it holds a\.gif"),
+        ("gif", r"no images; it contains a\.gif"),
         ("clip.MP4", r"clip\.MP4: is a video; .*`pimper frames .*clip\.MP4"),
         ("film", r"clip\.MP4: is a video; .*`pimper frames .*clip\.MP4"),
         ("photos", "found 2 .*needed: at least 3"),
@@ -167,7 +167,7 @@ def test_a_black_photograph_is_removed_by_name(photos, pixels):
     save(photos / "2.png", np.full((16, 12, 3), 2, dtype=np.uint8))
     save(masks / "2.png", np.zeros((16, 12), np.uint8))  # its mask is empty
     with pytest.warns(
-        PimperWarning, match=r"1 of 4 photographs \(2\.png\) are black all over.*left out"
+        PimperWarning, match=r"1 of 4 photographs \(2\.png\) are completely black.*skipped"
     ):
         views = load_views(photos, masks=masks)
     (photos / "2.png").unlink()
@@ -182,7 +182,7 @@ def test_a_black_photograph_is_removed_by_name(photos, pixels):
 def test_a_folder_with_too_few_usable_photographs_is_refused(photos, count):
     for index in range(count):
         save(photos / f"{index + 2}.png", np.full((8, 12, 3), 2, dtype=np.uint8))
-    with pytest.raises(InputError, match=r"2\.png.*are black all over; needed: 3 photographs"):
+    with pytest.raises(InputError, match=r"2\.png.*are completely black; needed: at least 3 photo"):
         load_views(photos)
 
 
@@ -262,7 +262,7 @@ def test_a_subfolder_of_masks_or_maps_is_not_a_pose(tmp_path, pixels, beside):
 def test_two_subfolders_are_not_poses(tmp_path, pixels):
     for name in ("a/1.png", "a/2.png", "b/1.png", "b/2.png"):
         save(tmp_path / name, pixels)
-    with pytest.raises(InputError, match=r"no images; it holds .*three folders inside at least"):
+    with pytest.raises(InputError, match=r"no images; it contains .*at least three subfolders"):
         load_views(tmp_path)
     save(tmp_path / "c" / "1.png", pixels)
     save(tmp_path / "c" / "1.tif", pixels)

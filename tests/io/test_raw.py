@@ -160,7 +160,7 @@ def test_raw_takes_precedence_over_the_jpeg_of_the_same_photograph(folder, pixel
     raw = load_views(folder)
     for name in ("0.jpg", "1.JPG", "2.jpeg"):
         Image.fromarray(pixels).save(folder / name)
-    message = r"0\.jpg, 1\.JPG, 2\.jpeg were not read, as camera raw of the same names was\."
+    message = r"0\.jpg, 1\.JPG, 2\.jpeg were not read, as camera raw with the same names was\."
     with pytest.warns(PimperWarning, match=message) as warned:
         beside = load_views(folder)
     assert len(warned) == 1

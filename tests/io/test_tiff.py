@@ -59,7 +59,7 @@ def test_extra_samples_are_ignored_with_a_warning(pixels, tmp_path):
     options = {"photometric": "rgb", "extrasamples": ["unspecified"]}
     for index in range(3):
         tifffile.imwrite(tmp_path / f"{index}.tif", with_more(pixels), **options)
-    message = r"3 of 3 .* has samples besides its colours whose meaning it does not tell"
+    message = r"3 of 3 .* has extra samples of unknown meaning"
     with pytest.warns(PimperWarning, match=message):
         assert load_views(tmp_path).masks is None
 

@@ -1,1 +1,1 @@
-"""Files: photographs in, results out."""
+"""Reading of photographs and meshes, and writing of results."""

@@ -1,4 +1,4 @@
-"""One image file to its samples, at full depth and the right way up."""
+"""Decoding of image files to upright samples at full bit depth."""
 
 import io
 import warnings
@@ -27,27 +27,27 @@ from pimper_torch.runtime.errors import InputError
 
 Result = TypeVar("Result")
 
-_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two hold published data sets
-# Choices: the largest sensors have 151 million pixels, in files of 1 GB at most; no photograph of
-# more than 32 million has less than a bit in 25 samples: pictures made to exhaust memory do.
+_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two for published data sets
+# Choices: the largest sensors have 151 million pixels, in files of at most 1 GB. Photographs of
+# more than 32 million pixels have at least a bit per 25 samples; images made to exhaust memory do
+# not.
 MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
 
 LABELS = 32
-"""Whole numbers of a mask or of a map that are all below this are labels. A choice."""
+"""A mask or map with only integers below this contains labels. A choice."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Decoded(Record):
-    """Samples of a file, the right way up.
+    """Upright samples of a file.
 
     Attributes:
         samples: In [0, 1] as the file encodes them; one or three channels.
-        alpha: Opacity in [0, 1]; ``None`` where the file has none.
-        lossy: True for JPEG, whose samples ring around edges.
-        full: Level of the file that is full scale, a sample of 1: 255, 65535, or what the file
-            says.
-        colour: What the file says about its samples.
+        alpha: Opacity in [0, 1]; ``None`` if the file has none.
+        lossy: True for JPEG and HEIC, which ring around edges.
+        full: Full-scale level of the file, a sample of 1: 255, 65535, or as the file states.
+        colour: Colour metadata of the file.
     """
 
     samples: Float[Tensor, "channel height width"]
@@ -59,7 +59,7 @@ class Decoded(Record):
 
     @property
     def bits(self) -> int:
-        """Of the file's samples: 8 or 16."""
+        """Bits of the file's samples: 8 or 16."""
         return 8 if self.full == 255 else 16
 
 
@@ -67,9 +67,9 @@ def read_header(path: Path | str) -> Header:
     """Read size, orientation and focal length of an image file.
 
     Raises:
-        InputError: Names a file that is no JPEG, PNG or TIFF, HEIC or camera raw, is damaged,
-            is too large to be a photograph, holds inks or several pages, or needs a package that
-            is not installed.
+        InputError: Names a file that is not JPEG, PNG, TIFF, HEIC or camera raw, is damaged,
+            is too large for a photograph, is CMYK, has several pages, or needs a package that is
+            not installed.
     """
     path = Path(path)
     return _guarded(path, lambda: _header_of(path))
@@ -79,7 +79,7 @@ def _header_of(path: Path) -> Header:
     if path.stat().st_size > _MAX_BYTES:  # before a library reads it into memory
         raise InputError(
             f"{path}: has {path.stat().st_size} bytes; needed: at most {_MAX_BYTES // 2**30} GB. "
-            "Scale it down."
+            "Shrink it."
         )
     extra, name = extra_of(path), format_of(path)
     if extra:
@@ -90,11 +90,11 @@ def _header_of(path: Path) -> Header:
     chunks = _png_chunks(path) if name == "PNG" else {}
     with Image.open(path, formats=_FORMATS) as image:
         if image.mode == "CMYK":
-            raise InputError(f"{path}: is CMYK, inks of a printer; needed: RGB. {tiff.CONVERT}")
+            raise InputError(f"{path}: is CMYK, for printing; needed: RGB. {tiff.CONVERT}")
         width, height = image.size
         channels = 1 if image.mode[:4] in ("1", "L", "LA", "I;16") else 3
         _refuse_huge(path, width, height, channels)
-        # Pillow decodes all of a PNG to find out that it has no EXIF.
+        # Pillow decodes a complete PNG to search for EXIF.
         bare = name == "PNG" and not chunks.keys() & {b"eXIf", b"tEXt", b"zTXt", b"iTXt"}
         exif = Image.Exif() if bare else image.getexif()
         colour = profiles.colour_of_info(image.info, chunks.get(b"cICP", b""))
@@ -104,17 +104,15 @@ def _header_of(path: Path) -> Header:
         cautions = []
         if not (isinstance(orientation, int) and 1 <= orientation <= 8):
             cautions.append(
-                f"has an EXIF orientation of {orientation!r:.20}, not of 1 to 8; it is taken as "
+                f"has an EXIF orientation of {orientation!r:.20}, not of 1 to 8; it is treated as "
                 "upright"
             )
             orientation = 1
         if layout and layout.unknown:
-            cautions.append(
-                "has samples besides its colours whose meaning it does not tell; they are left out"
-            )
-        if orientation >= 5 and layout is None:  # Pillow has turned a TIFF's size
+            cautions.append("has extra samples of unknown meaning, which are ignored")
+        if orientation >= 5 and layout is None:  # Pillow already swaps the size of a TIFF
             width, height = height, width
-        # Bit depth, and RGB, gray with opacity (which OpenCV spreads over four channels), or RGBA.
+        # 16 bits, and RGB, gray with opacity (which OpenCV expands to four channels), or RGBA.
         deep_png = chunks.get(b"IHDR", b"")[8:] in (b"\x10\x02", b"\x10\x04", b"\x10\x06")
         sixteen = deep_png or image.mode.startswith("I;16")
         return Header(
@@ -144,40 +142,40 @@ def _png_chunks(path: Path) -> dict[bytes, bytes]:
 
 
 def _guarded(path: Path, read: Callable[[], Result]) -> Result:
-    """Turn whatever a library raises of a file into one error."""
+    """Convert errors of libraries about a file to ``InputError``."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # size below Pillow's limit, odd but legible tags
+            warnings.simplefilter("ignore")  # large but allowed sizes, odd but legible tags
             return read()
     except (InputError, MemoryError):
         raise
     except Image.DecompressionBombError as error:
         raise InputError(
-            f"{path}: has more than {MAX_PIXELS // 10**6} million pixels; needed: at most as many. "
-            "Scale it down."
+            f"{path}: has more than {MAX_PIXELS // 10**6} million pixels; needed: at most that. "
+            "Shrink it."
         ) from error
     except UnidentifiedImageError as error:
         name = format_of(path)
         content = f", but {name}" if name and name not in _FORMATS else ""
         raise InputError(
-            f"{path}: holds no JPEG, PNG or TIFF image that can be read{content}. Convert it, or "
-            "take it out of the folder."
+            f"{path}: is not a readable JPEG, PNG or TIFF image{content}. Convert it, or remove it "
+            "from the folder."
         ) from error
     except OSError as error:
-        if error.errno is not None:  # of the system, not of a decoder
+        if error.errno is not None:  # from the operating system, not a decoder
             raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
         raise _damaged(path) from error
-    except Exception as error:  # libraries raise whatever a damaged file leads to
+    except Exception as error:  # libraries raise errors of many types for damaged files
         raise _damaged(path) from error
 
 
 def decode(path: Path | str) -> Decoded:
-    """Read an image file at full depth and turn it as EXIF says.
+    """Return the samples of an image file at full bit depth, with EXIF's orientation applied.
 
-    Profiles are not applied; what they say comes along.
+    Profiles are returned as ``colour``, but not applied.
 
     Raises:
-        InputError: As :func:`read_header`, and for samples that are not of 8 or 16 bits.
+        InputError: As :func:`read_header`, and for samples that do not have 8 or 16 bits.
     """
     path = Path(path)
     header = read_header(path)
@@ -187,10 +185,10 @@ def decode(path: Path | str) -> Decoded:
     array = array[..., None] if array.ndim == 2 else array
     if array.shape[:2] != (header.height, header.width):
         raise _damaged(path)
-    # As the file says, unless its samples contradict it.
+    # As the file states, unless its samples exceed this.
     sixteen = array.dtype == np.uint16
     full = header.full if sixteen and int(array.max()) <= header.full else np.iinfo(array.dtype).max
-    # Plane by plane, so that no more memory is taken than is returned.
+    # Plane by plane, so that no memory is used beyond the returned planes.
     planes = torch.empty(array.shape[2], *array.shape[:2])
     for plane, channel in zip(planes, np.moveaxis(array, -1, 0), strict=True):
         np.divide(channel, np.float32(full), out=plane.numpy())
@@ -206,7 +204,7 @@ def decode(path: Path | str) -> Decoded:
 
 
 def _upright(path: Path, header: Header) -> np.ndarray:
-    """Read samples, ``height width`` or ``height width channel``; opacity comes last."""
+    """Return upright samples, ``height width`` or ``height width channel`` with opacity last."""
     extra, layout = extra_of(path), header.layout
     if extra == "heic":
         return read_heic(path)
@@ -214,7 +212,7 @@ def _upright(path: Path, header: Header) -> np.ndarray:
         return rotated(read_raw(path), header.orientation)
     if header.deep:
         return _read_deep(path, header)
-    # From memory: Pillow 13 misreads an uncompressed, turned TIFF that it maps.
+    # From memory: Pillow 13 misreads an uncompressed, rotated TIFF if it maps the file.
     with Image.open(io.BytesIO(path.read_bytes()), formats=_FORMATS) as image:
         upright = ImageOps.exif_transpose(image)
         if upright.mode.startswith("I;16"):
@@ -222,20 +220,20 @@ def _upright(path: Path, header: Header) -> np.ndarray:
             inverted = layout is not None and layout.inverted
             return header.full - np.minimum(array, header.full) if inverted else array
         if upright.mode in ("I", "F"):
-            return np.asarray(upright)  # 32 bits: the caller refuses them
+            return np.asarray(upright)  # 32 bits: an error in the caller
         if upright.has_transparency_data:
             return np.asarray(upright.convert("LA" if upright.mode in ("L", "LA") else "RGBA"))
         return np.asarray(upright.convert("L" if upright.mode in ("1", "L") else "RGB"))
 
 
 def write_deep_png(samples: np.ndarray, path: Path | str) -> None:
-    """Write 16-bit colour, ``height width 3``, which Pillow would cut to 8 bits."""
+    """Write 16-bit colour ``height width 3``, which Pillow would truncate to 8 bits."""
     _, data = cv2.imencode(".png", np.ascontiguousarray(samples[..., ::-1]))
     Path(path).write_bytes(data.tobytes())
 
 
 def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
-    """Turn rows and columns so that an image of this EXIF orientation is upright."""
+    """Return the upright version of an image with this EXIF orientation."""
     if orientation >= 5:
         array = array.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -246,41 +244,41 @@ def rotated(array: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _refuse_huge(path: Path, width: int, height: int, channels: int) -> None:
-    """Refuse, by its header, an image that would take too much memory."""
-    pixels, held = width * height, path.stat().st_size
+    """Raise an error for an image that would need too much memory, by its header."""
+    pixels, size = width * height, path.stat().st_size
     if pixels > MAX_PIXELS:
         raise InputError(
             f"{path}: has {width} x {height} pixels; needed: at most "
-            f"{MAX_PIXELS // 10**6} million. Scale it down."
+            f"{MAX_PIXELS // 10**6} million. Shrink it."
         )
-    if channels > 1 and pixels > _MANY_PIXELS and pixels * channels > _MAX_SAMPLES_PER_BYTE * held:
+    if channels > 1 and pixels > _MANY_PIXELS and pixels * channels > _MAX_SAMPLES_PER_BYTE * size:
         raise InputError(
-            f"{path}: says that it has {width} x {height} pixels in {held} bytes, which no "
-            "photograph has. Take it out of the folder, or scale it down."
+            f"{path}: has {width} x {height} pixels in only {size} bytes, unlike a photograph. "
+            "Remove it from the folder, or shrink it."
         )
 
 
 def _damaged(path: Path) -> InputError:
     return InputError(
-        f"{path}: cannot be read, it seems cut short, damaged or packed in an unusual way. Copy it "
-        "again, save it anew as PNG, or take it out of the folder."
+        f"{path}: cannot be read; it seems cut short, damaged or compressed in an unusual way. "
+        "Copy it again, save it again as PNG, or remove it from the folder."
     )
 
 
 def _read_deep(path: Path, header: Header) -> np.ndarray:
-    """Read samples of 16 bits in several channels, which Pillow would cut to 8."""
+    """Return 16-bit samples in several channels, which Pillow would truncate to 8 bits."""
     layout = header.layout
     if layout and layout.planes:  # OpenCV misreads them
         array = rotated(np.moveaxis(tifffile.imread(path, key=0), 0, -1), header.orientation)
     else:
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
-            found = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+            decoded = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
         finally:
             cv2.utils.logging.setLogLevel(level)
-        if found is None:
+        if decoded is None:
             raise _damaged(path)
-        array = found[..., [2, 1, 0, 3][: found.shape[2]]]
-        if not layout:  # OpenCV turns a TIFF by itself
+        array = decoded[..., [2, 1, 0, 3][: decoded.shape[2]]]
+        if not layout:  # OpenCV already rotates a TIFF
             array = rotated(array, header.orientation)
     return array[..., :3] if layout and layout.unknown else array

@@ -1,4 +1,4 @@
-"""Which files of a folder are photographs, in the order of their names."""
+"""Lists of the photographs of a folder, in the order of their names."""
 
 import re
 from collections import Counter, defaultdict
@@ -15,38 +15,38 @@ from pimper_torch.doors.io.extras import (
 )
 from pimper_torch.runtime.errors import InputError, caution, some
 
-MIN_PHOTOGRAPHS = 3  # fewer cannot tell shape from light and viewpoint
-# What people take for photographs, and is none of SUFFIXES: images and camera raw; video.
+MIN_PHOTOGRAPHS = 3  # fewer do not separate shape, light and viewpoint
+# Files that users may expect to be read, though not in SUFFIXES: images and camera raw; video.
 _PICTURES = re.compile(
     r"\.(gif|hei[cf]|avif|webp|bmp|jp2|jxl|psd|exr|hdr|p[pg]m"
     r"|cr[23w]|n(ef|rw)|arw|sr2|dng|orf|raf|rw[2l]|pef|srw|3fr|iiq|raw|hif)",
     re.IGNORECASE,
 )
 _VIDEO = re.compile(r"\.(mp4|mov|avi|mkv|m4v|webm|mts)", re.IGNORECASE)
-# Folders next to those of poses that hold what belongs to photographs.
+# Folders next to those of poses, with masks and maps of photographs.
 _MAPS = re.compile(
     r"(masks?|silhouettes?|mattes?|segmentations?|normals?|depths?|disparit(y|ies))", re.IGNORECASE
 )
 
-# Which of several files of one name is read: the extra that they need; least first.
+# Rank of files with the same name by the extra that they need; the lowest is read.
 _RANKS = {"raw": 0, "": 1, "heic": 2}
 _DEVELOPED = (".png", ".tif", ".tiff")
 _MORE = "HEIC and camera raw where their extras are installed"
 
 
 def image_name(path: Path | str, folder: Path | str) -> str:
-    """Return the name of an image of a folder, with the folder inside that it is in."""
+    """Return the name of an image relative to its folder, with slashes."""
     return Path(path).relative_to(folder).as_posix()
 
 
 def list_images(folder: Path | str) -> list[Path]:
     """List the image files of a folder in natural order: ``img2`` before ``img10``.
 
-    Of a folder that holds none, those of the folders inside, if three at least hold some: each
-    holds the photographs of one pose of the camera. Folders of masks and maps are not poses.
+    If it has no images, those of its subfolders are listed, if at least three have images: each
+    contains the photographs of one camera pose. Folders of masks and maps are not poses.
 
     Raises:
-        InputError: No such folder, no images in it, or two of one stem.
+        InputError: The folder does not exist, has no images, or has two with the same stem.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -60,18 +60,18 @@ def list_images(folder: Path | str) -> list[Path]:
     paths = _readable(entries)
     if not paths:
         poses = [path for path in sorted(entries) if not _MAPS.fullmatch(path.name)]
-        inside = [path for path in poses if path.is_dir() and _holds_images(path)]
-        if len(inside) >= MIN_PHOTOGRAPHS:
-            paths = [image for one in inside for image in _readable(_visible(one))]
+        folders = [path for path in poses if path.is_dir() and _has_images(path)]
+        if len(folders) >= MIN_PHOTOGRAPHS:
+            paths = [image for pose in folders for image in _readable(_visible(pose))]
     if not paths:
         for path in sorted(entries):
             if path.is_file() and (extra := extra_of(path)):
-                load_extra(extra, path)  # refuses what needs a package that is absent
+                load_extra(extra, path)  # raises an error if a package is missing
         _refuse_video(entries)
-        content = f"it holds {some([path.name for path in entries])}" if entries else "it is empty"
+        content = f"contains {some([path.name for path in entries])}" if entries else "is empty"
         raise InputError(
-            f"{folder}: no images; {content}. Read are files ending in {', '.join(SUFFIXES)}, "
-            f"{_MORE}; or those in three folders inside at least, one a pose of the camera."
+            f"{folder}: no images; it {content}. Needed: files ending in {', '.join(SUFFIXES)}, "
+            f"{_MORE}; or at least three subfolders of such files, one per camera pose."
         )
     paths.sort(key=lambda path: _natural(image_name(path, folder)))
     stems: dict[Path, Path] = {}
@@ -79,8 +79,8 @@ def list_images(folder: Path | str) -> list[Path]:
         other = stems.setdefault(path.with_suffix(""), path)
         if other is not path:
             raise InputError(
-                f"{path.parent}: {other.name} and {path.name} differ only in their suffix; masks "
-                "and results go by the name without it. Rename or remove one."
+                f"{path.parent}: {other.name} and {path.name} differ only in their suffix, but "
+                "masks and results are named without it. Rename or remove one."
             )
     return paths
 
@@ -90,10 +90,10 @@ def _visible(folder: Path) -> list[Path]:
 
 
 def _readable(entries: Sequence[Path]) -> list[Path]:
-    """Choose the image files, one of those that a camera writes of one photograph.
+    """List the image files, with one of the files that a camera writes of each photograph.
 
-    Camera raw goes before JPEG, and JPEG, PNG or TIFF before HEIC; PNG and TIFF next to raw count
-    as developed on purpose.
+    Camera raw is preferred to JPEG, and JPEG, PNG or TIFF to HEIC. PNG and TIFF next to raw are
+    preferred to it, as someone developed them.
     """
     ranks: dict[str, dict[Path, int]] = defaultdict(dict)
     for path in entries:
@@ -111,17 +111,17 @@ def _readable(entries: Sequence[Path]) -> list[Path]:
 
 
 def _refuse_video(entries: Sequence[Path]) -> None:
-    """Refuse a video, and name the command that makes photographs of it."""
+    """Raise an error for a video, with the command that extracts photographs."""
     for path in sorted(entries):
         if path.is_file() and _VIDEO.fullmatch(path.suffix):
             raise InputError(
-                f"{path}: is a video; needed: a folder of images. `pimper frames {path} -o "
-                "photos/` chooses photographs out of it."
+                f"{path}: is a video; needed: a folder of images. Extract photographs with `pimper "
+                f"frames {path} -o photos/`."
             )
 
 
 def warn_of_skipped_files(folder: Path | str, read: Sequence[Path | str]) -> None:
-    """Warn of what looks like photographs and is not read, kind by kind with its count."""
+    """Warn of files that look like photographs but are not read, with the number of each kind."""
     folder, paths = Path(folder), [Path(path) for path in read]
     names = {path.relative_to(folder).parts[0] for path in paths}
     raw = {path.stem.casefold() for path in paths if extra_of(path) == "raw"}
@@ -137,8 +137,8 @@ def warn_of_skipped_files(folder: Path | str, read: Sequence[Path | str]) -> Non
             kinds[path] = kind
     if twins:
         caution(
-            f"{folder}: {some(twins)} were not read, as camera raw of the same names was. Move the "
-            "raw away to read them.",
+            f"{folder}: {some(twins)} were not read, as camera raw with the same names was. To "
+            "read them, move the raw files away.",
             stacklevel=3,
         )
     if kinds:
@@ -150,24 +150,24 @@ def warn_of_skipped_files(folder: Path | str, read: Sequence[Path | str]) -> Non
             if not is_installed(extra)
         )
         caution(
-            f"{folder}: these were not read: {counts}; {some([path.name for path in kinds])}. Read "
-            f"are files ending in {', '.join(SUFFIXES)}, {_MORE}, not those in folders inside."
-            f"{hint} Convert or move what belongs to the photographs.",
+            f"{folder}: these were not read: {counts}; {some([path.name for path in kinds])}. "
+            f"Supported are files ending in {', '.join(SUFFIXES)}, {_MORE}, not in subfolders."
+            f"{hint} Convert or move files that belong to the photographs.",
             stacklevel=3,
         )
 
 
 def _kind(path: Path) -> str:
-    """Name what looks like photographs and is not read; empty for anything else."""
+    """Return the kind of a file that looks like photographs but is not read, else ""."""
     if path.is_symlink() and not path.exists():
         return "broken link"
     if path.is_dir():
-        return "folder of images" if _holds_images(path) else ""
-    looks = _PICTURES.fullmatch(path.suffix) or _VIDEO.fullmatch(path.suffix)
-    return path.suffix[1:].upper() if looks else ""
+        return "folder of images" if _has_images(path) else ""
+    match = _PICTURES.fullmatch(path.suffix) or _VIDEO.fullmatch(path.suffix)
+    return path.suffix[1:].upper() if match else ""
 
 
-def _holds_images(folder: Path) -> bool:
+def _has_images(folder: Path) -> bool:
     try:
         suffixes = {path.suffix.lower() for path in folder.iterdir()}
     except OSError:
@@ -176,7 +176,7 @@ def _holds_images(folder: Path) -> bool:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Sort digits as numbers; the name itself settles ``1`` against ``01``."""
+    """Return a sort key with digits as numbers; the name itself orders ``1`` and ``01``."""
     pieces = re.split(r"([0-9]+)", name)
     key = [(int(piece), "") if piece.isdigit() else (0, piece.lower()) for piece in pieces]
     return [*key, (0, name)]
