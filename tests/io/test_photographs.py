@@ -229,7 +229,7 @@ def test_each_subfolder_has_the_photographs_of_one_pose(tmp_path, pixels):
     for name in reversed(names):
         save(tmp_path / "photos" / name, pixels)
         save(tmp_path / "masks" / name, pixels[..., 0])
-    with pytest.warns(PimperWarning, match="6 photographs in its 3 folders are taken for 3 poses"):
+    with pytest.warns(PimperWarning, match="6 photographs in its 3 folders are interpreted as 3"):
         views = load_views(tmp_path / "photos", masks=tmp_path / "masks")
     assert views.names == tuple(names)
     assert views.poses.tolist() == [0, 0, 1, 1, 2, 2]

@@ -146,7 +146,7 @@ def test_control_characters_are_removed_from_the_profile_name(make_profile):
 @pytest.mark.parametrize(
     ("settings", "why"),
     [
-        ({"space": b"CMYK", "curve": (IDENTITY,)}, "is of CMYK, not of RGB or gray"),
+        ({"space": b"CMYK", "curve": (IDENTITY,)}, "is for CMYK, not RGB or gray"),
         ({"space": b"GRAY", "more": {b"kTRC": b""}}, "has tone curves of an unknown type"),
         ({"connection": b"Lab "}, "has tone curves in CIELab"),
         ({"curve": sampled(np.linspace(1, 0, 20))}, "does not rise"),
@@ -156,7 +156,7 @@ def test_control_characters_are_removed_from_the_profile_name(make_profile):
         ({"curve": parametric(9, 1.0)}, "unknown function"),
         ({"curve": parametric(1, 2.0, 0.0, 0.5)}, "flat"),
         ({"curve": b"text" + bytes(20)}, "unknown type"),
-        ({"columns": ((0, 0, 0),) * 3}, "primaries that span no colours"),
+        ({"columns": ((0, 0, 0),) * 3}, "primaries that are linearly dependent"),
         ({"columns": ()}, "has no primaries"),
     ],
 )
@@ -249,7 +249,7 @@ def test_adobe_rgb_in_exif_is_applied(tmp_path, pixels, exif, response):
         ({"chunks": gamma(50_000) | SAME}, f"PNG {NOT_SRGB}"),
         ({"chunks": gamma(0)}, f"PNG {NOT_SRGB}"),
         ({"chunks": WIDE}, f"PNG {NOT_SRGB}"),
-        ({"chunks": {"cICP": b"\1"}}, "PNG's cICP tells of samples that are no RGB"),
+        ({"chunks": {"cICP": b"\1"}}, "PNG's cICP is not for full-range RGB"),
         ({"chunks": {"cICP": bytes([9, 16, 0, 1])}}, "names transfer 16, as of HDR or film"),
         ({"chunks": {"cICP": bytes([5, 13, 0, 1])}}, "names primaries 5"),
         ({"chunks": {"iCCP": b"x\0\0" + zlib.compress(bytes(2**19))}}, "an ICC profile is damaged"),
@@ -274,10 +274,10 @@ def test_unsupported_colours_are_refused(
             Image.fromarray(pixels).save(path, exif=write["exif"])
         else:
             png_with(path, pixels, **write["chunks"])
-    told = rf"0\.(png|tif): .*{why}.*, and cannot be followed; needed: sRGB.*photographs\.response"
+    told = rf"0\.(png|tif): .*{why}.*, which is not supported; needed: sRGB.*photographs\.response"
     with pytest.raises(InputError, match=told):
         load_views(tmp_path)
-    told = rf"3 of 3 .*{why}.*, and is not followed; what is given is taken"
+    told = rf"3 of 3 .*{why}.*, which is not supported; the given response"
     with pytest.warns(PimperWarning, match=told):
         found = load_views(tmp_path, encoding=Encoding(response="srgb")).images[0]
     assert_close(found.double(), linear_from_srgb(stored), rtol=0, atol=1e-6)

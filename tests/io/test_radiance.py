@@ -27,7 +27,7 @@ def test_saturation_below_full_scale_is_scaled_to_one(raw, saturation):
     folder, levels = raw
     encoding = Encoding(response="linear", saturation=saturation)
     if saturation == "auto":
-        with pytest.warns(PimperWarning, match="16 bits pile up at 15000 of 65535"):
+        with pytest.warns(PimperWarning, match="16-bit files pile up at 15000 of 65535"):
             images = load_views(folder, encoding=encoding).images
     else:
         images = load_views(folder, encoding=encoding).images
@@ -91,7 +91,7 @@ def test_a_curve_is_applied_only_to_files_of_its_depth(photos, pixels, raw, tmp_
     stored = torch.from_numpy(pixels / 255).movedim(-1, 0)
     found = load_views(photos, encoding=encoding).images[0]
     assert_close(found.double(), stored**1.5, rtol=0, atol=1e-6)
-    message = r"0\.png: holds 16 bits, levels 0 to 65535, but the response curve ends at level 255"
+    message = r"0\.png: has 16 bits, levels 0 to 65535, but the response curve ends at level 255"
     with pytest.raises(InputError, match=message):
         load_views(raw[0], encoding=encoding)
 
@@ -109,8 +109,8 @@ def test_a_curve_of_three_colours_or_levels_is_refused_for_gray_files(photos, pi
 @pytest.mark.parametrize(
     ("settings", "why"),
     [
-        ({"saturation": 15000.0}, r"1\.png: holds 8 bits, levels 0 to 255, but a level of"),
-        ({"black": 512.0}, r"1\.png: holds 8 bits, levels 0 to 255, but a level of"),
+        ({"saturation": 15000.0}, r"1\.png: has 8 bits, levels 0 to 255, but a level of"),
+        ({"black": 512.0}, r"1\.png: has 8 bits, levels 0 to 255, but a level of"),
         (
             {"saturation": 0.5, "black": 200.0},
             r"black is 0\.7843 of full scale and saturation 0\.5",
@@ -181,7 +181,7 @@ def test_files_of_different_depths_have_separate_saturation_levels(raw, pixels):
     generator = np.random.default_rng(8)
     shallow = (255 * generator.random((60, 90, 3)) ** 3).round().astype(np.uint8)
     Image.fromarray(shallow).save(folder / "8.png")
-    with pytest.warns(PimperWarning, match="16 bits pile up at 15000"):
+    with pytest.warns(PimperWarning, match="16-bit files pile up at 15000"):
         images = load_views(folder, encoding=Encoding(response="linear")).images
     assert_close(images[3], torch.from_numpy(shallow / 255).movedim(-1, 0).float())
     assert_close(images[0].double(), (levels[0] / 15000).clamp(max=1), rtol=0, atol=1e-4)

@@ -63,13 +63,17 @@ def test_every_choice_gives_its_response(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv", "1,2\n3\n", r"a\.csv: holds no table .*unlike lengths"),
-        ("a.csv", "", "unlike lengths, or there are none"),
-        ("a.csv", "0,1\n1,dark\n", "holds no table"),
+        ("a.csv", "1,2\n3\n", r"a\.csv: has no table .*different lengths"),
+        ("a.csv", "", "no rows, or rows of different lengths"),
+        ("a.csv", "0,1\n1,dark\n", "has no table"),
         ("a.csv", "\n".join("1,2,3,4,5" for _ in range(20)), "a table of 20 x 5"),
-        ("a.csv", "\n".join(str(level) for level in range(100)), "is no response curve: the last"),
-        ("a.npy", "not an array", "holds no table"),
-        ("a.xlsx", "", r"a\.xlsx: is no response .*needed: srgb, linear"),
+        (
+            "a.csv",
+            "\n".join(str(level) for level in range(100)),
+            "is not a response curve: the last",
+        ),
+        ("a.npy", "not an array", "has no table"),
+        ("a.xlsx", "", r"a\.xlsx: is not a response .*needed: srgb, linear"),
     ],
 )
 def test_files_without_a_curve_are_refused_by_name(tmp_path, name, content, message):
@@ -80,7 +84,7 @@ def test_files_without_a_curve_are_refused_by_name(tmp_path, name, content, mess
 
 def test_a_misspelt_choice_and_a_missing_or_huge_file_are_refused(tmp_path):
     for name in ("sRGB", "curve.csv"):
-        with pytest.raises(InputError, match=f"{name}: is no response .*needed: srgb, linear"):
+        with pytest.raises(InputError, match=f"{name}: is not a response .*needed: srgb, linear"):
             response_of(Encoding(response=tmp_path / name))
     with (tmp_path / "a.csv").open("wb") as file:
         file.truncate(30_000_000)
@@ -90,5 +94,5 @@ def test_a_misspelt_choice_and_a_missing_or_huge_file_are_refused(tmp_path):
 
 def test_pickled_objects_are_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.array([{"radiance": 1}], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match="holds no table"):
+    with pytest.raises(InputError, match="has no table"):
         read_curve(tmp_path / "a.npy")

@@ -120,7 +120,7 @@ def test_sixteen_bit_files_of_fewer_bits_give_a_warning(tmp_path, pixels, write_
     levels = (pixels.astype(np.uint16) * 257) >> (16 - bits)
     for index in range(3):
         write_png16(tmp_path / f"{index}.png", levels)
-    message = rf"no value of its files of 16 bits is above \d+ of 65535.*{bits} bits.*{2**bits - 1}"
+    message = rf"no value of its 16-bit files is above \d+ of 65535.*{bits} bits.*{2**bits - 1}"
     with pytest.warns(PimperWarning, match=message):
         load_views(tmp_path)
     given = Encoding(response="linear", saturation=float(2**bits - 1))

@@ -1,4 +1,4 @@
-"""Image files to radiance: the response undone, 1 where the sensor saturates, shrunk."""
+"""Linear radiance from image files: response inverted, 1 at saturation, shrunk."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -24,15 +24,15 @@ from pimper_torch.runtime.mapped import zeros
 from pimper_torch.runtime.parallel import side_by_side
 
 OPAQUE = 0.5
-# What sensors digitize to; 16 bits hold all of it.
+# Bit depths of sensors, which 16-bit files can contain.
 _SENSOR_BITS = (10, 12, 14)
-# Choices: photographs share one raster, and one that makes it so many times as large as all are
-# together is no photograph of theirs, from 400 MB of raster on.
+# Choices: all photographs share one raster size. A file that makes the rasters 8 times as large as
+# the photographs is not one of them, for rasters of 400 MB or more.
 _MAX_PADDING, _MUCH_PADDING = 8, 10**8
 
 
 class _Kind(NamedTuple):
-    """Files of one kind: their level of full scale, whether it is stated, and their response."""
+    """Kind of files: full-scale level, whether it is stated, and response."""
 
     full: int
     full_scale_given: bool
@@ -41,10 +41,10 @@ class _Kind(NamedTuple):
 
 Planes = Float[Tensor, "channel height width"]
 Shrunk = Float[Tensor, "channel {height} {width}"]
-Levels = Float[Tensor, " channel"]  # fractions of full scale, one a colour
+Levels = Float[Tensor, " channel"]  # fractions of full scale, one per colour
 Sizes = Sequence[tuple[int, int]]  # width and height
-_Whites = Mapping[_Kind, Levels]  # of saturation, where it was found
-# Of all files of a kind: how often each level occurs, and in how many files it does so often.
+_Whites = Mapping[_Kind, Levels]  # detected saturation levels
+# Over all files of a kind: pixels at each level, and number of files with PIXELS or more of them.
 _Tally = Int[Tensor, "2 channel level"]
 
 
@@ -53,44 +53,43 @@ def read_pictures(
 ) -> tuple[Images, tuple[Mask | None, ...]]:
     """Read image files as linear radiance that is 1 where the sensor saturates.
 
-    Black is taken away, values above saturation are cut off. Files whose saturation is to be
-    found are read once more if it lies below full scale, which a
-    :class:`~pimper_torch.runtime.errors.PimperWarning` reports. Colours of other primaries than
-    sRGB's, as a file says, are turned into those of sRGB.
+    Black is subtracted, and values are clipped at saturation. If detected saturation is below full
+    scale, files are read again, with a :class:`~pimper_torch.runtime.errors.PimperWarning`.
+    Colours in primaries other than those of sRGB, by the file's metadata, are converted to sRGB's.
 
     Args:
         sizes_px: Width and height of each, at most those of its header.
 
     Returns:
-        The radiance on one raster, padded right and below; and where each file's alpha channel
-        shows the object, false in the padding, ``None`` if it is transparent nowhere.
+        The radiance of all files, padded right and below; and where each file's alpha channel
+        is opaque, false in the padding, ``None`` without transparent pixels.
 
     Raises:
-        InputError: Names a file that cannot be read, that the encoding does not fit, or that is
-            much larger than all others.
+        InputError: Names a file that cannot be read, does not fit the encoding, or is much
+            larger than all others.
     """
     width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
     channels = max(header.channels for header in headers)
     files = [Path(path) for path in paths]
     raster, pixels = len(files) * width * height, sum(map(prod, sizes_px))
     if raster * channels >= _MUCH_PADDING and raster >= _MAX_PADDING * pixels:
-        file, (wide, high) = max(zip(files, sizes_px, strict=True), key=lambda one: prod(one[1]))
+        file, (wide, high) = max(zip(files, sizes_px, strict=True), key=lambda item: prod(item[1]))
         raise InputError(
             f"{file}: has {wide} x {high} pixels, all have {pixels} together; needed: photographs "
-            "of similar sizes, as memory is taken for the largest. Take it out of the folder, or "
-            "give all one longest side by `--max-size-px`."
+            "of similar sizes, as each needs the memory of the largest. Remove it from the folder, "
+            "or shrink all to the same longer side with `--max-size-px`."
         )
     images = zeros((len(files), channels, height, width))
     opaque, tallies = _fill(images, files, sizes_px, encoding, {})
-    whites = _found(tallies)
+    whites = _saturation(tallies)
     if advice := _low_levels(tallies, whites):
         caution(f"{files[0].parent}: {advice}", stacklevel=3)
     for kind, white in whites.items():
-        levels = [str(round(kind.full * float(one))) for one in white]
+        levels = [str(round(kind.full * float(level))) for level in white]
         text = levels[0] if len({*levels}) == 1 else f"{', '.join(levels)} (red, green, blue)"
         caution(
-            f"{files[0].parent}: values of its files of {kind.full.bit_length()} bits pile up at "
-            f"{text} of {kind.full}, which is taken for the level of saturation. If it is not, set "
+            f"{files[0].parent}: values of its {kind.full.bit_length()}-bit files pile up at "
+            f"{text} of {kind.full}, which is treated as the saturation level. If it is not, set "
             "`photographs.saturation` to the true level, or to 1 for full scale.",
             stacklevel=3,
         )
@@ -100,7 +99,7 @@ def read_pictures(
 
 
 def resized(planes: Planes, width: int, height: int) -> Shrunk:
-    """Shrink by a triangle filter as wide as the new pixels; corners stay corners."""
+    """Shrink with a triangle filter scaled to the new pixels; image corners stay aligned."""
     if tuple(planes.shape[-2:]) == (height, width):
         return planes
     return interpolate(
@@ -109,21 +108,21 @@ def resized(planes: Planes, width: int, height: int) -> Shrunk:
 
 
 def resized_radiance(radiance: Planes, width: int, height: int) -> Shrunk:
-    """Shrink radiance; a pixel made of some that are saturated is saturated, colour by colour.
+    """Shrink radiance; a pixel to which a saturated pixel contributes is saturated, per colour.
 
-    The radiance of saturated pixels is unknown, and so is their mean with others.
+    The radiance of saturated pixels is unknown, and so are means that contain it.
     """
     if tuple(radiance.shape[-2:]) == (height, width):
         return radiance
-    # Less is rounding of the filter's weights.
-    touched = resized((radiance >= SATURATED).to(radiance), width, height) > 1e-3
-    return torch.where(touched, 1.0, resized(radiance, width, height))
+    # Smaller contributions are rounding errors of the filter's weights.
+    saturated = resized((radiance >= SATURATED).to(radiance), width, height) > 1e-3
+    return torch.where(saturated, 1.0, resized(radiance, width, height))
 
 
 def resized_mask(
     opacity: Float[Tensor, "height_in width_in"] | None, width: int, height: int
 ) -> Bool[Tensor, "{height} {width}"]:
-    """Shrink opacity and call what is at least half opaque the object; ``None`` is all of it."""
+    """Return the object mask of shrunk opacity, at least one half; all true for ``None``."""
     if opacity is None:
         return torch.ones(height, width, dtype=torch.bool)
     return resized(opacity[None], width, height)[0] >= OPAQUE
@@ -132,19 +131,19 @@ def resized_mask(
 def _fill(
     images: Images, paths: Sequence[Path], sizes_px: Sizes, encoding: Encoding, whites: _Whites
 ) -> tuple[tuple[Mask | None, ...], dict[_Kind, _Tally]]:
-    """Write the radiance of each file into the images; count its levels unless white is known."""
+    """Write the radiance of each file to ``images``; count its levels unless whites are known."""
     given = None if encoding.response == "auto" else response_of(encoding)
 
-    def of_file(index: int) -> tuple[Mask | None, _Kind, _Tally | None]:
+    def read(index: int) -> tuple[Mask | None, _Kind, _Tally | None]:
         decoded, (wide, high) = decode(paths[index]), sizes_px[index]
         response = decoded.colour.response if given is None else given
-        of_colours = isinstance(response, Curve) and len(response.radiance) > len(decoded.samples)
-        if response is None or (given is None and of_colours):
+        per_colour = isinstance(response, Curve) and len(response.radiance) > len(decoded.samples)
+        if response is None or (given is None and per_colour):
             response = Srgb()
         kind = _Kind(decoded.full, decoded.full_scale_given, response)
         black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
-        linear = _fitted(response, decoded, paths[index]).linear_from_encoded
-        # Black becomes 0; the level of saturation, or more, 1.
+        linear = _scaled_response(response, decoded, paths[index]).linear_from_encoded
+        # Black becomes 0, and saturation 1.
         dark = linear(black.expand(len(white), 1, 1))
         span = linear(white[:, None, None]) - dark
         radiance = ((linear(decoded.samples) - dark) / span).clamp(0, 1)
@@ -156,39 +155,39 @@ def _fill(
         if encoding.saturation != "auto" or whites:
             return mask, kind, None
         levels = (decoded.full * decoded.samples).round().to(torch.int32).flatten(1)
-        counts = torch.stack([one.bincount(minlength=decoded.full + 1) for one in levels])
+        counts = torch.stack([channel.bincount(minlength=decoded.full + 1) for channel in levels])
         return mask, kind, torch.stack([counts, (counts >= PIXELS).long()])
 
     opaque: list[Tensor | None] = []
-    drawn: Tensor | None = None
+    opaque_masks: Tensor | None = None
     tallies: dict[_Kind, _Tally] = {}
     with warnings.catch_warnings():
-        # Decoders ignore warnings, in threads that exchange their filters; this restores them.
+        # Decoders ignore warnings in threads that exchange their filters; this restores them.
         warnings.simplefilter("ignore")
-        for index, (mask, kind, tally) in enumerate(side_by_side(of_file, range(len(paths)))):
+        for index, (mask, kind, tally) in enumerate(side_by_side(read, range(len(paths)))):
             opaque.append(None)
             if mask is not None:
-                if drawn is None:
-                    drawn = zeros((len(images), *images.shape[-2:]), torch.bool)
-                drawn[index, : len(mask), : mask.shape[1]] = mask
-                opaque[-1] = drawn[index]
+                if opaque_masks is None:
+                    opaque_masks = zeros((len(images), *images.shape[-2:]), torch.bool)
+                opaque_masks[index, : len(mask), : mask.shape[1]] = mask
+                opaque[-1] = opaque_masks[index]
             if tally is not None:
                 tallies[kind] = tally.expand(-1, images.shape[1], -1) + tallies.get(kind, 0)
     return tuple(opaque), tallies
 
 
-def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
-    """Return the saturation of files of each kind, where it is below full scale.
+def _saturation(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
+    """Return the detected saturation levels of each kind of files, if below full scale.
 
-    A colour that shows none saturates where the highest of the others does.
+    A colour without a detected level has the highest one of the others.
     """
     whites = {}
     for kind, tally in tallies.items():
-        found = [find_saturation(*counts) for counts in tally.unbind(dim=1)]
-        highest = max((level for level in found if level is not None), default=None)
+        levels = [find_saturation(*counts) for counts in tally.unbind(dim=1)]
+        highest = max((level for level in levels if level is not None), default=None)
         if highest is None:
             continue
-        white = torch.tensor([highest if one is None else one for one in found]) / kind.full
+        white = torch.tensor([highest if level is None else level for level in levels]) / kind.full
         beyond = kind.response.linear_from_encoded(white[:, None, None]).min()
         end = kind.response.linear_from_encoded(torch.ones_like(white)[:, None, None]).max()
         if beyond < SATURATED * end:
@@ -197,7 +196,7 @@ def _found(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
 
 
 def _low_levels(tallies: Mapping[_Kind, _Tally], whites: _Whites) -> str:
-    """Return advice where files of 16 bits may hold 10, 12 or 14, as cameras' sensors do."""
+    """Return advice if 16-bit files may contain 10, 12 or 14 bits of a sensor, else ""."""
     deep = [kind for kind in tallies if kind.full == 2**16 - 1 and not kind.full_scale_given]
     if not deep or any(kind in whites for kind in deep):
         return ""
@@ -206,30 +205,30 @@ def _low_levels(tallies: Mapping[_Kind, _Tally], whites: _Whites) -> str:
     if bits is None:
         return ""
     return (
-        f"no value of its files of 16 bits is above {highest} of 65535. If they hold {bits} bits, "
-        f"full scale is {2**bits - 1}: say so by `photographs.saturation`; saturated pixels are "
-        "taken for radiance otherwise."
+        f"no value of its 16-bit files is above {highest} of 65535. If they contain {bits} bits, "
+        f"set `photographs.saturation` to full scale, {2**bits - 1}; otherwise saturated pixels "
+        "are treated as radiance."
     )
 
 
 def _levels(
-    encoding: Encoding, decoded: Decoded, path: Path, found: Levels | None
+    encoding: Encoding, decoded: Decoded, path: Path, detected: Levels | None
 ) -> tuple[Scalar, Levels]:
-    """Return black and white of a file as fractions of its full scale."""
+    """Return the black and saturation levels of a file as fractions of its full scale."""
     full, channels = decoded.full, decoded.samples.shape[0]
     saturation, black = encoding.saturation, encoding.black
     given: tuple[float | int, ...] = ()
     if saturation == "auto":
-        white = (torch.ones(channels) if found is None else found)[:channels]
+        white = (torch.ones(channels) if detected is None else detected)[:channels]
     else:
         given = saturation if isinstance(saturation, tuple) else (saturation,) * channels
-        white = torch.tensor([one if one <= 1 else one / full for one in given])
+        white = torch.tensor([level if level <= 1 else level / full for level in given])
     highest = max((black, *given))
     if highest > full:
         raise InputError(
-            f"{path}: holds {full.bit_length()} bits, levels 0 to {full}, but a level of "
-            f"{highest:g} is given for saturation or black; needed: a level that the files have, "
-            "or a fraction of full scale up to 1."
+            f"{path}: has {full.bit_length()} bits, levels 0 to {full}, but a level of "
+            f"{highest:g} is given for saturation or black; needed: a level of the files, or a "
+            "fraction of full scale up to 1."
         )
     if len(white) != channels:
         raise InputError(
@@ -244,23 +243,23 @@ def _levels(
     return dark, white
 
 
-def _fitted(response: Response, decoded: Decoded, path: Path) -> Response:
-    """Return a response over the levels of a file; refuse a curve measured on files of others."""
+def _scaled_response(response: Response, decoded: Decoded, path: Path) -> Response:
+    """Return a response for the levels of a file, or raise an error if a curve does not fit."""
     if not isinstance(response, Curve):
         return response
-    most = 2**decoded.bits - 1
+    highest = 2**decoded.bits - 1
     if response.bits not in (None, decoded.bits):
         last = float(response.encoded[-1]) * (2**response.bits - 1)
         raise InputError(
-            f"{path}: holds {decoded.bits} bits, levels 0 to {most}, but the response curve ends "
-            f"at level {last:g}, for files of {response.bits} bits; needed: a curve over the "
-            "levels of these files, or over fractions of full scale from 0 to 1."
+            f"{path}: has {decoded.bits} bits, levels 0 to {highest}, but the response curve ends "
+            f"at level {last:g}, for files of {response.bits} bits; needed: a curve for the levels "
+            "of these files, or for fractions of full scale from 0 to 1."
         )
     if len(response.radiance) not in (1, decoded.samples.shape[0]):
         raise InputError(
-            f"{path}: is gray, but the response curve is one for red, green and blue; needed: one "
-            "for all."
+            f"{path}: is gray, but the response curve is for red, green and blue; needed: a single "
+            "curve."
         )
-    if response.bits is None or decoded.full == most:
+    if response.bits is None or decoded.full == highest:
         return response
-    return replace(response, encoded=response.encoded * most / decoded.full)
+    return replace(response, encoded=response.encoded * highest / decoded.full)

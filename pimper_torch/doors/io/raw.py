@@ -1,8 +1,8 @@
-"""Camera raw: what the sensor saw, linear, with the black and saturation levels of the file.
+"""Camera raw: linear sensor values, with the black and saturation levels of the file.
 
-Read by LibRaw, which knows some 1,200 cameras, with everything left out that is no measurement:
-no curve, no brightening, no noise reduction, no white balance before saturation. Colours are
-interpolated linearly. A pixel into which a saturated sample was interpolated is saturated.
+Decoded by LibRaw, which supports about 1,200 cameras, without curves, brightening, noise reduction,
+or white balance before saturation. Colours are interpolated linearly. A pixel into which a
+saturated sample was interpolated is saturated.
 """
 
 import io
@@ -24,12 +24,12 @@ from pimper_torch.ground.radiometry.colour import Colour
 from pimper_torch.ground.shapes import Matrix3
 from pimper_torch.runtime.errors import InputError
 
-# EXIF's orientation of LibRaw's turns: none, half, to the left, to the right.
+# EXIF orientations of LibRaw's rotations: none, by 180 degrees, to the left, to the right.
 _ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}
-# Pixels whose samples linear interpolation mixes: of Bayer's pattern, and of X-Trans.
+# Widths of the windows of linear interpolation, for Bayer patterns and X-Trans.
 _WINDOWS = {2: 3, 6: 7}
 _SOURCE = "camera raw"
-# XYZ of sRGB's primaries under D65, as dcraw has them, which LibRaw's matrices are made for.
+# XYZ of sRGB's primaries under D65 in dcraw, for which LibRaw's matrices were made.
 _XYZ_FROM_SRGB = torch.tensor(
     [
         [0.412453, 0.357580, 0.180423],
@@ -38,18 +38,18 @@ _XYZ_FROM_SRGB = torch.tensor(
     ],
     dtype=torch.float64,
 )
-_UNKNOWN_CAMERA = "is of a camera whose colours nobody tells; albedo keeps them as they are"
+_UNKNOWN_CAMERA = "is from a camera of unknown colours; albedo keeps the colours of the sensor"
 
 
 def read_raw_header(path: Path | str) -> Header:
-    """Read size, turn, colours and EXIF of a raw file, without its samples."""
+    """Read size, orientation, colours and EXIF of a raw file, without its samples."""
     path = Path(path)
     with _opened(path) as raw:
-        rows, columns = _shown(raw)
+        rows, columns = _crop(raw)
         if raw.num_colors not in (1, 3):
             raise InputError(
                 f"{path}: its sensor has {raw.num_colors} colours; needed: red, green and blue. "
-                "Develop it to linear TIFF of 16 bits."
+                "Develop it to a linear 16-bit TIFF."
             )
         gray = raw.num_colors == 1
         matrix = None if gray else _srgb_from_sensor(raw)
@@ -58,7 +58,7 @@ def read_raw_header(path: Path | str) -> Header:
         orientation = _ORIENTATION.get(raw.sizes.flip, 1)
         if orientation >= 5:
             width, height = height, width
-        # Digital zoom crops what a camera develops, not what its sensor sees.
+        # Digital zoom crops developed images, not the samples of the sensor.
         tags = _exif(path, raw).get_ifd(ExifTags.IFD.Exif) | {ExifTags.Base.DigitalZoomRatio: 1}
         return Header(
             width=width,
@@ -75,10 +75,10 @@ def read_raw_header(path: Path | str) -> Header:
 
 
 def read_raw(path: Path | str) -> np.ndarray:
-    """Read the samples of a raw file, interpolated; full scale is the sensor's saturation.
+    """Return the interpolated samples of a raw file; full scale is the sensor's saturation.
 
     Returns:
-        16 bits, ``height width channel``, not turned.
+        16 bits, ``height width channel``, without applying the orientation.
     """
     path = Path(path)
     rawpy = load_extra("raw", path)
@@ -92,7 +92,7 @@ def read_raw(path: Path | str) -> np.ndarray:
             output_bps=16,
             user_wb=[1.0, 1.0, 1.0, 1.0],
             user_flip=0,
-            # Counted from black, by LibRaw; the file's own if it tells no lower one.
+            # LibRaw counts this from black; by default it uses the file's level.
             user_sat=white - black if white < raw.white_level else None,
             gamma=(1, 1),
             no_auto_bright=True,
@@ -101,13 +101,13 @@ def read_raw(path: Path | str) -> np.ndarray:
         )
         if array.shape[:2] != (raw.sizes.height, raw.sizes.width):
             raise InputError(
-                f"{path}: its sensor's pixels are no squares in rows; needed: a sensor "
-                "as most cameras have. Develop it to linear TIFF of 16 bits."
+                f"{path}: the pixels of its sensor are not squares in rows; needed: a sensor "
+                "with square pixels. Develop it to a linear 16-bit TIFF."
             )
-        shown = _shown(raw)
+        crop = _crop(raw)
     if saturated is not None:
         array[saturated] = np.iinfo(np.uint16).max
-    array = array[shown]
+    array = array[crop]
     return array[..., 0] if array.shape[2] == 1 else array
 
 
@@ -117,22 +117,22 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            path.stat()  # of what is not there, the system's own words
+            path.stat()  # a missing file raises the error of the system
             with rawpy.imread(str(path)) as raw:
                 yield raw
     except (InputError, OSError, MemoryError):
         raise
-    except Exception as error:  # LibRaw's own, and whatever its bindings raise
+    except Exception as error:  # LibRaw and its bindings raise errors of many types
         raise InputError(
-            f"{path}: cannot be read as camera raw; it is damaged, or of a camera that LibRaw "
-            "does not know. Develop it to linear TIFF of 16 bits, or take it out of the folder."
+            f"{path}: cannot be read as camera raw; it is damaged, or from a camera that LibRaw "
+            "does not support. Develop it to a linear 16-bit TIFF, or remove it from the folder."
         ) from error
 
 
-def _shown(raw: Any) -> tuple[slice, slice]:  # noqa: ANN401 - of a package that may be absent
-    """Return the rows and columns that the camera's own picture shows, of those that see light.
+def _crop(raw: Any) -> tuple[slice, slice]:  # noqa: ANN401 - of a package that may be absent
+    """Return the rows and columns of the camera's JPEG within the exposed area of the sensor.
 
-    They are fewer by a margin, as interpolation needs; masks and models of the JPEG then fit.
+    The sensor has a margin for interpolation. With this crop, masks and models of the JPEG fit.
     """
     sizes = raw.sizes
     top, left = sizes.crop_top_margin - sizes.top_margin, sizes.crop_left_margin - sizes.left_margin
@@ -143,28 +143,28 @@ def _shown(raw: Any) -> tuple[slice, slice]:  # noqa: ANN401 - of a package that
 
 
 def _white(raw: Any) -> int:  # noqa: ANN401 - as above
-    """Return the level of saturation: the lowest that the file tells."""
-    told = filter(None, raw.camera_white_level_per_channel or ())
-    return min(map(int, (raw.white_level, *told)))
+    """Return the saturation level: the lowest that the file states."""
+    levels = filter(None, raw.camera_white_level_per_channel or ())
+    return min(map(int, (raw.white_level, *levels)))
 
 
 def _saturated(raw: Any, white: int) -> np.ndarray | None:  # noqa: ANN401 - as above
-    """Find pixels that hold a saturated sample, or into which one is interpolated."""
+    """Return the mask of pixels to which a saturated sample contributes."""
     samples, pattern = raw.raw_image_visible, raw.raw_pattern
     if samples is None:
         return None
     black = np.asarray(raw.black_level_per_channel, dtype=np.float32)
     levels = black + SATURATED * (white - black)
-    if samples.ndim == 3:  # every colour in every pixel, as converters and telephones leave it
+    if samples.ndim == 3:  # every colour in every pixel, as from converters and phones
         return (samples[..., :3] >= levels[:3]).any(axis=2)
     if pattern is None:
         return samples >= levels[0]
-    reached = samples >= levels[raw.raw_colors_visible]
-    return maximum_filter(reached, size=_WINDOWS.get(len(pattern), 7))
+    saturated = samples >= levels[raw.raw_colors_visible]
+    return maximum_filter(saturated, size=_WINDOWS.get(len(pattern), 7))
 
 
 def _srgb_from_sensor(raw: Any) -> Matrix3 | None:  # noqa: ANN401 - as above
-    """Return the matrix from the sensor's colours to linear sRGB, by the camera's white balance."""
+    """Return the matrix from sensor colours to linear sRGB, with the camera's white balance."""
     matrix = torch.tensor(np.asarray(raw.color_matrix), dtype=torch.float64)[:3, :3]
     if not _keeps_white(matrix):
         sensor = torch.tensor(np.asarray(raw.rgb_xyz_matrix), dtype=torch.float64)[:3]
@@ -174,32 +174,32 @@ def _srgb_from_sensor(raw: Any) -> Matrix3 | None:  # noqa: ANN401 - as above
         matrix = (sensor / sensor.sum(dim=1, keepdim=True)).inverse()
     if not _keeps_white(matrix):
         return None
-    for told in (raw.camera_whitebalance, raw.daylight_whitebalance):
-        factors = torch.tensor(list(told)[:3], dtype=torch.float64)
+    for balance in (raw.camera_whitebalance, raw.daylight_whitebalance):
+        factors = torch.tensor(list(balance)[:3], dtype=torch.float64)
         if bool(factors.isfinite().all() & (factors > 0).all()):
             return matrix * (factors / factors[1])
     return matrix
 
 
 def _keeps_white(matrix: Matrix3) -> bool:
-    """Return whether rows of a matrix to sRGB sum to about 1."""
+    """Return whether the rows of a matrix to sRGB sum to about 1."""
     white = (matrix.sum(dim=1) - 1).abs().max()
     return bool(matrix.isfinite().all()) and float(white) < 0.1
 
 
 def _exif(path: Path, raw: Any) -> Image.Exif:  # noqa: ANN401 - as above
-    """Read EXIF: of the file, where it is laid out as TIFF is, else of the preview in it."""
+    """Return the EXIF of the file if its layout is that of TIFF, else of its preview."""
     exif = Image.Exif()
     try:
         with path.open("rb") as file:
             exif.load_from_fp(file)
             if exif.get_ifd(ExifTags.IFD.Exif):
                 return exif
-    except Exception:  # Pillow's parser raises whatever a file leads to: no TIFF, then
+    except Exception:  # not TIFF: Pillow's parser raises errors of many types
         exif = Image.Exif()
     try:
         preview = raw.extract_thumb()
         with Image.open(io.BytesIO(preview.data), formats=("JPEG",)) as image:
             return image.getexif()
-    except Exception:  # no preview, none that is JPEG, or a damaged one
+    except Exception:  # no preview, or one that is damaged or not JPEG
         return exif

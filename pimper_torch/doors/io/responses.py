@@ -1,4 +1,4 @@
-"""Responses of photographs: measured curves from small files, and contradictions of files."""
+"""Responses of photographs: measured curves, and contradictions with the files' metadata."""
 
 import csv
 from collections import defaultdict
@@ -16,15 +16,15 @@ from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.numpy_files import read_npy
 
 _LAYOUT = (
-    "a column of radiance, or red, green and blue, for the levels 0, 1, 2 and on; or two or four "
-    "columns, of which the first is the level"
+    "one column of radiance, or three for red, green and blue, for the levels 0, 1, 2, ...; or two "
+    "or four columns, the first with the level"
 )
 
 
 def response_of(encoding: Encoding) -> Response:
-    """Return the response that was chosen, reading its file if it is a measured one.
+    """Return the response of the settings, read from its file if it is measured.
 
-    ``auto``, where no file says another, is sRGB.
+    ``auto`` is sRGB, the default for files that state no response.
     """
     choice = encoding.response
     if choice in ("auto", "srgb"):
@@ -37,18 +37,18 @@ def response_of(encoding: Encoding) -> Response:
 
 
 def read_curve(path: Path | str) -> Curve:
-    """Read a measured inverse response: the radiance that belongs to each level.
+    """Read a measured inverse response: the radiance of each level.
 
-    The table has one column, the radiance of the levels 0, 1, 2 and on; three, of red, green
-    and blue; or two or four, of which the first is the level. Levels go from 0 to 1 (shares
-    of full scale), to 255 (files of 8 bits), or to more (of 16). Radiance is in any unit.
+    The table has one column, the radiance of the levels 0, 1, 2, ...; three, for red, green
+    and blue; or two or four, the first with the level. Levels go from 0 to 1 (fractions of
+    full scale), to 255 (files of 8 bits), or higher (16 bits). Radiance is in any unit.
 
-    ``.csv`` has rows of numbers, a first row of names is passed over; ``.npy`` rows, such as
-    OpenCV's ``CalibrateDebevec`` gives with its colours in reverse order.
+    ``.csv`` has rows of numbers, and may have a first row of names; ``.npy`` has rows, such as
+    those of OpenCV's ``CalibrateDebevec`` with its colours in reverse order.
 
     Raises:
-        InputError: No such file, one of another kind, no table of numbers, or no curve:
-            see :func:`~pimper_torch.ground.radiometry.response.curve_from_table`.
+        InputError: The file does not exist, is of a different kind, or has no table of numbers
+            or no curve: see :func:`~pimper_torch.ground.radiometry.response.curve_from_table`.
     """
     path = Path(path)
     readers: Mapping[str, Callable[[Path], np.ndarray]] = {".csv": _read_csv, ".npy": _read_npy}
@@ -56,20 +56,20 @@ def read_curve(path: Path | str) -> Curve:
     if reader is None or not path.is_file():
         found = "no such file" if reader else f"a {path.suffix} file" if path.suffix else "no file"
         raise InputError(
-            f"{path}: is no response of photographs ({found}); needed: srgb, linear, the exponent "
-            f"of a gamma curve, or a file ending in {', '.join(readers)}."
+            f"{path}: is not a response of photographs ({found}); needed: srgb, linear, the "
+            f"exponent of a gamma curve, or a file ending in {', '.join(readers)}."
         )
-    if path.stat().st_size > 20_000_000:  # 65536 levels in three colours take 5 MB as text
+    if path.stat().st_size > 20_000_000:  # 65536 levels of three colours need 5 MB as text
         raise InputError(f"{path}: has {path.stat().st_size} bytes; needed: a small table.")
     try:
         table = reader(path)
     except (OSError, ValueError, TypeError, OverflowError, csv.Error) as error:
         raise InputError(
-            f"{path}: holds no table of a response curve ({str(error)[:200]}); needed: {_LAYOUT}."
+            f"{path}: has no table of a response curve ({str(error)[:200]}); needed: {_LAYOUT}."
         ) from error
     if table.ndim != 2 or not 1 <= table.shape[1] <= 4:
         raise InputError(
-            f"{path}: holds a table of {' x '.join(str(side) for side in table.shape)}; needed: "
+            f"{path}: has a table of {' x '.join(str(side) for side in table.shape)}; needed: "
             f"{_LAYOUT}."
         )
     columns = torch.from_numpy(np.ascontiguousarray(table.T))
@@ -78,7 +78,7 @@ def read_curve(path: Path | str) -> Curve:
     try:
         return curve_from_table(columns[0], columns[1:])
     except InputError as error:
-        raise InputError(f"{path}: is no response curve: {error}") from error
+        raise InputError(f"{path}: is not a response curve: {error}") from error
 
 
 def _read_csv(path: Path) -> np.ndarray:
@@ -88,15 +88,15 @@ def _read_csv(path: Path) -> np.ndarray:
     if rows and not any(_is_number(cell) for cell in rows[0]):
         rows = rows[1:]
     if len({len(row) for row in rows}) != 1:
-        raise ValueError("its rows are of unlike lengths, or there are none")
+        raise ValueError("it has no rows, or rows of different lengths")
     return np.array([[float(cell) for cell in row] for row in rows])
 
 
 def _read_npy(path: Path) -> np.ndarray:
     table = read_npy(path)
     if table.dtype.kind not in "iuf":
-        raise ValueError("it is no array of numbers")
-    if table.ndim == 3 and table.shape[1] == 1:  # as OpenCV has it
+        raise ValueError("it is not an array of numbers")
+    if table.ndim == 3 and table.shape[1] == 1:  # OpenCV's layout
         table = table[:, 0]
     return (table[:, None] if table.ndim == 1 else table).astype(np.float64)
 
@@ -109,47 +109,47 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-# Of the warning that files say something else than the response that is given.
-CONTRADICTED = "what is given is taken"
+# Part of the warning that the files' metadata differ from the given response.
+CONTRADICTED = "the given response is used"
 
 
 def warn_of_responses(
     folder: Path | str, paths: Sequence[Path | str], headers: Sequence[Header], encoding: Encoding
 ) -> None:
-    """Warn of what photographs say and is not followed.
+    """Warn of metadata of photographs that are not applied.
 
     Args:
-        encoding: As given. A measured curve is not compared with what files say.
+        encoding: As given. A measured curve is not compared with the files' metadata.
 
     Raises:
-        InputError: Names a file whose colours cannot be followed, unless a response is given.
+        InputError: Names a file with unsupported colours, unless a response is given.
     """
-    kinds: dict[str, list[str]] = defaultdict(list)
+    names_of: dict[str, list[str]] = defaultdict(list)
     for path, header in zip(paths, headers, strict=True):
-        sentences, said = [*header.cautions], header.colour
-        if said.trouble and encoding.response == "auto":
+        sentences, stated = [*header.cautions], header.colour
+        if stated.trouble and encoding.response == "auto":
             raise InputError(
-                f"{path}: {said.source} {said.trouble}, and cannot be followed; needed: sRGB, or a "
-                "profile of tone curves and primaries such as Display P3. Save it so by a program "
-                "that follows it, such as GIMP or ImageMagick, or give the true response by "
-                "`photographs.response`."
+                f"{path}: {stated.source} {stated.trouble}, which is not supported; needed: sRGB, "
+                "or a profile with tone curves and primaries such as Display P3. Convert it with a "
+                "program that supports it, such as GIMP or ImageMagick, or give the true response "
+                "with `photographs.response`."
             )
-        if said.trouble:
+        if stated.trouble:
             sentences.append(
-                f"{said.source} {said.trouble}, and is not followed; what is given is taken, "
-                "with the primaries of sRGB"
+                f"{stated.source} {stated.trouble}, which is not supported; {CONTRADICTED}, with "
+                "the primaries of sRGB"
             )
-        elif said.response is not None and not isinstance(encoding.response, Path):
+        elif stated.response is not None and not isinstance(encoding.response, Path):
             given = response_of(encoding)
-            if encoding.response != "auto" and disagree(given, said.response):
+            if encoding.response != "auto" and disagree(given, stated.response):
                 sentences.append(
-                    f"the response {describe(given)} is given, but {said.source} says "
-                    f"{describe(said.response)}; what is given is taken. Leave out "
-                    "`photographs.response` to follow the files"
+                    f"the response {describe(given)} is given, but {stated.source} states "
+                    f"{describe(stated.response)}; {CONTRADICTED}. Remove `photographs.response` "
+                    "to use that of the files"
                 )
         for sentence in sentences:
-            kinds[sentence].append(Path(path).name)
-    for sentence, names in kinds.items():
+            names_of[sentence].append(Path(path).name)
+    for sentence, names in names_of.items():
         caution(
             f"{folder}: {len(names)} of {len(paths)} photographs ({some(names, 4)}): {sentence}.",
             stacklevel=3,

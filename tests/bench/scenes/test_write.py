@@ -104,7 +104,7 @@ def test_zero_processes_are_refused(ball, tmp_path):
 def test_several_lights_per_pose_have_one_camera_and_one_folder_each(ball, tmp_path):
     config = SceneConfig(num_views=6, lights_per_pose=2, width=48, height=36, supersample=1)
     folder = render_scene(ball, tmp_path / "scene", config, processes=1)
-    with pytest.warns(PimperWarning, match="3 poses of the camera"):
+    with pytest.warns(PimperWarning, match="3 camera poses"):
         views = load_views(folder / "photos", masks=folder / "masks")
     assert views.names[2:4] == ("pose_01/light_00.png", "pose_01/light_01.png")
     assert views.poses.tolist() == [0, 0, 1, 1, 2, 2]
