@@ -39,7 +39,7 @@ def scene_of(scene, images):
         (lambda linear: linear[:, 0], r"images has shape \(4, 36, 48\); needed: view channel"),
         (
             lambda linear: 255 * linear,
-            r"images reach \d+.*\d% .* above 1; .*1 is where .*: divide them .*linear_from_srgb",
+            r"images have values up to \d+.*\d% .* above 1; .*1 where .*: divide .*linear_from_srgb",
         ),
         (to_bytes, r"images is uint8; .*hold sRGB.*linear_from_srgb\(images / 255\)`.*load_views"),
         (lambda linear: to_bytes(linear).numpy(), "images is uint8; "),

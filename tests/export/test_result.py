@@ -102,7 +102,7 @@ def test_a_photograph_that_looks_different_is_named(folder, photographs):
     with Image.open(photographs / "c.png") as picture:
         darker = picture.point(lambda level: level // 2)
     darker.save(photographs / "c.png")
-    with pytest.warns(PimperWarning, match=r"look different now: c\.png\."):
+    with pytest.warns(PimperWarning, match=r"have changed: c\.png\."):
         read_result(folder)
 
 
@@ -172,8 +172,8 @@ def test_larger_photographs_are_shrunk_to_those_of_the_run(folder, photographs):
     for path in photographs.iterdir():
         with Image.open(path) as picture:
             picture.resize((120, 80), Image.Resampling.NEAREST).save(path)
-    # They are noise, in which saturation spreads to a third of the pixels when resized.
-    with pytest.warns(PimperWarning, match=r"look different now: a\.png, b\.png, c\.png"):
+    # They are noise, in which saturation spreads over a third of the pixels when it is shrunk.
+    with pytest.warns(PimperWarning, match=r"have changed: a\.png, b\.png, c\.png"):
         found = read_result(folder)
     assert torch.equal(found.scene.views.sizes_px, there.scene.views.sizes_px)
     assert torch.equal(found.cameras.intrinsics, there.cameras.intrinsics)

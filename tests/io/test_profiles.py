@@ -325,11 +325,11 @@ def test_a_given_response_overrides_the_profile(three, pixels, stored, make_prof
     def write(path):
         Image.fromarray(pixels).save(path, icc_profile=profile)
 
-    told = r'3 of 3 photographs \(0\.png, .*srgb is given, but the ICC profile "mine" says linear'
+    told = r'3 of 3 photographs \(0\.png, .*srgb is given, but the ICC profile "mine" states linear'
     with pytest.warns(PimperWarning, match=told):
         found = three(write, "png", encoding=Encoding(response="srgb"))
     assert_close(found, linear_from_srgb(stored), rtol=0, atol=1e-6)
-    with pytest.warns(PimperWarning, match=r"response 1\.8 is given, but .* says linear"):
+    with pytest.warns(PimperWarning, match=r"response 1\.8 is given, but .* states linear"):
         three(write, "png", encoding=Encoding(response=1.8))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -43,5 +43,5 @@ def test_reordered_photographs_are_refused_and_new_ones_are_not(images):
         compare_thumbnails(views_of(images.flip(0)), known, "photographs")
     changed = images.clone()
     changed[1] *= 0.5
-    with pytest.warns(PimperWarning, match=r"look different now: 1\.png"):
+    with pytest.warns(PimperWarning, match=r"have changed: 1\.png"):
         compare_thumbnails(views_of(changed), known, "photographs")

@@ -1,4 +1,4 @@
-"""Results to evaluate: a folder that ``pimper reconstruct`` wrote, or a mesh of any method."""
+"""Estimates to evaluate: a result folder of ``pimper reconstruct``, or a mesh of any method."""
 
 from pathlib import Path, PurePosixPath
 
@@ -21,18 +21,18 @@ def read_estimate(path: Path | str) -> Estimate:
     """Read a method's estimate of an object.
 
     Args:
-        path: A mesh or point cloud; or a folder with ``mesh.ply`` and, if it has them, ``sparse/``
-            (COLMAP model whose pinholes are the cameras), ``lights.json`` and ``depth.npz`` (whose
-            ``name`` is the reference view), as
-            :func:`pimper_torch.doors.io.results.write_result` writes them.
+        path: A mesh or point cloud; or a folder with ``mesh.ply`` and optionally ``sparse/``
+            (COLMAP model with the cameras), ``lights.json`` and ``depth.npz`` (with the ``name`` of
+            the reference view), as written by
+            :func:`pimper_torch.doors.io.results.write_result`.
     """
     path = Path(path)
     if not path.is_dir():
         return Estimate(mesh=read_mesh(path))
     if not (path / "mesh.ply").is_file():
         raise InputError(
-            f"{path}: holds no mesh.ply; needed: a folder written by `pimper reconstruct`, or the "
-            "path of a mesh file itself."
+            f"{path}: contains no mesh.ply; needed: a folder written by `pimper reconstruct`, or "
+            "the path of a mesh file."
         )
     mesh = read_mesh(path / "mesh.ply")
     names: tuple[str, ...] = ()
@@ -50,19 +50,19 @@ def read_estimate(path: Path | str) -> Estimate:
 
 
 def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view 4"] | None:
-    """Read the light of every named view; NaN where the file has none.
+    """Read the light of every named view; NaN if the file lacks it.
 
     Returns:
-        ``None`` where there is no such file, no view, or no light.
+        ``None`` without such a file, without views, or without lights.
     """
     file = DataSetPath(Path(path), _KIND)
     if not file.path.is_file() or not names:
         return None
     views = file.objects(file.read_json().get("views"), "views")
-    known = {str(view.get("name")): view.get("light") for view in views}
+    light_of = {str(view.get("name")): view.get("light") for view in views}
     unknown = torch.full((4,), torch.nan, dtype=torch.float64)
     rows = [
-        file.numbers(known[name], 4, f"light of {name}") if known.get(name) else unknown
+        file.numbers(light_of[name], 4, f"light of {name}") if light_of.get(name) else unknown
         for name in names
     ]
     lights = torch.stack(rows)
@@ -70,16 +70,16 @@ def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view
 
 
 def read_reference(path: Path | str) -> str | None:
-    """Read the name of the reference view; ``None`` where there is no such file."""
+    """Read the name of the reference view; ``None`` without such a file."""
     file = DataSetPath(Path(path), _KIND)
     if not file.path.is_file():
         return None
-    found = file.read(lambda path: read_npz(path, lambda name: name == "name"), "an archive")
-    return str(found["name"]) if "name" in found else None
+    arrays = file.read(lambda path: read_npz(path, lambda name: name == "name"), "an archive")
+    return str(arrays["name"]) if "name" in arrays else None
 
 
 def mask_path(folder: Path | str, name: str) -> Path:
-    """Return where the mask of a photograph is written: under its name, never outside the folder.
+    """Return the path of the mask of a photograph, by its name and always inside the folder.
 
     >>> mask_path(Path("masks"), "pose_03/../light_02.jpg").as_posix()
     'masks/pose_03/light_02.png'

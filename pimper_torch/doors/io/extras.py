@@ -1,4 +1,4 @@
-"""Formats of photographs, and those that need a package more, which may be absent."""
+"""Formats of photographs, and optional packages that some of them need."""
 
 import re
 from importlib import import_module
@@ -14,9 +14,9 @@ RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2"),
     *(".pef", ".srw", ".3fr", ".iiq", ".rwl"),
 )
-# Of each extra: its name for people, and the modules any of which will do.
+# Name of each extra in messages, and the modules that provide it.
 _EXTRAS = {"heic": ("a HEIC image", ("pi_heif", "pillow_heif")), "raw": ("camera raw", ("rawpy",))}
-# How files begin. Most camera raw begins as TIFF does.
+# First bytes of files. Most camera raw begins like TIFF.
 _STARTS = {
     "JPEG": rb"\xff\xd8\xff",
     "PNG": rb"\x89PNG",
@@ -33,7 +33,7 @@ _STARTS = {
 
 
 def format_of(path: Path | str) -> str:
-    """Return the name of a file's format by its first bytes; empty if they match none."""
+    """Return the name of a file's format by its first bytes; empty if unknown."""
     try:
         with Path(path).open("rb") as file:
             start = file.read(16)
@@ -43,9 +43,9 @@ def format_of(path: Path | str) -> str:
 
 
 def extra_of(path: Path | str) -> str:
-    """Return the extra that reads a file, ``heic`` or ``raw``; empty where none is needed.
+    """Return the extra that reads a file, ``heic`` or ``raw``; empty if none is needed.
 
-    The content decides, not the suffix, unless it is that of a TIFF or unknown.
+    The content decides; the suffix only if the content is TIFF or unknown.
     """
     name, suffix = format_of(path), Path(path).suffix.lower()
     if name == "CR3" or (suffix in RAW_SUFFIXES and name in ("TIFF", "")):
@@ -55,23 +55,23 @@ def extra_of(path: Path | str) -> str:
 
 def is_installed(extra: str) -> bool:
     """Return whether a package of an extra is installed."""
-    return any(_is_there(name) for name in _EXTRAS[extra][1])
+    return any(_exists(name) for name in _EXTRAS[extra][1])
 
 
 def load_extra(extra: str, path: Path | str) -> ModuleType:
-    """Import the package of an extra."""
+    """Import the package of an extra; ``InputError`` about the file if it is missing."""
     kind, modules = _EXTRAS[extra]
     for name in modules:
-        if _is_there(name):
+        if _exists(name):
             return import_module(name)
     raise InputError(
-        f"{path}: is {kind}, which needs one more package: "
-        f'`pip install "pimper_torch[{extra}]"`. Or convert it to TIFF of 16 bits, PNG or JPEG.'
+        f"{path}: is {kind}, which needs an additional package: "
+        f'`pip install "pimper_torch[{extra}]"`. Or convert it to 16-bit TIFF, PNG or JPEG.'
     )
 
 
-def _is_there(module: str) -> bool:
+def _exists(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ValueError:  # half imported, or taken away on purpose
+    except ValueError:  # partially imported, or removed on purpose
         return False

@@ -1,4 +1,4 @@
-"""HEIC, by libheif."""
+"""HEIC images, decoded by libheif."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,9 +16,9 @@ from pimper_torch.runtime.errors import InputError
 
 
 def read_heic_header(path: Path | str) -> Header:
-    """Read size, colours and EXIF of the primary picture of a HEIC file, without its pixels.
+    """Read size, colours and EXIF of the primary image of a HEIC file, without its pixels.
 
-    The file's own rotation is applied; EXIF's, which only repeats it, is not.
+    The rotation of the HEIC container is applied; EXIF's, which repeats it, is not.
     """
     opened = _opened(path)
     image = opened[opened.primary_index]
@@ -29,7 +29,7 @@ def read_heic_header(path: Path | str) -> Header:
     colour, codes = SILENT, info.get("nclx_profile")
     if info.get("icc_profile"):
         colour = colour_of_info(info)
-    elif isinstance(codes, Mapping):  # its matrix and range are undone by the decoder
+    elif isinstance(codes, Mapping):  # the decoder already applies matrix and range
         primaries, curve = codes["color_primaries"], codes["transfer_characteristics"]
         colour = colour_of_codes(int(primaries), int(curve), "HEIC's nclx")
     bits = int(info.get("bit_depth", 8))
@@ -46,12 +46,12 @@ def read_heic_header(path: Path | str) -> Header:
 
 
 def read_heic(path: Path | str) -> np.ndarray:
-    """Decode the primary picture at its full depth, ``height width channel``; opacity last."""
+    """Decode the primary image at full bit depth, ``height width channel`` with opacity last."""
     opened = _opened(path)
     image = opened[opened.primary_index]
     if image.mode.partition(";")[0] in ("RGBa", "La"):
         raise InputError(f"{path}: {PREMULTIPLIED}")
-    # A copy, made while the file that owns the memory is alive.
+    # A copy, as the memory belongs to the file.
     return np.array(image, copy=True)
 
 

@@ -1,4 +1,4 @@
-"""Meshes as files that other programs open."""
+"""Reading and writing of mesh files."""
 
 import json
 import re
@@ -27,12 +27,12 @@ from pimper_torch.result.asset.gltf import MATTE, gltf_of
 from pimper_torch.result.viz.maps import base_color, carried_normals
 from pimper_torch.runtime.errors import InputError
 
-# One number a vertex, written and read under the names of the record's fields.
+# Scalars per vertex, written and read under the names of the record's fields.
 _ERRORS = ("confidence", "expected_error")
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
 _NEEDED = "PLY, OBJ, STL, OFF or GLB"
-# Of a short edge (longer than a tenth of all): the most that rounding may move a vertex. A choice.
-# A cloud's spacing is assumed to be a thousandth of its radius.
+# Largest shift of a vertex by rounding, as a fraction of a short edge (the 10th percentile). A
+# choice. A cloud's spacing is assumed to be a thousandth of its radius.
 _MAX_ROUNDING, _CLOUD_SPACING = 1e-3, 1e-3
 _KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's names
 
@@ -40,32 +40,32 @@ _KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's na
 def write_ply(
     mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET, measured: FaceMask | None = None
 ) -> None:
-    """Write a binary PLY: vertex normals, albedo as 8-bit sRGB colour, and what is known of errors.
+    """Write a binary PLY with vertex normals, albedo as 8-bit sRGB colour, and errors.
 
-    These are the properties ``confidence`` and ``expected_error``, the latter in scene units.
-    Positions are ``double`` where ``float`` would move one by more than a thousandth of an edge,
-    as it does far from the origin.
+    Errors are the properties ``confidence`` and ``expected_error``, the latter in scene units.
+    Positions are ``double`` if ``float`` would move a vertex by more than a thousandth of a short
+    edge, as it does far from the origin.
 
     Args:
         offset_world: Added to the vertices; see ``SparseScene.offset_world``.
-        measured: Written as the faces' property of this name, 0 of those that close a hole.
+        measured: Face property of the same name; 0 for faces that close a hole.
     """
     columns = {"x y z": _positions(mesh, offset_world), "nx ny nz": carried_normals(mesh).float()}
     if mesh.albedo is not None:
         columns["red green blue"] = to_bytes(base_color(mesh).expand(-1, 3))
     for name in _ERRORS:
-        known = getattr(mesh, name)
-        if known is not None:
-            columns[name] = known.float()[:, None]
+        errors = getattr(mesh, name)
+        if errors is not None:
+            columns[name] = errors.float()[:, None]
     arrays = {
         name: column.detach().cpu().numpy()
         for names, values in columns.items()
         for name, column in zip(names.split(), values.unbind(dim=1), strict=True)
     }
-    row = [(name, array.dtype.newbyteorder("<")) for name, array in arrays.items()]
-    vertices = np.rec.fromarrays(list(arrays.values()), dtype=row)
-    kind = [("count", "u1"), ("corners", "<i4", 3)]
-    faces = np.empty(len(mesh.faces), kind if measured is None else [*kind, ("measured", "u1")])
+    vertex_type = [(name, array.dtype.newbyteorder("<")) for name, array in arrays.items()]
+    vertices = np.rec.fromarrays(list(arrays.values()), dtype=vertex_type)
+    face = [("count", "u1"), ("corners", "<i4", 3)]
+    faces = np.empty(len(mesh.faces), face if measured is None else [*face, ("measured", "u1")])
     faces["count"], faces["corners"] = 3, mesh.faces.cpu().numpy()
     if measured is not None:
         faces["measured"] = measured.cpu().numpy()
@@ -86,30 +86,30 @@ def write_ply(
 
 
 def _positions(mesh: Mesh, offset_world: Offset) -> Vertices:
-    """Return positions as they are written: float32 where that is exact enough, else float64."""
+    """Return the positions to write: float32 if that is exact enough, else float64."""
     vertices = mesh.vertices_world.detach().double()
-    placed = vertices + vertices.new_tensor(offset_world)
-    single = placed.float()
+    shifted = vertices + vertices.new_tensor(offset_world)
+    single = shifted.float()
     if len(vertices) == 0:
         return single
     if len(mesh.faces):
         lengths = side_lengths(vertices[mesh.faces.clamp(0, len(vertices) - 1)]).flatten()
         short = float(lengths.kthvalue(max(1, len(lengths) // 10)).values)
     else:
-        away = (vertices - vertices.median(dim=0).values).norm(dim=1)
-        short = _CLOUD_SPACING * float(away.median())
-    lost = float((placed - single).abs().max())
-    return single if lost <= _MAX_ROUNDING * short else placed
+        distance = (vertices - vertices.median(dim=0).values).norm(dim=1)
+        short = _CLOUD_SPACING * float(distance.median())
+    rounding = float((shifted - single).abs().max())
+    return single if rounding <= _MAX_ROUNDING * short else shifted
 
 
 def read_mesh(path: Path | str) -> Mesh:
     """Read a triangle mesh or a point cloud: PLY, OBJ, STL, OFF or GLB.
 
-    Faces of more corners are split, the parts of a scene put together; vertices keep their
-    order and number. Vertex normals are kept if the file has some; colours are taken for
-    albedo (sRGB undone, except in glTF, whose colours are linear); ``confidence`` and
-    ``expected_error`` of PLY are kept too. What of these is not finite throughout is dropped. A
-    point cloud becomes a mesh without faces.
+    Polygons are triangulated, and the parts of a scene are merged; vertices keep their order and
+    number. Vertex normals are read if present; colours become albedo (converted from sRGB, except
+    in glTF, whose colours are linear); ``confidence`` and ``expected_error`` are read from PLY.
+    Any of these with values that are not finite is dropped. A point cloud becomes a mesh without
+    faces.
 
     Args:
         path: The file. Its textures and materials are not read.
@@ -118,8 +118,8 @@ def read_mesh(path: Path | str) -> Mesh:
         Float64 geometry on the CPU.
 
     Raises:
-        InputError: No such file, not a mesh, one that says it holds more than its file, no
-            vertices, vertices that are not finite, or faces of vertices that are not there.
+        InputError: The file does not exist, is not a mesh, is shorter than its header states, or
+            has no vertices, vertices that are not finite, or faces with invalid indices.
     """
     path = Path(path)
     if not path.is_file():
@@ -127,10 +127,10 @@ def read_mesh(path: Path | str) -> Mesh:
         raise InputError(f"{path}: found {found}; needed: a mesh file such as .ply or .obj.")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        why = f"it ends in {suffix}" if suffix else "its name has no ending"
-        raise InputError(f"{path}: cannot be read as a mesh, {why}; needed: {_NEEDED}.")
+        found = f"its suffix is {suffix}" if suffix else "its name has no suffix"
+        raise InputError(f"{path}: cannot be read as a mesh, {found}; needed: {_NEEDED}.")
     try:
-        # Without a resolver nothing but the file itself is opened.
+        # Without a resolver, no other file is opened.
         scene = trimesh.load_scene(
             BytesIO(_readable(path, suffix)),
             file_type=suffix.lstrip("."),
@@ -139,25 +139,25 @@ def read_mesh(path: Path | str) -> Mesh:
         )
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
         count = sum(len(scene.geometry[name].vertices) for _, name in placed)
-        if count > 100_000_000:  # a scene may place a mesh many times, and each takes memory
+        if count > 100_000_000:  # a scene may contain many instances of a mesh
             raise InputError(
-                f"{path}: its scene has {count} vertices; needed: 100,000,000 at most."
+                f"{path}: its scene has {count} vertices; needed: at most 100,000,000."
             )
         parts = [
             _mesh(scene.geometry[name], pose, linear=suffix == ".glb") for pose, name in placed
         ]
     except InputError:
         raise
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
+    except Exception as error:  # parsers of trimesh raise errors of many types
         raise InputError(
             f"{path}: cannot be read as a mesh, it seems damaged; needed: {_NEEDED}."
         ) from error
     parts = [part for part in parts if len(part.vertices_world)]
     if not parts:
-        raise InputError(f"{path}: holds no vertices; needed: a mesh or a point cloud.")
+        raise InputError(f"{path}: has no vertices; needed: a mesh or a point cloud.")
     mesh = _joined(parts)
     if not bool(mesh.vertices_world.isfinite().all()):
-        raise InputError(f"{path}: some vertices are not finite; needed: numbers throughout.")
+        raise InputError(f"{path}: some vertices are not finite; needed: finite coordinates.")
     if found := out_of_range(mesh.faces, len(mesh.vertices_world)):
         raise InputError(
             f"{path}: the corners of its faces {found}; needed: indices of its "
@@ -169,19 +169,19 @@ def read_mesh(path: Path | str) -> Mesh:
 def write_glb(
     mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET, measured: FaceMask | None = None
 ) -> None:
-    """Write a binary glTF of the same frame, normals and colours as the PLY.
+    """Write a binary glTF with the frame, normals and colours of the PLY.
 
-    glTF has no doubles in its buffers: vertices stay near the origin, and their node's
-    ``translation``, which is text, has the offset in full. Programs that follow it in single
-    precision, as Blender does, place the model to its rounding and keep its shape.
+    glTF has no doubles in its buffers: vertices stay near the origin, and the ``translation`` of
+    their node, which is text, is the exact offset. Programs that apply it in single precision,
+    such as Blender, round the position of the model and keep its shape.
 
-    glTF's colours are linear, so these are albedo itself; the material is matte and seen from both
-    sides. glTF's y is up: viewers show the model as it is oriented in the world frame of structure
-    from motion, whose up is arbitrary.
+    glTF's colours are linear, so they are the albedo; the material is matte and double-sided.
+    glTF's y is up: viewers show the model in the world frame of structure from motion, whose up
+    direction is arbitrary.
 
     Args:
-        offset_world: Of the node; see ``SparseScene.offset_world``.
-        measured: The attribute ``_MEASURED`` is 0 at vertices of no such face.
+        offset_world: Translation of the node; see ``SparseScene.offset_world``.
+        measured: The attribute ``_MEASURED`` is 0 at vertices without such a face.
     """
     attributes = {"POSITION": mesh.vertices_world, "NORMAL": carried_normals(mesh)}
     if mesh.albedo is not None:
@@ -198,17 +198,17 @@ def write_glb(
 
 
 def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
-    """Write a binary STL: triangles alone, without vertices that faces share.
+    """Write a binary STL: only triangles, without shared vertices.
 
-    STL has no doubles: of a mesh far from the origin, vertices stay near it.
+    STL has no doubles, so vertices stay near the origin.
 
     Args:
-        offset_world: Written into the file's header; see ``SparseScene.offset_world``.
+        offset_world: Written to the header, not added; see ``SparseScene.offset_world``.
     """
     corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
     normals = unit_face_normals(mesh.vertices_world, mesh.faces).detach().cpu()
-    kind = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
-    triangles = np.zeros(len(corners), kind)
+    triangle_type = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+    triangles = np.zeros(len(corners), triangle_type)
     triangles["normal"], triangles["corners"] = normals.numpy(), corners.numpy()
     header = b"pimper_torch"
     if offset_world != NO_OFFSET:
@@ -221,11 +221,11 @@ def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
 def write_obj(
     mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET, measured: FaceMask | None = None
 ) -> None:
-    """Write an OBJ: vertex normals, and albedo as sRGB colour behind each position.
+    """Write an OBJ with vertex normals, and albedo as sRGB colour after each position.
 
     Args:
         offset_world: Added to the vertices; see ``SparseScene.offset_world``.
-        measured: The other faces are in a group ``caps`` of their own.
+        measured: All other faces are in a separate group ``caps``.
     """
     rows = mesh.vertices_world.detach().cpu().double() + torch.tensor(offset_world).double()
     if mesh.albedo is not None:
@@ -245,11 +245,10 @@ def write_obj(
 
 
 def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401 - untyped
-    """Take over one part of what trimesh loaded, put where the scene has it."""
+    """Convert a part of a trimesh scene, transformed by its pose in the scene."""
     scene_from_part = torch.tensor(np.asarray(pose), dtype=torch.float64)
     faces = torch.tensor(np.asarray(getattr(part, "faces", ())).reshape(-1, 3)).long()
-    # Asked for normals that the file does not have, trimesh computes some; those of the file
-    # are in its cache.
+    # trimesh computes normals that a file lacks; those of the file are in its cache.
     normals = _rows(part._cache.cache.get("vertex_normals"))
     colors = getattr(part, "colors", None)
     if len(faces):
@@ -262,9 +261,9 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
         encoded = encoded[:, :3] / (np.iinfo(kind).max if kind.kind in "ui" else 1)
     vertices = np.asarray(part.vertices, dtype=np.float64).reshape(-1, 3)
     raw = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
-    written = getattr(getattr(raw, "dtype", None), "names", None) or raw
-    known = {name: _rows(raw[name]) if name in written else None for name in _ERRORS}
-    if normals is None and {"nx", "ny", "nz"} <= set(written):  # of a cloud, trimesh drops them
+    columns = getattr(getattr(raw, "dtype", None), "names", None) or raw
+    errors = {name: _rows(raw[name]) if name in columns else None for name in _ERRORS}
+    if normals is None and {"nx", "ny", "nz"} <= set(columns):  # trimesh drops those of a cloud
         normals = _rows(np.stack([np.ravel(raw[axis]) for axis in ("nx", "ny", "nz")], axis=1))
     return Mesh(
         vertices_world=transform(scene_from_part, torch.tensor(vertices)),
@@ -273,63 +272,63 @@ def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401
         if normals is None
         else normalize(rotate(scene_from_part, normals), dim=-1),
         albedo=encoded if linear or encoded is None else linear_from_srgb(encoded),
-        **{name: None if one is None else one.reshape(-1) for name, one in known.items()},
+        **{name: None if rows is None else rows.reshape(-1) for name, rows in errors.items()},
     )
 
 
 def _rows(values: Any) -> Tensor | None:  # noqa: ANN401 - untyped
     if values is None or len(values) == 0:
         return None
-    # A column of a file's records has a stride that torch does not know.
+    # A copy, as torch does not support the stride of a column of records.
     return torch.from_numpy(np.array(values, dtype=np.float64))
 
 
 def _joined(parts: Sequence[Mesh]) -> Mesh:
-    """Put parts in one mesh; what not every part has, or is not finite throughout, is dropped."""
+    """Merge parts to one mesh, with attributes that are complete and finite in every part."""
     starts = accumulate((len(part.vertices_world) for part in parts), initial=0)
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
-    known: dict[str, Tensor] = {}
+    attributes: dict[str, Tensor] = {}
     for name in ("normals_world", "albedo", *_ERRORS):
         values = [getattr(part, name) for part in parts]
-        if all(one is not None and not not_finite(one) for one in values):
-            known[name] = torch.cat(values)
+        if all(value is not None and not not_finite(value) for value in values):
+            attributes[name] = torch.cat(values)
     return Mesh(
         vertices_world=torch.cat([part.vertices_world for part in parts]),
         faces=torch.cat(faces),
-        **known,
+        **attributes,
     )
 
 
-# glTF's name for vertex colours, and one whose values trimesh takes over unchanged: those of the
-# first it rounds to 8 bits, or cuts to them.
+# glTF's name of vertex colours, which trimesh rounds or truncates to 8 bits, and a name for which it
+# does not.
 _COLORS, _RAW_COLORS = "COLOR_0", "_COLOR_0"
 
 
 def _readable(path: Path, suffix: str) -> bytes:
-    """Return a file's bytes so that trimesh reads all that they hold."""
+    """Return a file's bytes, changed so that trimesh reads all attributes, after checks."""
     data = path.read_bytes()
     if suffix == ".glb":
         return _with_raw_colors(path, data)
     header, _, body = data.partition(b"end_header")
     if suffix == ".ply" and b"format ascii" in header:
         counts = re.findall(rb"^element \S+ (\d+)", header, re.MULTILINE)
-        told, rows = sum(map(int, counts)), len(body.strip().splitlines())
-        if told > rows:
+        stated, rows = sum(map(int, counts)), len(body.strip().splitlines())
+        if stated > rows:
             raise InputError(
-                f"{path}: cannot be read as a mesh, it says that it holds {told} rows, but has "
+                f"{path}: cannot be read as a mesh, its header states {stated} rows, but it has "
                 f"{rows}. Export it again."
             )
     return data
 
 
 def _with_raw_colors(path: Path, data: bytes) -> bytes:
-    """Rename the colours of surfaces in a GLB file; trimesh reads no other attributes of points."""
+    """Rename colours in a GLB file, except of points, whose custom attributes trimesh drops."""
     length, size = struct.unpack_from("<2I", data, 8)
     tree = json.loads(data[20 : 20 + size])
-    if any("sparse" in one or "bufferView" not in one for one in tree.get("accessors", [])):
+    if any("sparse" in item or "bufferView" not in item for item in tree.get("accessors", [])):
         raise InputError(
-            f"{path}: cannot be read as a mesh, it has values that are not in the file itself "
-            "(sparse, or compressed). Export it without compression."
+            f"{path}: cannot be read as a mesh, its values are sparse or compressed. Export it "
+            "without compression."
         )
     for mesh in tree.get("meshes", []):
         for part in mesh["primitives"]:

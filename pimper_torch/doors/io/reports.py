@@ -1,4 +1,4 @@
-"""Results of a run in numbers: lights and the summary, ready for JSON."""
+"""Lights and summary of a run, as content of JSON files."""
 
 import json
 import math
@@ -15,23 +15,22 @@ from pimper_torch.ground.geometry.rigid import rotate
 from pimper_torch.published.seams import by_facet
 from pimper_torch.records import Failure, Reconstruction, Relighting
 
-# What JSON can hold.
-Report = dict[str, object]
+Report = dict[str, object]  # a JSON object
 
 
 def write_json(report: Mapping[str, object], path: Path | str, indent: int | None = 2) -> None:
-    """Write numbers and texts, none of which may be NaN or infinite."""
+    """Write a JSON file; ``ValueError`` for numbers that are NaN or infinite."""
     text = json.dumps(report, indent=indent, allow_nan=False, ensure_ascii=False)
     Path(path).write_text(text + "\n", encoding="utf-8")
 
 
 def lights_report(result: Reconstruction) -> Report:
-    """Report the light of every view, for each patch and for all of them together.
+    """Return the content of ``lights.json``: the light of every view, per patch and in common.
 
     Lights are first-order harmonics ``l`` in the world frame: radiance is
-    ``albedo * (l[0] + l[1:] . n)`` with ``n`` the outward unit normal. A patch that a view
-    does not have is ``null`` there. A view's one light leaves out such patches, and those
-    whose light varied too little for a factorization; see :func:`common_lights`.
+    ``albedo * (l[0] + l[1:] . n)`` with ``n`` the outward unit normal. The light is ``null`` for a
+    patch without samples in the view. The common light of a view excludes such patches, and
+    those with too little variation of the light for a factorization; see :func:`common_lights`.
     """
     facets, lights_world, determined = world_lights(result)
     lit = (lights_world != 0).any(dim=-1)
@@ -51,13 +50,13 @@ def lights_report(result: Reconstruction) -> Report:
         "patches": [
             {
                 "facet": int(facet),
-                "determined": bool(known),
+                "determined": bool(is_determined),
                 "lights": [
-                    _rounded(light) if bool(there) else None
-                    for light, there in zip(lights, here, strict=True)
+                    _rounded(light) if bool(is_lit) else None
+                    for light, is_lit in zip(lights, lit_views, strict=True)
                 ],
             }
-            for facet, known, lights, here in zip(
+            for facet, is_determined, lights, lit_views in zip(
                 facets, determined, lights_world, lit, strict=True
             )
         ],
@@ -65,35 +64,35 @@ def lights_report(result: Reconstruction) -> Report:
 
 
 def common_lights(result: Reconstruction) -> tuple[Float[Tensor, "view 4"], Int[Tensor, " view"]]:
-    r"""Find the one light of every view that shades all patches most nearly as their own do.
+    r"""Return the light of every view that best reproduces the shading of its patches' lights.
 
-    A patch that is nearly flat determines its light only along its normal, so lights are weighted
-    by what they were determined from: minimised is :math:`\sum_p \sum_s \rho_s^2 ((l - l_p)
-    \cdot (1, n_s))^2` over the valid samples. What they leave open together is the mean's.
+    A patch that is nearly flat determines its light only along its normal, so the fit minimizes
+    :math:`\sum_p \sum_s \rho_s^2 ((l - l_p) \cdot (1, n_s))^2` over the valid samples. Components
+    that these do not determine are those of the mean light.
 
     Returns:
-        The lights, world frame, and of how many patches each is; zero where of none.
+        The lights in the world frame, and the number of patches of each; zero without patches.
     """
     _, lights_world, determined = world_lights(result)
     counted = ((lights_world != 0).any(dim=-1) & determined[:, None]).double()
     counts = counted.sum(dim=0)
     lights = lights_world.double()
     mean = (lights * counted[..., None]).sum(dim=0) / counts[:, None].clamp_min(1)
-    weight = _determined_by(result)
-    known = torch.einsum("pij,pv->vij", weight, counted)
-    regularization = torch.einsum("pij,pvj->vi", weight, counted[..., None] * (lights - mean))
-    # What samples see with a millionth of the best seen direction is left open.
-    step = torch.linalg.pinv(known, rtol=1e-6, hermitian=True) @ regularization[..., None]
+    weight = _normal_matrices(result)
+    matrix = torch.einsum("pij,pv->vij", weight, counted)
+    residual = torch.einsum("pij,pvj->vi", weight, counted[..., None] * (lights - mean))
+    # Directions with less than a millionth of the largest eigenvalue are undetermined.
+    step = torch.linalg.pinv(matrix, rtol=1e-6, hermitian=True) @ residual[..., None]
     return (mean + step[..., 0]).to(lights_world), counts.long()
 
 
-def _determined_by(result: Reconstruction) -> Float[Tensor, "patch 4 4"]:
-    """Sum ``rho^2 (1, n) (1, n)^T`` over each patch's samples, world frame, order of facets."""
+def _normal_matrices(result: Reconstruction) -> Float[Tensor, "patch 4 4"]:
+    """Sum ``rho^2 (1, n) (1, n)^T`` over samples of each patch, world frame, in facet order."""
     photometric = result.patches.photometric
     sums = []
-    for templates, found in zip(photometric.patches.buckets, photometric.buckets, strict=True):
-        weight = found.albedo.double().mean(dim=-1).square() * found.valid
-        normals = rotate(templates.patch_from_world.mT, found.normals_patch.flatten(1, 2)).double()
+    for templates, bucket in zip(photometric.patches.buckets, photometric.buckets, strict=True):
+        weight = bucket.albedo.double().mean(dim=-1).square() * bucket.valid
+        normals = rotate(templates.patch_from_world.mT, bucket.normals_patch.flatten(1, 2)).double()
         shading = torch.cat([torch.ones_like(normals[..., :1]), normals], dim=-1)
         sums.append(shading.mT @ (weight.flatten(1)[..., None] * shading))
     return by_facet(photometric.patches, sums)
@@ -102,30 +101,30 @@ def _determined_by(result: Reconstruction) -> Float[Tensor, "patch 4 4"]:
 def world_lights(
     result: Reconstruction,
 ) -> tuple[Int[Tensor, " patch"], Float[Tensor, "patch view 4"], Bool[Tensor, " patch"]]:
-    """Turn the lights of all patches to the world frame.
+    """Return the lights of all patches in the world frame.
 
     ``l . (1, R n) = (l_0, R^T l_xyz) . (1, n)`` for ``R`` from world to patch.
 
     Returns:
-        In the order of the facets: the facet, its lights, whether they were determined.
+        In the order of facets: the facets, their lights, whether these were determined.
     """
     patches, buckets = result.patches.photometric.patches, result.patches.photometric.buckets
     lights = []
-    for templates, found in zip(patches.buckets, buckets, strict=True):
+    for templates, bucket in zip(patches.buckets, buckets, strict=True):
         world_from_patch = templates.patch_from_world.mT  # only its rotation is used
-        directed = rotate(world_from_patch, found.lights_patch[..., 1:4])
-        own = torch.cat([found.lights_patch[..., :1], directed], dim=-1)
-        lights.append(templates.among_all(own))
+        directed = rotate(world_from_patch, bucket.lights_patch[..., 1:4])
+        rotated = torch.cat([bucket.lights_patch[..., :1], directed], dim=-1)
+        lights.append(templates.among_all(rotated))
     facets = by_facet(patches, (templates.facet for templates in patches.buckets))
-    determined = by_facet(patches, (found.determined for found in buckets))
+    determined = by_facet(patches, (bucket.determined for bucket in buckets))
     return facets, by_facet(patches, lights), determined
 
 
 def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Report:
-    """Count what went in and came out, and what every stage cost.
+    """Return ``summary.json``: sizes of inputs and results, and figures of every stage.
 
     Args:
-        about: More entries, such as the folder of the photographs.
+        about: Additional entries, such as the folder of the photographs.
     """
     scene = result.scene
     figures = {key: value for report in result.report for key, value in report.figures.items()}
@@ -134,7 +133,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
     ends = [bucket.convergence for bucket in buckets]
     patches = sum(len(end.converged) for end in ends)
     undetermined = sum(int((~bucket.determined).sum()) for bucket in buckets)
-    # Peaks are of the process so far: the first that reaches the highest raised it.
+    # Peaks are cumulative: the first stage with the highest peak caused it.
     peak = max(result.report, key=lambda report: report.peak_memory_mb, default=None)
     return {
         "pimper_torch": installed_version(),
@@ -144,7 +143,7 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
         "registered": scene.views.num_views,
         "unregistered": list(scene.unregistered),
         "diagnosis": scene.diagnosis or None,
-        "doubt": scene.diagnosis or None,  # its name until 0.9
+        "doubt": scene.diagnosis or None,  # the name until version 0.9
         "offset_world": list(scene.offset_world),
         "failures": _failures(result.failures),
         "left_out": [asdict(entry) for entry in result.left_out],
@@ -178,13 +177,13 @@ def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Repor
 
 
 def _failures(failures: Sequence[Failure]) -> list[Report]:
-    """List failures of one kind and reason together, by the names of what failed."""
+    """Group failures with the same kind and reason, and list the names of each group."""
     names: dict[tuple[str, str, str, str], list[str]] = {}
     for each in failures:
         names.setdefault((each.stage, each.what, each.reason, each.done), []).append(each.name)
     return [
-        {"stage": stage, "what": what, "names": some, "reason": reason, "done": done}
-        for (stage, what, reason, done), some in names.items()
+        {"stage": stage, "what": what, "names": group, "reason": reason, "done": done}
+        for (stage, what, reason, done), group in names.items()
     ]
 
 
@@ -193,29 +192,29 @@ def _finite(value: float | int) -> float | int | None:
 
 
 def _rounded(light: Float[Tensor, " 4"]) -> list[float | None]:
-    """Keep six digits, more than any photograph determines."""
+    """Round to six digits, more than photographs determine."""
     return [_finite(float(f"{value:.6g}")) for value in light.tolist()]
 
 
-def relighting_report(found: Relighting) -> dict[str, object]:
-    """Return the entry ``relighting`` of ``summary.json``: lights and materials."""
-    vertices = torch.bincount(found.materials.cluster, minlength=len(found.materials.metallic))
+def relighting_report(fit: Relighting) -> dict[str, object]:
+    """Return the entry ``relighting`` of ``summary.json``: prediction errors and materials."""
+    vertices = torch.bincount(fit.materials.cluster, minlength=len(fit.materials.metallic))
     shares = (vertices / vertices.sum()).tolist()
-    rows = zip(shares, found.materials.values.tolist(), strict=True)
-    decibels = [one.psnr_db.tolist() for one in (found.errors, found.matte)]
-    errors = zip(found.errors.names, *decibels, strict=True)
+    rows = zip(shares, fit.materials.values.tolist(), strict=True)
+    decibels = [errors.psnr_db.tolist() for errors in (fit.errors, fit.matte)]
+    errors = zip(fit.errors.names, *decibels, strict=True)
     return {
-        "photographs": "held out" if found.held_out else "used",
-        "psnr_db": _mean(found.errors.psnr_db),
-        "psnr_matte_db": _mean(found.matte.psnr_db),
-        "psnr_textured_db": None if found.textured is None else _mean(found.textured.psnr_db),
+        "photographs": "held out" if fit.held_out else "used",
+        "psnr_db": _mean(fit.errors.psnr_db),
+        "psnr_matte_db": _mean(fit.matte.psnr_db),
+        "psnr_textured_db": None if fit.textured is None else _mean(fit.textured.psnr_db),
         "views": [
             {
                 "name": name,
-                "psnr_db": _finite(round(with_one, 3)),
-                "psnr_matte_db": _finite(round(without, 3)),
+                "psnr_db": _finite(round(psnr, 3)),
+                "psnr_matte_db": _finite(round(matte, 3)),
             }
-            for name, with_one, without in errors
+            for name, psnr, matte in errors
         ],
         "materials": [
             {"vertices": share, "metallic": metal, "roughness": rough, "specular": specular}

@@ -1,4 +1,4 @@
-"""Results to a folder."""
+"""Writing of result folders."""
 
 import time
 from collections.abc import Mapping
@@ -58,8 +58,8 @@ RESULT_NAMES = (
     "turn.webp",
     "report.html",
 )
-"""Files of a result, and nothing else; a table in the manual describes them."""
-_PARTS = 6  # of the bar: meshes, asset, maps, sheet, turning picture, page
+"""All files of a result; a table in the manual describes them."""
+_PARTS = 6  # of the progress bar: meshes, asset, maps, overview, turntable, page
 
 
 def write_result(
@@ -72,31 +72,31 @@ def write_result(
     files: MeshFiles | None = None,
     report: bool = True,
 ) -> None:
-    """Write everything a run found into a folder: the files of :data:`RESULT_NAMES`.
+    """Write a result to a folder: the files of :data:`RESULT_NAMES`.
 
-    Everything is in the frame of the cameras that the photographs came with; ``summary.json`` has
-    the ``offset_world`` that was added to the frame of the run, zero unless they are far from their
-    origin. The PLY then has doubles, and the mesh's GLB the offset as its node's translation.
-    The asset alone stands upright on the origin; its ``extras`` undo that.
+    All files are in the frame of the given cameras; ``summary.json`` has the ``offset_world`` that
+    was added to the frame of the run, zero unless the cameras are far from their origin. If it is
+    not zero, the PLY has doubles, and the mesh's GLB has the offset as translation of its node.
+    Only the asset is upright on the origin; its ``extras`` have the inverse transform.
 
     The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's
     spacing of it, its normal within 1.5 degrees, and its colour, confidence and expected error
-    within :func:`~pimper_torch.result.asset.finish.written_channels` of what is blended there
-    (``summary.json`` tells how far off they are). ``files`` asks for every vertex, or for fewer.
-    The pictures show what is written, but for the caps of a mesh that shall be watertight: those
-    are not measured. Faces of the PLY and the OBJ, and vertices of the GLB, say which they are.
+    within :func:`~pimper_torch.result.asset.finish.written_channels` of the interpolated values
+    (``summary.json`` has the errors). ``files`` selects all vertices, or fewer. The images show the
+    written mesh, except the caps of a watertight mesh, which are not measured. Faces of the PLY and
+    the OBJ, and vertices of the GLB, are marked as measured or not.
 
-    The folder is replaced as a whole, or not at all; see
+    The folder is replaced completely or not at all; see
     :func:`pimper_torch.doors.result_folder.folders.written_whole`.
 
     Args:
-        config: The dataclass of settings that it ran with.
-        folder: New or empty; its parents are made.
-        files: How many faces the mesh has, and in which formats; of a result that is not finished
-            yet, see :meth:`~pimper_torch.method.chains.chain.Chain.finish`.
+        config: Dataclass of the settings of the run.
+        folder: New or empty; its parents are created.
+        files: Number of faces and formats of the mesh, for a result without ``finished``; see
+            :meth:`~pimper_torch.method.chains.chain.Chain.finish`.
 
     Raises:
-        OutputError: The folder holds something else, or cannot be written.
+        OutputError: The folder contains other files, or cannot be written.
     """
     folder, began = Path(folder), time.perf_counter()
     files = files or MeshFiles()
@@ -107,12 +107,12 @@ def write_result(
         assert ready is not None
         assert asset is not None
         assert relighting is not None
-        whole = result.replace(mesh=ready.mesh)
+        written = result.replace(mesh=ready.mesh)
         with part(0, _PARTS):
             mesh, measured = ready.mesh, None
             if ready.closed is not None:
                 mesh, measured = ready.closed.mesh, ready.closed.measured
-            offset = whole.scene.offset_world
+            offset = written.scene.offset_world
             write_ply(mesh, staging / "mesh.ply", offset, measured)
             write_glb(mesh, staging / "mesh.glb", offset, measured)
             if "stl" in files.formats:
@@ -120,22 +120,22 @@ def write_result(
             if "obj" in files.formats:
                 write_obj(mesh, staging / "mesh.obj", offset, measured)
         with part(1, _PARTS):
-            placement = _placement(whole, asset, files, folder.absolute().name, about or {})
+            placement = _placement(written, asset, files, folder.absolute().name, about or {})
             write_asset(asset, staging / "asset.glb", placement, files.texture)
             if "usdz" in files.formats:
                 write_usdz(asset, staging / "asset.usdz", placement)
             if "obj" in files.formats:
                 write_asset_obj(asset, staging / "asset.obj", placement)
-        _write_all(whole, config, staging)
+        _write_all(written, config, staging)
         writing = reported("write", time.perf_counter() - began)
-        found = result.replace(report=(*result.report, writing))
+        timed = result.replace(report=(*result.report, writing))
         summary = {
-            **reports.summary_report(found, about or {}),
+            **reports.summary_report(timed, about or {}),
             **({ready.how: ready.counts} if ready.how else {}),
             **({"caps": ready.caps} if ready.caps else {}),
             "asset": asset.summary,
             "relighting": reports.relighting_report(relighting),
-            "thumbnails": thumbnails(whole.scene.views),
+            "thumbnails": thumbnails(written.scene.views),
         }
         reports.write_json(summary, staging / "summary.json")
         with part(5, _PARTS):
@@ -146,13 +146,13 @@ def write_result(
                     mesh=ready.mesh,
                     asset=asset_within(asset, staging / "asset.glb", placement),
                     surface=asset.mesh,
-                    scene=whole.scene,
-                    silhouettes=whole.silhouettes,
-                    reference=whole.coarse.reference,
-                    predictions=predictions(ready.few, whole.scene, relighting),
+                    scene=written.scene,
+                    silhouettes=written.silhouettes,
+                    reference=written.coarse.reference,
+                    predictions=predictions(ready.few, written.scene, relighting),
                     summary=summary,
                     settings=read_mapping(staging / "config.yaml"),
-                    lights_world=read_lights(staging / "lights.json", whole.scene.views.names),
+                    lights_world=read_lights(staging / "lights.json", written.scene.views.names),
                 )
 
 
@@ -163,7 +163,7 @@ def _placement(
     name: str,
     about: Mapping[str, Any],
 ) -> Placement:
-    """Return the place of an asset in its files; of known size if ``about`` names the unit."""
+    """Return the placement of an asset in its files, in metres if ``about`` has the unit."""
     cameras, unit = result.cameras, (about.get("scale") or {}).get("unit")
     metre = None if unit is None else MILLIMETRES["m"] / MILLIMETRES[unit]
     up, reference = up_world(cameras), result.coarse.reference
@@ -180,13 +180,13 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
         (folder / "masks").mkdir()
-        views, sizes = each(result.silhouettes.shown), result.cameras.sizes_px.tolist()
+        masks, sizes = each(result.silhouettes.shown), result.cameras.sizes_px.tolist()
         names = result.scene.views.names
-        for name, (shown,), (width, height) in zip(names, views, sizes, strict=True):
-            drawn = shown[:height, :width].to(torch.uint8) * 255
+        for name, (mask,), (width, height) in zip(names, masks, sizes, strict=True):
+            levels = mask[:height, :width].to(torch.uint8) * 255
             path = mask_path(folder / "masks", name)
             path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(drawn.numpy()).save(path)
+            Image.fromarray(levels.numpy()).save(path)
     with part(2, _PARTS):
         _write_maps(result, folder)
     reports.write_json(reports.lights_report(result), folder / "lights.json", indent=None)

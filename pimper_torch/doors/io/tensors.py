@@ -1,4 +1,4 @@
-"""A scene from tensors or arrays at hand: photographs, cameras, and what else is known."""
+"""Scenes from tensors or arrays of photographs, cameras and points."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.runtime.errors import InputError, caution
 
 _DECODED = (
-    " Bytes hold sRGB as a rule: `radiometry.linear_from_srgb(images / 255)` decodes them, "
+    " Bytes are usually sRGB: `radiometry.linear_from_srgb(images / 255)` decodes them, "
     "`load_views` reads files."
 )
 Array = Tensor | np.ndarray | Sequence[object]
@@ -33,43 +33,43 @@ def scene_of(
     masks: Array | None = None,
     names: Sequence[str] | None = None,
 ) -> SparseScene:
-    """Make a scene of photographs without distortion and known cameras.
+    """Return a scene with undistorted photographs and known cameras.
 
-    Takes tensors, numpy arrays or nested lists. A chain takes the scene in the place of
-    photographs, and structure from motion does not run.
+    Arguments are tensors, numpy arrays or nested lists. A chain accepts the scene instead of
+    photographs, and then does not run structure from motion.
 
     Args:
         images: Linear radiance, ``view channel height width``; 1 is where the sensor saturates.
-            Bytes, and values to 255, are refused: decode them to linear radiance first.
+            Bytes, and values up to 255, are an error: convert them to linear radiance first.
         intrinsics: ``K`` of every view, ``view 3 3``, or one for all, ``3 3``; in pixels, the
             centre of the top-left pixel at (0.5, 0.5).
         cam_from_world: ``view 4 4`` or ``view 3 4``, rigid; camera axes x right, y down, z forward.
-        points_world: A cloud, ``point 3``; none unless given. A chain then triangulates points with
-            the cameras held fixed, unless a mesh comes with the scene.
-        observed: Which view sees which point, ``point view``. Without it, every view that has a
-            point in its frame and, where there are masks, on the object.
+        points_world: A cloud, ``point 3``; by default empty. A chain then triangulates points with
+            the cameras held fixed, unless a mesh is given.
+        observed: Which point is visible in which view, ``point view``; by default in every view
+            that has it in the frame and, with masks, on the object.
         masks: True on the object, ``view height width``.
-        names: Of the views; numbers unless given.
+        names: Names of the views; by default numbers.
 
     Returns:
-        A scene of the images' floating-point type and device. Where cameras stand far from the
-        origin it is shifted there, see ``SparseScene.offset_world``: give them in float64.
+        A scene with the floating-point type and device of the images. Cameras far from the origin
+        are shifted there, see ``SparseScene.offset_world``: give them in float64.
 
     Raises:
-        InputError: A shape or a value that means nothing, or cameras that look the wrong way.
+        InputError: Invalid shapes or values, or cameras that look away from the points.
     """
-    pictures = _floats(images, "images", "linear radiance, view channel height width")
-    _check_radiance(pictures)
-    count, _, height, width = pictures.shape
-    sizes = torch.tensor([[width, height]]).repeat(count, 1).to(pictures.device)
+    radiance = _floats(images, "images", "linear radiance, view channel height width")
+    _check_radiance(radiance)
+    count, _, height, width = radiance.shape
+    sizes = torch.tensor([[width, height]]).repeat(count, 1).to(radiance.device)
     views = Views(
-        images=pictures,
+        images=radiance,
         sizes_px=sizes,
         names=tuple(names) if names is not None else tuple(f"{view:03d}" for view in range(count)),
-        masks=None if masks is None else torch.as_tensor(masks).to(pictures.device).bool(),
-        focals_px=torch.full_like(pictures[:, 0, 0, 0], torch.nan),
+        masks=None if masks is None else torch.as_tensor(masks).to(radiance.device).bool(),
+        focals_px=torch.full_like(radiance[:, 0, 0, 0], torch.nan),
     )
-    matrices = _floats(intrinsics, "intrinsics", "K in pixels").to(pictures)
+    matrices = _floats(intrinsics, "intrinsics", "K in pixels").to(radiance)
     poses = _floats(_digits(cam_from_world), "cam_from_world", "rigid matrices")
     if poses.shape[1:] == (3, 4):
         poses = rigid(poses[..., :3], poses[..., 3])
@@ -82,22 +82,22 @@ def scene_of(
     if offset != NO_OFFSET:
         poses = to_local(poses.double(), offset)
         points = points.double() - points.new_tensor(offset, dtype=torch.float64)
-    poses, points = poses.to(pictures), points.to(pictures)
+    poses, points = poses.to(radiance), points.to(radiance)
     cameras = Cameras(
         intrinsics=matrices.expand(count, 3, 3) if matrices.shape == (3, 3) else matrices,
         cam_from_world=poses,
         sizes_px=sizes,
     )
-    pixels, seen = _observations(points, cameras, views)
+    pixels, visible = _observations(points, cameras, views)
     if observed is not None:
-        given = torch.as_tensor(observed).to(pictures.device).bool()
-        if given.shape != seen.shape:
+        given = torch.as_tensor(observed).to(radiance.device).bool()
+        if given.shape != visible.shape:
             raise InputError(
-                f"observed has shape {tuple(given.shape)}; needed: {tuple(seen.shape)}, a row a "
-                "point, a column a view."
+                f"observed has shape {tuple(given.shape)}; needed: {tuple(visible.shape)}, a row "
+                "per point, a column per view."
             )
-        seen = given
-    point, view = seen.nonzero(as_tuple=True)
+        visible = given
+    point, view = visible.nonzero(as_tuple=True)
     scene = SparseScene(
         views=views,
         cameras=cameras,
@@ -108,32 +108,32 @@ def scene_of(
         observation_pixels=pixels[view, point],
         lenses=pinhole_lenses(cameras),
         offset_world=offset,
-    ).to(pictures.device)
+    ).to(radiance.device)
     scene.check("scene_of")
     return scene
 
 
 def _check_radiance(images: Tensor) -> None:
-    """Refuse images of another layout or range; warn of those that look coded."""
+    """Raise an error for images with a different layout or range; warn if they look like bytes."""
     shape = tuple(images.shape)
     if images.ndim != 4 or shape[1] not in (1, 3):
         last = images.ndim == 4 and shape[3] in (1, 3)
-        told = " Channels come last: call `images.permute(0, 3, 1, 2)`." if last else ""
+        hint = " The last axis is the channel: call `images.permute(0, 3, 1, 2)`." if last else ""
         raise InputError(
-            f"images has shape {shape}; needed: view channel height width, 1 or 3 channels.{told}"
+            f"images has shape {shape}; needed: view channel height width, 1 or 3 channels.{hint}"
         )
     above, lit = (int((images > bound).sum()) for bound in (1, 0))
     if 2 * above > lit:  # highlights of rendered images are fewer
         raise InputError(
-            f"images reach {float(images.detach().max()):.6g}, {above / lit:.0%} of what is not "
-            "black is above 1; needed: linear radiance, of which 1 is where the sensor saturates: "
-            f"divide them by it.{_DECODED}"
+            f"images have values up to {float(images.detach().max()):.6g}, and {above / lit:.0%} "
+            "of pixels that are not black are above 1; needed: linear radiance with 1 where the "
+            f"sensor saturates: divide by this value.{_DECODED}"
         )
     step = math.ceil((images.numel() / 1e5) ** 0.5) or 1
     levels = images.detach()[..., ::step, ::step].float() * 255
     if len(torch.unique(levels)) > 16 and bool(((levels - levels.round()).abs() < 1e-3).all()):
         caution(
-            "images are whole 255ths, as bytes are, which hold sRGB as a rule; needed: linear "
+            "images are multiples of 1/255, like bytes, which are usually sRGB; needed: linear "
             "radiance. Decode them: `radiometry.linear_from_srgb(images)`.",
             stacklevel=3,
         )
@@ -150,20 +150,20 @@ def _floats(values: Array, name: str, what: str) -> Tensor:
 
 
 def _digits(values: Array) -> Tensor | np.ndarray:
-    """Keep all digits of numbers in lists, of which torch keeps those of single precision."""
+    """Return lists as float64 arrays, as torch would convert them to single precision."""
     return values if isinstance(values, Tensor) else np.asarray(values)
 
 
 def _observations(
     points: Points, cameras: Cameras, views: Views
 ) -> tuple[Float[Tensor, "view point 2"], Bool[Tensor, "point view"]]:
-    """Project the cloud, and mark where it falls into the frame, and onto the object."""
+    """Return projections of the cloud, and which points are in the frame and on the object."""
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px[:, None]
-    seen = (depth > 0) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
+    visible = (depth > 0) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
     if views.masks is not None:
         column, row = pixels.nan_to_num().clamp(-1, 1e6).long().unbind(dim=-1)
         height, width = views.masks.shape[-2:]
         view = torch.arange(len(pixels), device=pixels.device)[:, None]
-        seen &= views.masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
-    return pixels, seen.mT
+        visible &= views.masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return pixels, visible.mT

@@ -1,4 +1,4 @@
-"""Photographs in 64 grey levels each, by which a result knows them again."""
+"""Thumbnails of 8x8 grey levels, by which a result recognizes its photographs."""
 
 import re
 from collections.abc import Mapping
@@ -13,56 +13,56 @@ from pimper_torch.runtime.mapped import each
 
 _SIDE = 8
 _WRITTEN = re.compile(f"[0-9a-f]{{{2 * _SIDE**2}}}")
-# Root mean square, in levels of 255. The demo's photographs differ from themselves by 0.7 at most
-# as PNG, as JPEG of quality 50 or at half the size, and from one another by 11 at least.
+# Root mean square difference, in levels of 255. The demo's photographs differ by at most 0.7 from
+# their versions as PNG, JPEG of quality 50 or half the size, and by at least 11 from each other.
 _SAME = 2.0
 
 
 def thumbnails(views: Views) -> dict[str, str]:
-    """Average each photograph over 8x8 fields: grey levels in 8-bit sRGB, two digits each.
+    """Return the thumbnail of each photograph: 8x8 grey levels in 8-bit sRGB, in hexadecimal.
 
-    Averages are of linear radiance, which neither a resize nor another format changes.
+    Averages are of linear radiance, which resizing and conversion of the format do not change.
     """
-    found = {}
+    digits = {}
     sizes = views.sizes_px.tolist()
     for name, (image,), (width, height) in zip(views.names, each(views.images), sizes, strict=True):
         grey = image[:, :height, :width].detach().mean(dim=0, keepdim=True)
-        found[name] = bytes(to_bytes(adaptive_avg_pool2d(grey, _SIDE)).flatten().tolist()).hex()
-    return found
+        digits[name] = bytes(to_bytes(adaptive_avg_pool2d(grey, _SIDE)).flatten().tolist()).hex()
+    return digits
 
 
 def compare_thumbnails(views: Views, known: Mapping[str, str], where: str) -> None:
-    """Refuse photographs that have each other's names, and warn of those that look different.
+    """Raise an error if names of photographs were exchanged, and warn if photographs changed.
 
     Args:
-        views: Photographs as they are now.
-        known: What :func:`thumbnails` returned of them before.
-        where: The photographs, at the start of a sentence.
+        views: Current photographs.
+        known: Result of :func:`thumbnails` for the previous photographs.
+        where: Subject of the messages: the photographs.
 
     Raises:
-        InputError: A photograph looks like another one of ``known``, and not like itself.
+        InputError: A photograph differs from its thumbnail, and matches that of a different name.
     """
     now = thumbnails(views)
     names = [name for name in now if _WRITTEN.fullmatch(str(known.get(name)))]
     if not names:
         return
     levels, before = (
-        torch.tensor([list(bytes.fromhex(one[name])) for name in names]).double()
-        for one in (now, known)
+        torch.tensor([list(bytes.fromhex(digits[name])) for name in names]).double()
+        for digits in (now, known)
     )
     differences = torch.cdist(levels, before) / _SIDE
-    nearest, like = differences.min(dim=1)
-    own = differences.diagonal()
-    changed = [(row, name) for row, name in enumerate(names) if float(own[row]) > _SAME]
-    moved = [f"{name} shows {names[like[row]]}" for row, name in changed if nearest[row] <= _SAME]
-    if moved:
+    nearest, match = differences.min(dim=1)
+    same_name = differences.diagonal()
+    changed = [(row, name) for row, name in enumerate(names) if float(same_name[row]) > _SAME]
+    renamed = [f"{name} is {names[match[row]]}" for row, name in changed if nearest[row] <= _SAME]
+    if renamed:
         raise InputError(
-            f"{where} have other names now: {some(moved)}; needed: each under the name that the "
-            "run read it by. Name the folder of the originals by `--photos DIR` (`photographs=`)."
+            f"{where} were renamed: {some(renamed)}; needed: the names of the run. Give the folder "
+            "of the originals with `--photos DIR` (`photographs=`)."
         )
     if changed:
         caution(
-            f"{where} look different now: {some([name for _, name in changed])}. They are written "
-            "as they are. Name the folder of the originals by `--photos DIR` (`photographs=`).",
+            f"{where} have changed: {some([name for _, name in changed])}. They are written as "
+            "they are. Give the folder of the originals with `--photos DIR` (`photographs=`).",
             stacklevel=4,
         )

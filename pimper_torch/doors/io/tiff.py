@@ -1,4 +1,4 @@
-"""TIFF: whether its samples are a photograph's, by the tags of its directories."""
+"""Sample layout of TIFF files, and checks that they are photographs, by their tags."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -19,27 +19,27 @@ _WHITE_IS_ZERO, _GRAY, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _NAMES = {0: "gray", 1: "gray", 2: "RGB", 5: "CMYK", 6: "YCbCr", 8: "CIELab", 32845: "LogLuv"}
 _KINDS = {1: "uint", 2: "int", 3: "float", 5: "complex int", 6: "complex"}
 _SENSOR = (32803, 34892)  # a colour filter array, or linear raw: DNG
-_MAX_DIRECTORIES = 100  # a choice: stacks of microscopes have more, photographs a few copies
+_MAX_DIRECTORIES = 100  # a choice: microscope stacks have more, photographs a few small copies
 CONVERT = (
-    "Convert it to sRGB, by ImageMagick for instance: `magick in.tif -colorspace sRGB out.png`."
+    "Convert it to sRGB, for instance with ImageMagick: `magick in.tif -colorspace sRGB out.png`."
 )
 PREMULTIPLIED = (
-    "has colours multiplied by their opacity; needed: a photograph without transparency, or with "
-    f"plain colours. {CONVERT}"
+    "has colours multiplied by opacity; needed: a photograph without transparency, or with "
+    f"straight alpha. {CONVERT}"
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """What the samples of a TIFF mean.
+    """Layout of the samples of a TIFF.
 
     Attributes:
-        deep: Colour of 16 bits, which Pillow would cut to 8.
-        planes: Deep colour that is stored one colour after the other.
-        inverted: 0 is white, and Pillow does not undo it.
-        full: Level of full scale by the file.
-        transfer: It has a TransferFunction, a table of radiance.
-        unknown: Samples besides colours have a meaning that the file does not state.
+        deep: 16-bit colour, which Pillow would truncate to 8 bits.
+        planes: Deep colour in separate planes.
+        inverted: 0 is white, and Pillow does not invert it.
+        full: Full-scale level of the file.
+        transfer: Whether there is a TransferFunction, a table of radiance.
+        unknown: Whether there are extra samples of unknown meaning.
     """
 
     deep: bool
@@ -51,25 +51,25 @@ class Layout:
 
 
 def layout_of(path: Path | str) -> Layout:
-    """Check that a TIFF holds one photograph of 8 or 16 bits.
+    """Return the layout of a TIFF with a single photograph of 8 or 16 bits.
 
     Raises:
-        InputError: It has several pages, or samples that are none of a photograph.
+        InputError: It has several pages, or its samples are not those of a photograph.
     """
     tags, *others = _directories(Path(path))
     bits, photometric = tags.get(_BITS, (1,)), tags.get(_PHOTOMETRIC, _WHITE_IS_ZERO)
     samples, depth = tags.get(_SAMPLES, len(bits)), max(bits)
     if photometric in _SENSOR or (_is_copy(tags) and _SUB_IFDS in tags):
         raise InputError(
-            f"{path}: holds what a sensor saw, camera raw by the name of TIFF, or a small copy of "
-            "it. Give it the suffix that its camera gives, or develop it to linear TIFF of 16 bits."
+            f"{path}: is camera raw with the suffix of TIFF, or a small copy of it. Rename it to "
+            "the suffix of its camera, or develop it to a linear 16-bit TIFF."
         )
-    # Thumbnails are not always marked; cameras write some without a width.
+    # Thumbnails are not always marked; cameras write thumbnails without a width.
     small = [_is_copy(page) or 2 * page.get(_WIDTH, 0) <= tags[_WIDTH] for page in others]
     if others and (_is_copy(tags) or not all(small)):
         raise InputError(
-            f"{path}: has several pages; needed: one photograph a file, and nothing after it but "
-            "small copies of it. Split it, by ImageMagick for instance: `magick in.tif out_%d.tif`."
+            f"{path}: has several pages; needed: one photograph per file, followed only by small "
+            "copies. Split it, for instance with ImageMagick: `magick in.tif out_%d.tif`."
         )
     kind = _KINDS.get(max(tags.get(_FORMAT, (1,))), "unknown")
     if kind != "uint" or depth > 16:
@@ -83,8 +83,8 @@ def layout_of(path: Path | str) -> Layout:
     ):
         name = _NAMES.get(photometric, f"photometric interpretation {photometric}")
         raise InputError(
-            f"{path}: holds {name} of {depth} bits, {samples} samples a pixel; needed: RGB or gray "
-            f"of 8 or 16 bits (gray of 16 without transparency). {CONVERT}"
+            f"{path}: is {name} of {depth} bits, {samples} samples per pixel; needed: RGB or gray "
+            f"of 8 or 16 bits (16-bit gray without transparency). {CONVERT}"
         )
     extra = tags.get(_EXTRA, ())
     if 1 in extra:
@@ -95,19 +95,19 @@ def layout_of(path: Path | str) -> Layout:
         inverted=photometric == _WHITE_IS_ZERO and depth > 8,
         full=2 ** max(8, depth) - 1,
         transfer=_TRANSFER in tags,
-        unknown=not {*extra} <= {2, 999},  # opacity, which CorelDRAW calls 999
+        unknown=not {*extra} <= {2, 999},  # opacity; CorelDRAW writes 999
     )
 
 
 def _directories(path: Path) -> Iterator[Mapping[int, Any]]:
-    """Read the tags of a file's directories, one a page."""
+    """Read the tags of a file's directories, one per page."""
     with path.open("rb") as file:
         head = file.read(8)
-        head += file.read(8) if head[2] == 43 else b""  # of files beyond 4 GB
+        head += file.read(8) if head[2] == 43 else b""  # BigTIFF
         directory = TiffImagePlugin.ImageFileDirectory_v2(head)
-        seen = {0}
-        while directory.next not in seen and len(seen) <= _MAX_DIRECTORIES:
-            seen.add(directory.next)
+        visited = {0}
+        while directory.next not in visited and len(visited) <= _MAX_DIRECTORIES:
+            visited.add(directory.next)
             file.seek(directory.next)
             directory.load(file)
             if tags := {tag: directory[tag] for tag in _TAGS if tag in directory}:
@@ -115,13 +115,13 @@ def _directories(path: Path) -> Iterator[Mapping[int, Any]]:
 
 
 def _is_copy(tags: Mapping[int, Any]) -> bool:
-    """Return whether a page is a reduced copy of another, or a mask."""
+    """Return whether a page is a reduced copy of a different page, or a mask."""
     return bool(tags.get(_SUBFILE, 0) & 5) or tags.get(_OLD_SUBFILE) == 2
 
 
 def unfit(path: Path | str, kind: str) -> InputError:
-    """Return the refusal of samples of another kind, such as float32."""
+    """Return the error for samples of an unsupported type, such as float32."""
     return InputError(
-        f"{path}: its samples are {kind}; needed: 8 or 16 bits, whole numbers. Save it anew, as "
-        "16-bit TIFF for instance, with the level of saturation at full scale."
+        f"{path}: its samples are {kind}; needed: integers of 8 or 16 bits. Save it again, for "
+        "instance as 16-bit TIFF, with the saturation level at full scale."
     )

@@ -1,13 +1,13 @@
-"""Which version this is, and of what it is built on."""
+"""Versions of this package and its dependencies."""
 
 import platform
 from importlib.metadata import PackageNotFoundError, version
 
-_TOLD = ("pimper_torch", "torch", "kornia", "pycolmap")
+_REPORTED = ("pimper_torch", "torch", "kornia", "pycolmap")
 
 
 def installed_version(distribution: str = "pimper_torch") -> str:
-    """Name the version of an installed distribution."""
+    """Return the version of an installed distribution."""
     try:
         return version(distribution)
     except PackageNotFoundError:
@@ -15,9 +15,9 @@ def installed_version(distribution: str = "pimper_torch") -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that a report of a fault needs, without loading what they are of."""
+    """Return the versions for a bug report, without importing the packages."""
     return {
-        **{name: installed_version(name) for name in _TOLD},
+        **{name: installed_version(name) for name in _REPORTED},
         "Python": platform.python_version(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
     }

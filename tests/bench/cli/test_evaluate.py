@@ -184,9 +184,9 @@ def test_views_of_a_set_are_paired_by_position_under_any_light(ball):
         ("ball.ply", "ball.ply", ["--trimmed-fraction", "1.5"], "trimmed_fraction is 1.5"),
         ("ball.ply", "ball.ply", ["-o", "."], "is no ordinary file"),
         ("ball.ply", "ball.ply", ["-o", "nowhere/report.json"], "its folder is not there"),
-        ("ball.ply", "empty", [], "is a folder without truth/;"),
-        ("empty", "ball.ply", [], "holds no mesh.ply"),
-        ("ball.ply", "away.ply", [], "does not exist"),
+        ("ball.ply", "empty", [], "a folder without truth/ in it"),
+        ("empty", "ball.ply", [], "contains no mesh.ply"),
+        ("ball.ply", "away.ply", [], "found nothing"),
         ("ball.ply", "empty", ["--truth-layout", "dtu-mvs"], "--scan with the number of one"),
     ],
 )
