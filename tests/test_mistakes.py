@@ -39,9 +39,9 @@ def scene_of(scene, images):
         (lambda linear: linear[:, 0], r"images has shape \(4, 36, 48\); needed: view channel"),
         (
             lambda linear: 255 * linear,
-            r"images have values up to \d+.*\d% .* above 1; .*1 where .*: divide .*linear_from_srgb",
+            r"images have values up to \d+.*\d% .* above 1; .*: divide .*linear_from_srgb",
         ),
-        (to_bytes, r"images is uint8; .*hold sRGB.*linear_from_srgb\(images / 255\)`.*load_views"),
+        (to_bytes, r"images is uint8; .*usually.*linear_from_srgb\(images / 255\)`.*load_views"),
         (lambda linear: to_bytes(linear).numpy(), "images is uint8; "),
     ],
 )

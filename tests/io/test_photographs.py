@@ -237,7 +237,7 @@ def test_each_subfolder_has_the_photographs_of_one_pose(tmp_path, pixels):
         save(tmp_path / "shared" / f"pose_{pose}.png", pixels[..., 0])
         save(tmp_path / "inside" / f"pose_{pose}" / "all.png", pixels[..., 0])
     for folder in ("shared", "inside"):
-        with pytest.warns(PimperWarning, match="3 poses"):
+        with pytest.warns(PimperWarning, match="3 camera poses"):
             one_a_pose = load_views(tmp_path / "photos", masks=tmp_path / folder)
         assert torch.equal(one_a_pose.masks, views.masks)
 

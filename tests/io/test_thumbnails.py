@@ -39,7 +39,7 @@ def test_neither_a_resize_nor_padding_changes_thumbnails(images):
 
 def test_reordered_photographs_are_refused_and_new_ones_are_not(images):
     known = thumbnails(views_of(images))
-    with pytest.raises(InputError, match=r"0\.png shows 2\.png, 2\.png shows 0\.png; needed"):
+    with pytest.raises(InputError, match=r"0\.png is 2\.png, 2\.png is 0\.png; needed"):
         compare_thumbnails(views_of(images.flip(0)), known, "photographs")
     changed = images.clone()
     changed[1] *= 0.5

@@ -89,18 +89,18 @@ def test_several_pages_are_refused_with_how_to_split_them(tmp_path, pixels, kind
 @pytest.mark.parametrize(
     ("kind", "options", "why"),
     [
-        (np.uint8, {"photometric": "separated"}, "holds CMYK of 8 bits.*`magick in.tif"),
+        (np.uint8, {"photometric": "separated"}, "is CMYK of 8 bits.*`magick in.tif"),
         (np.uint16, {"photometric": "separated"}, "is CMYK of 16 bits, 4 samples per pixel"),
         (np.uint8, {"photometric": "cielab"}, "is CIELab of 8 bits, 3 samples per pixel"),
         (np.uint16, {"photometric": "cielab"}, "is CIELab of 16 bits, 3 samples per pixel"),
-        (np.uint16, {"photometric": "ycbcr"}, "holds YCbCr of 16 bits, 3 samples"),
+        (np.uint16, {"photometric": "ycbcr"}, "is YCbCr of 16 bits, 3 samples"),
         (np.uint16, {"photometric": "minisblack", "extrasamples": [2, 0]}, "gray of 16 bits, 3 s"),
         (np.uint8, {"photometric": "rgb", "extrasamples": [1]}, "colours multiplied by opac"),
         (np.uint16, {"photometric": "rgb", "extrasamples": [1]}, "colours multiplied by op"),
         (np.uint16, {"photometric": "rgb", "extrasamples": [2, 0]}, "RGB of 16 bits, 5 samples"),
-        (np.int8, {"photometric": "rgb"}, "its samples are int8; needed: 8 or 16 bits"),
-        (np.float32, {"photometric": "rgb"}, "its samples are float32; needed: 8 or 16 bits"),
-        (np.uint32, {"photometric": "rgb"}, "its samples are uint32; needed: 8 or 16 bits"),
+        (np.int8, {"photometric": "rgb"}, "its samples are int8; needed: integers of 8"),
+        (np.float32, {"photometric": "rgb"}, "its samples are float32; needed: integers of 8"),
+        (np.uint32, {"photometric": "rgb"}, "its samples are uint32; needed: integers of 8"),
         (np.uint16, {"photometric": "cfa"}, "is camera raw with the suffix of TIFF"),
     ],
 )

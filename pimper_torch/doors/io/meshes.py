@@ -299,8 +299,8 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
-# glTF's name of vertex colours, which trimesh rounds or truncates to 8 bits, and a name for which it
-# does not.
+# glTF's name of vertex colours, which trimesh rounds or truncates to 8 bits, and a name of which
+# it keeps the values.
 _COLORS, _RAW_COLORS = "COLOR_0", "_COLOR_0"
 
 

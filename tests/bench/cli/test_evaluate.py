@@ -113,7 +113,7 @@ def test_only_a_former_report_is_replaced_and_only_on_request(ball, tmp_path, ca
         assert "was not written by this command" in capsys.readouterr().err
         assert path.read_bytes() == before
     assert run(ball, larger, "-o", "/dev/null", "--overwrite") == 2
-    assert "is no ordinary file" in capsys.readouterr().err
+    assert "is not a regular file" in capsys.readouterr().err
     assert run(ball, larger, "-o", tmp_path / ("x" * 300)) == 2
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
@@ -182,8 +182,8 @@ def test_views_of_a_set_are_paired_by_position_under_any_light(ball):
     [
         ("ball.ply", "ball.ply", ["--alignment", "cameras"], "needed: at least two"),
         ("ball.ply", "ball.ply", ["--trimmed-fraction", "1.5"], "trimmed_fraction is 1.5"),
-        ("ball.ply", "ball.ply", ["-o", "."], "is no ordinary file"),
-        ("ball.ply", "ball.ply", ["-o", "nowhere/report.json"], "its folder is not there"),
+        ("ball.ply", "ball.ply", ["-o", "."], "is not a regular file"),
+        ("ball.ply", "ball.ply", ["-o", "nowhere/report.json"], "its folder does not exist"),
         ("ball.ply", "empty", [], "a folder without truth/ in it"),
         ("empty", "ball.ply", [], "contains no mesh.ply"),
         ("ball.ply", "away.ply", [], "found nothing"),
