@@ -52,7 +52,7 @@ def test_images_of_a_wrong_layout_range_or_encoding_are_refused(given, mistaken,
 
 def test_srgb_images_are_warned_of_and_linear_ones_are_not(given, recwarn):
     coded = to_bytes(given.views.images) / 255
-    with pytest.warns(pt.PimperWarning, match=r"255ths.*hold sRGB.*linear_from_srgb\(images\)"):
+    with pytest.warns(pt.PimperWarning, match=r"1/255, .*usually sRGB.*linear_from_srgb\(images\)"):
         scene_of(given, coded)
     recwarn.clear()
     scene_of(given, linear_from_srgb(coded))

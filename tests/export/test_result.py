@@ -69,7 +69,7 @@ def swap(first, second, aside):
 
 def test_photographs_with_exchanged_names_are_refused(folder, photographs):
     swap(photographs / "a.png", photographs / "b.png", photographs.parent / "aside")
-    why = r"other names now: a\.png shows b\.png, b\.png shows a\.png; needed"
+    why = r"were renamed: a\.png is b\.png, b\.png is a\.png; needed"
     with pytest.raises(InputError, match=why):
         read_result(folder)
 
@@ -93,7 +93,7 @@ def test_converted_and_exchanged_photographs_are_refused(folder, photographs):
         (photographs / name).unlink()
     with (
         pytest.warns(PimperWarning, match="were converted"),
-        pytest.raises(InputError, match=r"a\.png shows b\.png"),
+        pytest.raises(InputError, match=r"a\.png is b\.png"),
     ):
         read_result(folder)
 

@@ -136,16 +136,16 @@ def warn_of_responses(
             )
         if stated.trouble:
             sentences.append(
-                f"{stated.source} {stated.trouble}, which is not supported; {CONTRADICTED}, with "
-                "the primaries of sRGB"
+                f"{stated.source} {stated.trouble}, which is not supported; the given response is "
+                "used, with the primaries of sRGB"
             )
         elif stated.response is not None and not isinstance(encoding.response, Path):
             given = response_of(encoding)
             if encoding.response != "auto" and disagree(given, stated.response):
                 sentences.append(
                     f"the response {describe(given)} is given, but {stated.source} states "
-                    f"{describe(stated.response)}; {CONTRADICTED}. Remove `photographs.response` "
-                    "to use that of the files"
+                    f"{describe(stated.response)}; the given response is used. Remove "
+                    "`photographs.response` to use that of the files"
                 )
         for sentence in sentences:
             names_of[sentence].append(Path(path).name)

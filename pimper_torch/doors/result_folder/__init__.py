@@ -1,1 +1,1 @@
-"""Folders and files of results: whole or not there, and nothing that is not ours removed."""
+"""Result folders and files: written completely or not at all, without removing other files."""
