@@ -66,7 +66,8 @@ def test_masks_are_found_by_name_and_mark_bright_or_opaque_pixels(photos, tmp_pa
 def test_masks_with_a_dark_object_are_inverted(photos, tmp_path, polarity):
     for name in NAMES:
         save(tmp_path / "masks" / f"{name}_mask.png", 255 - box())
-    warned = pytest.warns(PimperWarning, match="masks: the masks are bright.*dark pixels are treated")
+    message = "masks: the masks are bright.*dark pixels are treated"
+    warned = pytest.warns(PimperWarning, match=message)
     with warned if polarity == "auto" else nullcontext():
         masks = load_views(photos, masks=tmp_path / "masks", mask_object=polarity).masks
     shown = torch.from_numpy((polarity == "bright") != SHOWN)

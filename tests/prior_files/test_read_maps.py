@@ -165,7 +165,7 @@ def depth_with(none, *, dtype=np.float32, near=1000, far=9000):
 )
 def test_values_for_missing_depth_are_ignored_and_counted(none, dtype, message, views, tmp_path):
     np.save(tmp_path / "a b.npy", depth_with(none, dtype=dtype), allow_pickle=False)
-    with pytest.warns(PimperWarning, match=f": 32 pixels contain {told}, which is treated"):
+    with pytest.warns(PimperWarning, match=f": 32 pixels contain {message}, which is treated"):
         found = read_depth(tmp_path, views)
     assert found.variance[0, 0].isinf().all()
     assert found.variance[0, 1:].isfinite().all()

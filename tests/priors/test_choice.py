@@ -11,9 +11,9 @@ def test_four_standard_errors_are_significant_and_too_few_samples_are_not(genera
     for wanted, believed in ((3.99, False), (4.01, True)):
         moved = differences - differences.mean() + wanted * error
         # Neither the unit of a score counts, nor the order of the places.
-        assert surely_better(7 * moved.flip(0), torch.zeros(400)) == believed
-    assert surely_better(torch.ones(8), torch.zeros(8))
-    assert not surely_better(torch.ones(7), torch.zeros(7))
+        assert clearly_better(7 * moved.flip(0), torch.zeros(400)) == believed
+    assert clearly_better(torch.ones(8), torch.zeros(8))
+    assert not clearly_better(torch.ones(7), torch.zeros(7))
 
 
 def test_noise_is_not_significant(generator):

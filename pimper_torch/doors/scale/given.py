@@ -53,14 +53,14 @@ class Mark:
         """Parse ``NAME,x,y``, or several of these joined by ``+``.
 
         >>> Mark.read("a, b.jpg,10,20.5").pointers
-        (Pointer(name='a, b.jpg', x=10.0, y=20.5, size_px=None),)
+        (PixelMark(name='a, b.jpg', x=10.0, y=20.5, size_px=None),)
         >>> str(Mark.read("1+1.jpg,10,20+c,7,8"))
         '1+1.jpg,10,20+c,7,8'
         """
         pointers, start = [], 0
-        while match := _POINTER.match(text, at):
-            pointers.append(Pointer(name=match["name"], x=float(match["x"]), y=float(match["y"])))
-            at = match.end()
+        while match := _POINTER.match(text, start):
+            pointers.append(PixelMark(name=match["name"], x=float(match["x"]), y=float(match["y"])))
+            start = match.end()
         if not pointers or start < len(text) or text.endswith("+"):
             raise InputError(
                 f"{text!r} is not a pixel of a photograph; needed: NAME,x,y, in pixels to the "

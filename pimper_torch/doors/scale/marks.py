@@ -104,7 +104,7 @@ def _intersect_rays(
     return point
 
 
-def _hit(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: Vector) -> Vector:
+def _hit(pointer: PixelMark, result: Reconstruction, view: int, eye: Vector, ray: Vector) -> Vector:
     """Return the first point of a ray on the surface, else near its border, else on the plane."""
     mesh = result.mesh.detach().to("cpu", torch.float64)
     hits = RayCaster(mesh.vertices_world, mesh.faces).cast(eye, ray[None])
@@ -142,7 +142,7 @@ def _hit(pointer: Pointer, result: Reconstruction, view: int, eye: Vector, ray: 
     )
 
 
-def _beside(
+def _near_border(
     pointer: PixelMark, result: Reconstruction, mesh: Mesh, view: int, eye: Vector, ray: Vector
 ) -> Vector | None:
     """Return the ray's point at the depth of the vertex nearest to the pixel, if that is near."""
