@@ -75,7 +75,7 @@ PATCHES: dict[str, dict[str, object]] = {
     "sfm.weak_views": {"sfm.registration.drop_weak_views": lambda model, _: model},
     "sfm.misplaced": {"sfm.diagnose._MIN_AGREEMENT": 0.0},
     "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
-    "silhouettes.empty": {"silhouettes.find._believed": lambda silhouettes, _: silhouettes},
+    "silhouettes.empty": {"silhouettes.find._without_empty": lambda silhouettes, _: silhouettes},
     "silhouettes.shadows": {"silhouettes.cuts._without_shadow": lambda mask, *_: mask},
     "coarse.seen_through": {"coarse.trim._MIN_BEHIND": 10**9},
     "remesh.data": {"coarse.remesh._with_data": everything(1)},

@@ -20,7 +20,7 @@ def test_former_names_of_the_package_work_with_a_warning(old, new):
 
 def test_a_former_manifold_is_found_with_a_warning():
     with pytest.warns(DeprecationWarning, match="`Free` is now `FreeManifold`"):
-        assert factorization.FreeManifold is factorization.FreeManifold
+        assert factorization.Free is factorization.FreeManifold
 
 
 def test_a_former_name_of_a_record_works_with_a_warning():

@@ -55,4 +55,4 @@ from pimper_torch.records.views import Cameras as Cameras
 from pimper_torch.records.views import Views as Views
 from pimper_torch.runtime.renamed import renamed_names
 
-__getattr__ = renamed_names(__name__, {"Removal": "Removal", "Lens": "CameraModel"})
+__getattr__ = renamed_names(__name__, {"LeftOut": "Removal", "Lens": "CameraModel"})

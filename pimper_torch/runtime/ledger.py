@@ -148,7 +148,7 @@ def left_out_of(entries: Sequence[object]) -> tuple[Removal, ...]:
 def closing_line(left_out: Sequence[Removal]) -> str:
     """Return one line with the removed elements of each guard's last pass; empty if negligible.
 
-    >>> cut = LeftOut(guard="extract.borders", what="faces", count=6, total=60, reason="narrow")
+    >>> cut = Removal(guard="extract.borders", what="faces", count=6, total=60, reason="narrow")
     >>> closing_line([cut])
     'Excluded: 10% of the faces (extract.borders).'
     """

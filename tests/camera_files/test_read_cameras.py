@@ -63,7 +63,7 @@ def test_the_largest_of_several_models_is_read(rig, text, tmp_path):
     for number, names in (("0", ("2.png",)), ("1", rigs.NAMES), ("10", ("x.png", "10.png"))):
         cameras = rig.take(torch.arange(len(names)))
         rigs.of_colmap(cameras, tmp_path, text=text, names=names).rename(tmp_path / number)
-    message = r"3 COLMAP models, .* read is 1, the largest, not 0, 10\. Point to"
+    message = r"3 COLMAP models, .*The largest, 1, is used, not 0, 10\. To use another one"
     with pytest.warns(PimperWarning, match=message):
         found = existing_model(rigs.views_of(), tmp_path)
     assert found.names == rigs.NAMES

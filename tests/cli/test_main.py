@@ -133,7 +133,7 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
         ),
         (["--reference", "nosuch"], "0 photographs are named 'nosuch'; needed: one of 0.png, 1"),
         (["--photographs.saturation", "x"], "is 'x'; needed: {auto}|FLOAT|FLOAT,FLOAT,FLOAT."),
-        (["--scales", "x"], "--scales is 'x'; needed: FLOAT,.... Of the photographs"),
+        (["--scales", "x"], "--scales is 'x'; needed: FLOAT,.... Scale of the photographs"),
         (["--region", "1"], "--region is '1'; needed: FLOAT,.... Box around the object"),
         (["--masks", "nowhere"], "nowhere: found nothing; needed: a folder"),
         (["--sede", "3"], "Unrecognized options: --sede, 3"),

@@ -32,7 +32,7 @@ def test_a_setting_is_described(capsys):
     printed = capsys.readouterr().out
     names = "--reconstruct.shared-camera, --reconstruct.no-shared-camera"
     assert printed.startswith(f"# option: {names}\n")
-    assert "One camera took all photographs" in printed
+    assert "All photographs share one lens" in printed
     assert yaml.safe_load(printed) == {"reconstruct": {"shared_camera": False}}
 
 

@@ -142,7 +142,7 @@ def test_a_surface_without_confidence_is_kept_entirely():
 def test_a_surface_without_enough_support_is_rejected():
     information = torch.zeros(SIDE**2).double()
     information[0] = 0.1  # a single vertex
-    with pytest.raises(ReconstructionError, match="0 have support"):
+    with pytest.raises(ReconstructionError, match="0 of 800 faces have support"):
         Extract(ExtractConfig(max_hole=0.2))(sheet(information=information))
 
 

@@ -303,7 +303,7 @@ COLOURED = np.where(LABELS[..., None] > 2, [1.0, -1, -1], [-1, 1, 1])
         (read_normals, "a b.npy", ONES[:, :24], "is 24 x 24, .* aspect ratio, at any size"),
         (read_normals, "a b.npy", np.ones((2, 24, 32, 5)), "has shape .*; needed: height width"),
         (read_normals, "a b.npy", np.full((24, 32, 3), "x"), "contains <U1; needed: real numbers"),
-        (read_normals, "a b.npy", np.full((24, 32, 3), None), "no array .*Python objects"),
+        (read_normals, "a b.npy", np.full((24, 32, 3), None), "not a NumPy array .*Python objects"),
         (read_normals, "a b.npy", 200 * ONES / 3**0.5, "lengths are 200 to 200; needed: unit"),
         (read_normals, "a b.txt", ONES, r"contains no maps; needed: files ending in .npz"),
         (read_depth, "a b.npy", 0 * ONES[..., 0], "a b.jpg contain no usable values"),
@@ -338,7 +338,7 @@ def test_missing_folders_archives_and_standard_errors_are_refused(views, normals
     with pytest.raises(InputError, match="found nothing; needed: a folder of maps"):
         read_normals(tmp_path / "none", views)
     (tmp_path / "a b.npz").write_bytes(b"no archive")
-    with pytest.raises(InputError, match=r"a b.npz: cannot be read: it is no archive"):
+    with pytest.raises(InputError, match=r"a b.npz: cannot be read: it is not a NumPy archive"):
         read_depth(tmp_path, views)
     save(tmp_path / "a b.npz", normals)
     with pytest.raises(ConfigError, match="error_deg is 0"):

@@ -126,14 +126,14 @@ def on_its_side(views, tag=None):
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        (without_columns, r"6 of 6 photographs: 0\.png is 400x360, its camera's picture 480x360"),
-        (on_its_side, r"0\.png is 360x480, its camera's picture 480x360"),
+        (without_columns, r"6 of 6 photographs: 0\.png is 400x360, its camera's image 480x360"),
+        (on_its_side, r"0\.png is 360x480, its camera's image 480x360"),
         (lambda views: on_its_side(views, tag=5), "0.png is 360x480"),  # which too mirrors
     ],
     ids=["cropped", "turned", "mirrored"],
 )
 def test_photographs_of_another_shape_are_refused(stored, sparse, change, found):
-    needed = r"Needed: the photographs that it was made of.*neither cropped nor turned.*leave the"
+    needed = r"Needed: the photographs that it was made of.*neither cropped nor turned.*omit the"
     with pytest.raises(InputError, match=f"The COLMAP model in .*{found}.*{needed}"):
         existing_model(change(stored), sparse)
 

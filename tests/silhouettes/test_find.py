@@ -177,7 +177,7 @@ def test_masks_without_a_consistent_majority_are_rejected(staged):
 
 
 def test_masks_are_asked_for_and_missing(staged):
-    with pytest.raises(InputError, match="come without any"):
+    with pytest.raises(InputError, match="the photographs have no masks"):
         FindSilhouettes(SilhouetteConfig(object="masks"))(staged.scene)
 
 

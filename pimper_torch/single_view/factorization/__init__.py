@@ -15,7 +15,7 @@ from pimper_torch.single_view.factorization.low_rank import (
     singular_left,
 )
 
-__getattr__ = renamed_names(__name__, {"FreeManifold": "FreeManifold", "RestartResult": "RestartResult"})
+__getattr__ = renamed_names(__name__, {"Free": "FreeManifold", "Restarted": "RestartResult"})
 
 __all__ = [
     "Ambiguity",

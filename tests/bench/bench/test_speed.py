@@ -108,10 +108,10 @@ def test_a_run_is_measured_saved_and_compared(speed, reconstruction, monkeypatch
     assert kept["entries"] == [100 * reconstruction.scene.views.num_views]
     assert kept["costs"][4]["floor_seconds"] == 13e-9 * kept["entries"][0]
     assert kept["written_mb"] > 0
-    after = speed.gather_samples(kept)[-2]
-    assert after.seconds < speed.gather_samples(kept)[-1].seconds
+    after = speed.cost_rows(kept)[-2]
+    assert after.seconds < speed.cost_rows(kept)[-1].seconds
     assert after.seconds > kept["costs"][-1]["seconds"]
-    whole = speed.gather_samples(kept)[-1].seconds
+    whole = speed.cost_rows(kept)[-1].seconds
     assert whole == pytest.approx(kept["clock_seconds"], abs=0.1 + 0.02 * whole)  # complete
     printed = capsys.readouterr().out
     measured, compared = printed.split("Over the earlier run's")

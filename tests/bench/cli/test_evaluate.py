@@ -184,9 +184,9 @@ def test_views_of_a_set_are_paired_by_position_under_any_light(ball):
         ("ball.ply", "ball.ply", ["--trimmed-fraction", "1.5"], "trimmed_fraction is 1.5"),
         ("ball.ply", "ball.ply", ["-o", "."], "is not a regular file"),
         ("ball.ply", "ball.ply", ["-o", "nowhere/report.json"], "its folder does not exist"),
-        ("ball.ply", "empty", [], "a folder without truth/ in it"),
+        ("ball.ply", "empty", [], "a folder without truth/; needed"),
         ("empty", "ball.ply", [], "contains no mesh.ply"),
-        ("ball.ply", "away.ply", [], "found nothing"),
+        ("ball.ply", "away.ply", [], "away.ply: does not exist"),
         ("ball.ply", "empty", ["--truth-layout", "dtu-mvs"], "--scan with the number of one"),
     ],
 )

@@ -85,5 +85,5 @@ def test_an_undetermined_gamma_advises_no_option(fixed, capsys, monkeypatch):
     monkeypatch.setattr(estimate_gamma, "gamma_of_photographs", lambda *_, **__: undetermined)
     assert main(["gamma", str(fixed / "photos")]) == 0
     output = capsys.readouterr().out
-    assert "a camera that moved" in output
+    assert "a moved camera" in output
     assert "--photographs.response" not in output
