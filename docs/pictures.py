@@ -103,7 +103,7 @@ def draw_stages() -> None:
 
 
 def draw_walk() -> None:
-    """Reconstruct the bundled skull, and count the functions that stages enter in rooms."""
+    """Reconstruct the bundled skull, and count the functions that each stage calls, by subpackage."""
     walk = Walk()
     walk.begin()
     chain = pt.load_chain("default")
@@ -111,16 +111,21 @@ def draw_walk() -> None:
     walk.end()
     counts = {place: len(functions) for place, functions in walk.entered.items()}
     stages = list(STAGES.values())
-    first = {room: min(stages.index(s) for s, r in counts if r == room) for _, room in counts}
-    many = {room: sum(r == room for _, r in counts) for room in first}
-    rooms = sorted(first, key=lambda room: (many[room] > 5, first[room], many[room]))
-    figure, axes = plt.subplots(figsize=(9, 0.27 * len(rooms) + 1.2), layout="constrained")
-    for (stage, room), count in counts.items():
-        x, y = stages.index(stage), rooms.index(room)
+    first = {
+        subpackage: min(stages.index(s) for s, r in counts if r == subpackage)
+        for _, subpackage in counts
+    }
+    many = {subpackage: sum(r == subpackage for _, r in counts) for subpackage in first}
+    subpackages = sorted(
+        first, key=lambda subpackage: (many[subpackage] > 5, first[subpackage], many[subpackage])
+    )
+    figure, axes = plt.subplots(figsize=(9, 0.27 * len(subpackages) + 1.2), layout="constrained")
+    for (stage, subpackage), count in counts.items():
+        x, y = stages.index(stage), subpackages.index(subpackage)
         axes.scatter(x, y, s=3.0 * count + 60, color="#9ecae1")
         axes.text(x, y, str(count), ha="center", va="center", fontsize=7)
     axes.set_xticks(range(len(stages)), stages, rotation=45, ha="left")
-    axes.set_yticks(range(len(rooms)), rooms)
+    axes.set_yticks(range(len(subpackages)), subpackages)
     axes.xaxis.tick_top()
     axes.invert_yaxis()
     axes.grid(visible=True, color="#eeeeee")
@@ -129,7 +134,7 @@ def draw_walk() -> None:
 
 
 class Walk:
-    """The functions of the package that are called, by the stage that runs and their room.
+    """The called functions of the package, by stage and subpackage.
 
     A function belongs to the innermost stage that called it; in a thread of a stage, to that stage.
     """
@@ -158,12 +163,12 @@ class Walk:
             return
         code = frame.f_code
         if code not in self._known:
-            self._known[code] = stage_of(code), room_of(code)
-        stage, room = self._known[code]
+            self._known[code] = stage_of(code), subpackage_of(code)
+        stage, subpackage = self._known[code]
         above = stack or self._stages[self._main]
         stack.append(stage or (above[-1] if above else None))
-        if room and stack[-1]:
-            self.entered[stack[-1], room].add(code)
+        if subpackage and stack[-1]:
+            self.entered[stack[-1], subpackage].add(code)
 
 
 def stage_of(code: CodeType) -> str | None:
@@ -172,7 +177,7 @@ def stage_of(code: CodeType) -> str | None:
     return next(found, None) if "pimper_torch" in code.co_filename else None
 
 
-def room_of(code: CodeType) -> str | None:
+def subpackage_of(code: CodeType) -> str | None:
     """Return the subpackage of a function, or its layer."""
     try:
         folders = Path(code.co_filename).relative_to(PACKAGE).parts[:-1]

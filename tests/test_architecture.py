@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 # A subpackage imports from those above it in this list. The last line has the optional ones: the
 # command line names their verbs, and imports one when it is called. viz is above io, which draws
 # the contact sheet of a result with it.
-ROOMS = [
+SUBPACKAGES = [
     *("journal", "errors", "renamed", "mapped", "config", "progress", "cores", "file_names"),
     *("user_cache", "scratch"),
     *("numpy_files", "shapes", "kernels", "radiometry", "records", "ledger", "failures"),
@@ -32,7 +32,7 @@ ROOMS = [
     *("batches", "single_view", "__main__"),
 ]
 
-FLOORS = {"runtime", "ground", "method", "priors", "result", "doors", "cli"}
+LAYERS = {"runtime", "ground", "method", "priors", "result", "doors", "cli"}
 
 # The method: no step imports from another step.
 STEPS = {"sfm", "silhouettes", "coarse", "patches", "photometry", "sweep", "fusion", "meshing"}
@@ -104,20 +104,22 @@ def _imports(path: Path) -> Iterator[str]:
             yield str(node.module)
 
 
-def room(parts: Sequence[str]) -> str:
+def subpackage(parts: Sequence[str]) -> str:
     """Return the subpackage of a file or module, inside a layer or at the top."""
     first, second, *_ = (*parts, "")
-    return second if first in FLOORS and second in ROOMS else first
+    return second if first in LAYERS and second in SUBPACKAGES else first
 
 
-def room_of(path: Path) -> str:
-    return room(path.relative_to(PACKAGE).with_suffix("").parts)
+def subpackage_of(path: Path) -> str:
+    return subpackage(path.relative_to(PACKAGE).with_suffix("").parts)
 
 
 @pytest.mark.parametrize("path", files(), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_point_only_upward(path):
-    assert room_of(path) in {*ROOMS, *FLOORS}, f"{room_of(path)} has no place in the layout"
-    if room_of(path) not in ROOMS:
+    assert subpackage_of(path) in {*SUBPACKAGES, *LAYERS}, (
+        f"{subpackage_of(path)} has no place in the layout"
+    )
+    if subpackage_of(path) not in SUBPACKAGES:
         assert path.name == "__init__.py"
         return
     for module in imports(path):
@@ -125,9 +127,9 @@ def test_imports_point_only_upward(path):
         assert head != "pimper_bench", "that is another distribution, which imports this one"
         if head == "pimper_torch":
             assert rest, f"{path.name} imports the package as a whole"
-            other = room(rest.split("."))
-            assert ROOMS.index(other) <= ROOMS.index(room_of(path)), module
-            assert not {other, room_of(path)} <= STEPS or other == room_of(path), module
+            other = subpackage(rest.split("."))
+            assert SUBPACKAGES.index(other) <= SUBPACKAGES.index(subpackage_of(path)), module
+            assert not {other, subpackage_of(path)} <= STEPS or other == subpackage_of(path), module
 
 
 def test_the_top_folder_has_few_entries():

@@ -12,7 +12,7 @@ import pytest
 import pimper_torch
 
 # Subpackages whose public functions users call; of the optional ones, their exports.
-ROOMS = ("method.chains", "runtime.config", "doors.io", "records", "result.viz")
+SUBPACKAGES = ("method.chains", "runtime.config", "doors.io", "records", "result.viz")
 EXPORTING = ("baselines", "datasets", "metrics", "scenes")
 
 
@@ -20,8 +20,8 @@ def functions() -> Iterator[typing.Any]:
     """Yield what users call: exported names, and public functions of the outer subpackages."""
     yield from (getattr(pimper_torch, name) for name in pimper_torch._names)
     for name in EXPORTING:
-        room = importlib.import_module(f"pimper_bench.{name}")
-        yield from (getattr(room, exported) for exported in room.__all__)
+        subpackage = importlib.import_module(f"pimper_bench.{name}")
+        yield from (getattr(subpackage, exported) for exported in subpackage.__all__)
     inner = (f"pimper_torch.{name}" for name in ("runtime.store.store", *modules()))
     for name in (*inner, "pimper_bench.bench.run_bench"):
         module = importlib.import_module(name)
@@ -31,11 +31,11 @@ def functions() -> Iterator[typing.Any]:
 
 
 def modules() -> Iterator[str]:
-    for room in ROOMS:
-        module = importlib.import_module(f"pimper_torch.{room}")
-        yield room
+    for subpackage in SUBPACKAGES:
+        module = importlib.import_module(f"pimper_torch.{subpackage}")
+        yield subpackage
         for inner in pkgutil.iter_modules(getattr(module, "__path__", ())):
-            yield f"{room}.{inner.name}"
+            yield f"{subpackage}.{inner.name}"
 
 
 def parameters(found: typing.Any) -> Iterator[tuple[str, typing.Any]]:

@@ -16,10 +16,12 @@ def test_the_tour_is_one_screen():
 
 
 def test_a_public_name_is_in_the_package_or_a_listed_subpackage():
-    rooms = [room for name in pt.__all__ if ismodule(room := getattr(pt, name))]
+    subpackages = [subpackage for name in pt.__all__ if ismodule(subpackage := getattr(pt, name))]
     for name in pt._names:
         value = getattr(pt, name)
-        assert name in pt.__all__ or any(getattr(room, name, None) is value for room in rooms), name
+        assert name in pt.__all__ or any(
+            getattr(subpackage, name, None) is value for subpackage in subpackages
+        ), name
     assert all(name in pt.__doc__ for name in pt.__all__ if ismodule(getattr(pt, name)))
     with pytest.raises(AttributeError, match="wrap"):
         _ = pt.wrap

@@ -50,13 +50,15 @@ def sources() -> Iterator[Source]:
                     yield Source(module=module, name=name, text=" ".join(found[1].split()))
 
 
-def rooms() -> dict[str, list[Source]]:
+def subpackages() -> dict[str, list[Source]]:
     """Group sources by subpackage."""
     groups: dict[str, list[Source]] = {}
     for source in sources():
         parts = source.module.removeprefix("pimper_torch.").split(".")
-        room = ".".join(parts[:2] if parts[0] in ("pimper_bench", "single_view") else parts[:1])
-        groups.setdefault(room, []).append(source)
+        subpackage = ".".join(
+            parts[:2] if parts[0] in ("pimper_bench", "single_view") else parts[:1]
+        )
+        groups.setdefault(subpackage, []).append(source)
     return groups
 
 
@@ -66,9 +68,9 @@ class Sources(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Write a section of the page for each subpackage."""
         written: list[nodes.Node] = []
-        for room, found in rooms().items():
-            section = nodes.section(ids=[nodes.make_id(f"sources {room}")])
-            section += nodes.title("", "", nodes.literal("", room))
+        for subpackage, found in subpackages().items():
+            section = nodes.section(ids=[nodes.make_id(f"sources {subpackage}")])
+            section += nodes.title("", "", nodes.literal("", subpackage))
             section += nodes.bullet_list("", *map(self.item, found))
             written.append(section)
         return written
