@@ -103,7 +103,7 @@ def draw_stages() -> None:
 
 
 def draw_walk() -> None:
-    """Reconstruct the bundled skull, and count the functions that each stage calls, by subpackage."""
+    """Reconstruct the bundled skull, and count each stage's functions by subpackage."""
     walk = Walk()
     walk.begin()
     chain = pt.load_chain("default")
