@@ -124,10 +124,10 @@ def split_edges(vertices: Vertices, faces: Faces, marked: Bool[Tensor, " edge"])
 
 def _cases(
     marked: Bool[Tensor, "face 3"], positions: Float[Tensor, "face 6 3"]
-) -> list[tuple[Int[Tensor, " face"], tuple[tuple[int, int, int], ...]]]:
+) -> list[tuple[Int[Tensor, " group"], tuple[tuple[int, int, int], ...]]]:
     """Return groups of faces that are cut alike, each with its children's corners in ``_NODES``."""
     count = marked.sum(dim=1)
-    cases: list[tuple[Int[Tensor, " face"], tuple[tuple[int, int, int], ...]]] = [
+    cases: list[tuple[Int[Tensor, " group"], tuple[tuple[int, int, int], ...]]] = [
         ((count == 0).nonzero()[:, 0], ((0, 1, 2),)),
         ((count == 3).nonzero()[:, 0], _RED),
     ]
