@@ -55,9 +55,7 @@ def subpackages() -> dict[str, list[Source]]:
     groups: dict[str, list[Source]] = {}
     for source in sources():
         parts = source.module.removeprefix("pimper_torch.").split(".")
-        subpackage = ".".join(
-            parts[:2] if parts[0] in ("pimper_bench", "single_view") else parts[:1]
-        )
+        subpackage = ".".join(parts[:-1][:2] or parts)
         groups.setdefault(subpackage, []).append(source)
     return groups
 
