@@ -34,8 +34,9 @@ def test_former_names_of_fields_work_in_constructor_and_attribute():
     lights = torch.rand(1, 3, 4)
     fields = {"radiance": torch.rand(1, 3, 5), "weight": torch.ones(1, 3, 5), "lights": lights}
     fields |= {"shading": torch.rand(1, 4, 5), "regularization": torch.ones(1, 3)}
-    with pytest.warns(DeprecationWarning, match="`anchor` is now `prior_mean`"):
+    with pytest.warns(DeprecationWarning, match="`anchor` is now `prior_mean`") as caught:
         problem = Bilinear(**fields, manifold=Cone(), anchor=lights)
+    assert caught[0].filename == __file__  # the line that has to change
     with pytest.warns(DeprecationWarning, match="`anchor` is now `prior_mean`"):
         assert problem.anchor is problem.prior_mean is lights
 

@@ -34,7 +34,9 @@ def renamed_fields(**names: str) -> Callable[[type[T]], type[T]]:
 
         @functools.wraps(init)
         def make(self: T, **values: Any) -> None:  # noqa: ANN401 - the fields' own types
-            init(self, **{renamed(k, names[k]) if k in names else k: v for k, v in values.items()})
+            for old in names.keys() & values:
+                values[renamed(old, names[old])] = values.pop(old)
+            init(self, **values)
 
         def reader(old: str, new: str) -> property:
             return property(lambda self: getattr(self, renamed(old, new)))

@@ -68,7 +68,7 @@ LINES = {
     "result/report": 424,
     "result/viewer": 554,
     "result/viz": 986,
-    "runtime": 2106,
+    "runtime": 2108,
     "runtime/store": 312,
     "single_view": 6,
     "single_view/cli": 80,
