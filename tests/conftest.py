@@ -363,7 +363,7 @@ def problem(generator):
             radiance=weight * (lights @ shading),
             weight=weight,
             lights=start,
-            anchor=start,
+            prior_mean=start,
             shading=from_shading,
             regularization=torch.zeros(patches, views, dtype=torch.float64),
         )
