@@ -19,10 +19,8 @@ import torch
 import trimesh
 from torch import Tensor
 
-from pimper_torch.ground.geometry.rigid import invert_rigid, transform
-from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.patches_config import DecomposeConfig
-from pimper_torch.published.align import Align
+from pimper_torch.geometry.rigid import invert_rigid, transform
+from pimper_torch.paper.align import Align
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -35,6 +33,8 @@ from pimper_torch.records import (
     Photometry,
     Templates,
 )
+from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.stages.patches.patches_config import DecomposeConfig
 
 # Wavelength over 2 pi and height of the bumps: slopes of 0.3 over an edge of 0.06.
 BUMP = (0.03, 0.008)

@@ -27,16 +27,17 @@ from torch import Tensor
 
 from pimper_bench.datasets import read_llff, write_colmap
 from pimper_bench.truth import Capture
-from pimper_torch.doors.export.picture_files import file_names
-from pimper_torch.doors.io.meshes import read_mesh, write_ply
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.chains.chain_config import PublishedConfig, load_config
-from pimper_torch.method.chains.presets import load_chain
-from pimper_torch.method.sfm.sparse_scene import write_model
+from pimper_torch.export.picture_files import file_names
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.meshes import read_mesh, write_ply
+from pimper_torch.paper.paper_config import PublishedConfig
+from pimper_torch.presets.load_chain import load_chain
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.records import CameraModel, Cameras, Mesh, SparseScene
-from pimper_torch.result.viz.render import crop
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.runtime.stage import Given
+from pimper_torch.stages.sfm.sparse_scene import write_model
+from pimper_torch.stages.stage import Given
+from pimper_torch.viz.render import crop
 
 # A point of the object is inside this fraction of the views' masks, which were drawn independently
 # and miss a pixel of the contour in places.

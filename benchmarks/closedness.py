@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.ground.geometry.surfaces import unit_face_normals
-from pimper_torch.ground.geometry.topology import (
+from pimper_torch.geometry.surfaces import unit_face_normals
+from pimper_torch.geometry.topology import (
     boundary_loops,
     face_components,
     face_edges,

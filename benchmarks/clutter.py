@@ -20,7 +20,7 @@ from pimper_bench.scenes.scene_object import SceneObject, Texture
 from pimper_bench.scenes.scene_objects import RECIPES
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.radiometry import srgb_from_linear
 
 # Scene, size, rotation in degrees and position: behind and next to the object, not occluding it.
 AROUND = (

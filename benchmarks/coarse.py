@@ -26,33 +26,33 @@ from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.metrics import pair_views, similarity_between_cameras, transfer
 from pimper_bench.metrics.in_view import compare_along_rays
 from pimper_bench.metrics.surface_distances import TrueSurface
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.ground.geometry.poisson import reduced
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.method.coarse.fine_surface import (
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.poisson import reduced
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.undistortion import undistorted
+from pimper_torch.io.photographs import load_views
+from pimper_torch.records import ContourPoints, Mesh, Silhouettes, SparseScene
+from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.coarse.fine_surface import (
     REACH_PX,
     TOLERANCE_PX,
     closed_surface,
     cropped,
     poisson,
 )
-from pimper_torch.method.coarse.oriented import OrientedPoints, matched_cloud
-from pimper_torch.method.coarse.reference import reference_view
-from pimper_torch.method.coarse.surface import CoarseSurface, reliable_points
-from pimper_torch.method.coarse.trim import (
+from pimper_torch.stages.coarse.oriented import OrientedPoints, matched_cloud
+from pimper_torch.stages.coarse.reference import reference_view
+from pimper_torch.stages.coarse.surface import CoarseSurface, reliable_points
+from pimper_torch.stages.coarse.trim import (
     CELL_PX,
     point_distances,
     seen_surface,
     supports,
     view_counts,
 )
-from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.undistort import undistorted
-from pimper_torch.method.silhouettes.trace import TraceContours
-from pimper_torch.records import ContourPoints, Mesh, Silhouettes, SparseScene
-from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.sfm.reconstruct import Reconstruct
+from pimper_torch.stages.silhouettes.trace import TraceContours
 
 Surface = tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
 

@@ -13,11 +13,11 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from scipy.spatial import Delaunay, cKDTree
 from torch import Tensor
 
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.visual_hull import Hull
-from pimper_torch.method.coarse.densify import DepthMaps
-from pimper_torch.method.coarse.oriented import OrientedPoints
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.visual_hull import Hull
 from pimper_torch.records import ContourPoints
+from pimper_torch.stages.coarse.densify import DepthMaps
+from pimper_torch.stages.coarse.oriented import OrientedPoints
 
 # Capacities are integers there.
 _UNIT = 100

@@ -12,12 +12,12 @@ from pathlib import Path
 import scipy.io
 import torch
 
-from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.single_view.factorization.low_rank import (
     low_rank_problem,
     random_left,
     singular_left,
 )
+from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
 # Name, rank, best residual known, starts.
 SETS = (

@@ -21,9 +21,9 @@ import torch
 from PIL import Image
 
 from pimper_torch.cli.main import main as pimper
-from pimper_torch.doors.io.decode import decode, write_deep_png
-from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.ground.radiometry.primaries import (
+from pimper_torch.io.decode import decode, write_deep_png
+from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.radiometry.primaries import (
     DISPLAY_P3,
     REC_2020,
     primaries_of,

@@ -16,7 +16,7 @@ from one_viewpoint import read_uw_ps, read_yale_b
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.radiometry import Gamma, Linear, Srgb
+from pimper_torch.radiometry import Gamma, Linear, Srgb
 from pimper_torch.single_view.factorization.estimate_gamma import (
     GammaEstimate,
     estimate_gamma,

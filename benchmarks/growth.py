@@ -20,7 +20,7 @@ from pathlib import Path
 from PIL import Image
 
 from pimper_torch.cli.doctor.cost import estimate
-from pimper_torch.doors.io.photograph_files import list_images
+from pimper_torch.io.photograph_files import list_images
 
 HEADER = "photographs | size | facets | vertices | CPU s | s | estimated | GB | estimated"
 

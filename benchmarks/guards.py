@@ -37,10 +37,10 @@ from pimper_bench.metrics.in_view import compare_along_rays
 from pimper_bench.metrics.similarity import align_estimate, transfer
 from pimper_bench.metrics.surface_distances import TrueSurface, true_surface
 from pimper_bench.truth import Capture
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.chains.presets import load_chain
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.photographs import load_views
+from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.records import Estimate, Reconstruction, Removal
 from pimper_torch.runtime.errors import PimperError
 from pimper_torch.runtime.ledger import GUARDS, listening

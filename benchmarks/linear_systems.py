@@ -22,10 +22,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, cg, spsolve
 from torch import Tensor
 
-from pimper_torch.ground.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
-from pimper_torch.ground.geometry.subdivision import subdivide
-from pimper_torch.ground.linalg.multigrid import Multigrid
-from pimper_torch.ground.linalg.sparse import SparseCholesky
+from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
+from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.linalg.multigrid import Multigrid
+from pimper_torch.linalg.sparse import SparseCholesky
 
 CASES = ("rectangle", "holes", "plateaus", "decades", "anisotropic", "strips", "mesh")
 SOLVERS = ("cholesky", "multigrid", "spsolve", "cg", "cg, diagonal")

@@ -24,7 +24,7 @@ from one_viewpoint import NormalMap, read_normal_map
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.published.integrate import differences
+from pimper_torch.paper.integrate import differences
 from pimper_torch.single_view.integration.normal_map import IntegratedMap, integrate_normal_map
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import (

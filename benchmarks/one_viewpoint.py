@@ -13,10 +13,10 @@ from torch import Tensor
 from pimper_bench.datasets.diligent import FLIP, directed_lights, facing_us
 from pimper_bench.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.doors.camera_files.layout import DataSetPath, contents
-from pimper_torch.doors.io.decode import decode
-from pimper_torch.doors.io.photographs import read_mask
-from pimper_torch.ground.radiometry import LINEAR
+from pimper_torch.io.cameras.layout import DataSetPath, contents
+from pimper_torch.io.decode import decode
+from pimper_torch.io.photographs import read_mask
+from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import Record, Views
 from pimper_torch.runtime.numpy_files import read_npz
 

@@ -25,9 +25,9 @@ from torch.nn.functional import normalize
 from pimper_bench.scenes import SceneObject, SensorConfig, render_objects
 from pimper_bench.scenes.scene_lights import Lights
 from pimper_bench.scenes.scene_object import Texture
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.ground.radiometry import linear_from_srgb
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.runtime.errors import PimperError
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.photometric_stereo import PhotometricStereo, photometric_stereo

@@ -13,13 +13,13 @@ from scipy.spatial import ConvexHull, cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.surfaces import (
+from pimper_torch.geometry.surfaces import (
     face_normals,
     side_lengths,
     unit_face_normals,
     vertex_normals,
 )
-from pimper_torch.ground.geometry.topology import face_components
+from pimper_torch.geometry.topology import face_components
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.errors import InputError
 

@@ -21,11 +21,11 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_torch import load_chain, load_views
-from pimper_torch.ground.geometry.pyramids import Sources
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
-from pimper_torch.method.chains.published import Published
-from pimper_torch.published.published_config import TriangulateConfig
-from pimper_torch.published.triangulate import Triangulate
+from pimper_torch.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.geometry.pyramids import Sources
+from pimper_torch.paper.chain import Published
+from pimper_torch.paper.paper_config import TriangulateConfig
+from pimper_torch.paper.triangulate import Triangulate
 from pimper_torch.records import (
     CoarseMesh,
     PatchViews,
@@ -35,7 +35,7 @@ from pimper_torch.records import (
     SparseScene,
     Surface,
 )
-from pimper_torch.runtime.stage import Given, Stage
+from pimper_torch.stages.stage import Given, Stage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 
 from pimper_bench.scenes.render_in_memory import EndlessPlane
 from pimper_bench.scenes.textures import Waves
-from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 
 _NEWTON_STEPS = 30  # quadratic convergence needs about 6

@@ -25,12 +25,12 @@ from pimper_bench.bench.measure import peak_memory
 from pimper_bench.datasets import read_llff, read_rendered
 from pimper_bench.metrics.evaluation import camera_figures
 from pimper_bench.truth import Capture
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.method.sfm.model_files import read_model
-from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Estimate, Mesh, SparseScene, Views
 from pimper_torch.runtime.errors import PimperError, PimperWarning
+from pimper_torch.stages.sfm.reconstruct import Reconstruct
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 
 COLMAP = ReconstructConfig(
     peak_threshold=0.0067,

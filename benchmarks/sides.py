@@ -20,9 +20,9 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.doors.io.estimates import read_estimate
+from pimper_torch.io.estimates import read_estimate
 from pimper_torch.records import Cameras, Mesh
-from pimper_torch.result.viz.render import bounding_box, crop, shade
+from pimper_torch.viz.render import bounding_box, crop, shade
 
 
 def main() -> None:

@@ -21,14 +21,14 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.chains.chain_config import CoarseToFineConfig
+from pimper_torch.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.io.photographs import load_views
 from pimper_torch.priors.prior_files.read_silhouettes import read_silhouettes
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import SilhouettePrior, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
 
 
 def main() -> None:

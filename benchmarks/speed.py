@@ -43,11 +43,11 @@ from pimper_bench.bench.measure import peak_memory, this_machine
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.cli.options import Job, parse
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.doors.io.results import write_result
-from pimper_torch.doors.result_folder.folders import held_output
-from pimper_torch.doors.result_folder.marker import STAGES
-from pimper_torch.method.chains.presets import make_chain
+from pimper_torch.export.result_folder.folders import held_output
+from pimper_torch.export.result_folder.marker import STAGES
+from pimper_torch.export.results import write_result
+from pimper_torch.io.photographs import load_views
+from pimper_torch.presets.load_chain import make_chain
 from pimper_torch.records import StageReport, Views
 from pimper_torch.runtime.cores import usable_cores
 from pimper_torch.runtime.reporting import ASIDE
@@ -327,7 +327,7 @@ def with_floors(
 def watch_cycles(meter: Meter) -> None:
     """Time every multigrid cycle; other solvers have no lower bound."""
     try:
-        from pimper_torch.ground.linalg.hierarchy import Hierarchy
+        from pimper_torch.linalg.hierarchy import Hierarchy
 
         cycle: Callable[..., Any] = Hierarchy.cycle
     except (ImportError, AttributeError):
@@ -368,7 +368,7 @@ def colmap_seconds(views: Views) -> float:
     """Run structure from motion with COLMAP's own settings."""
     from sfm import COLMAP  # the script in this folder
 
-    from pimper_torch.method.sfm.reconstruct import Reconstruct
+    from pimper_torch.stages.sfm.reconstruct import Reconstruct
 
     began = time.perf_counter()
     Reconstruct(COLMAP)(views)

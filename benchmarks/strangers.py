@@ -29,9 +29,9 @@ from pimper_bench.scenes.scene_lights import Lights
 from pimper_bench.scenes.scene_settings import SceneConfig, SensorConfig, expose
 from pimper_bench.scenes.whole_scene import Scene, build_scene
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.ground.geometry.lens_models import undistort_pixels
-from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
-from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.geometry.lens_models import undistort_pixels
+from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import CameraModel, Views
 
 RENDERED_FOCAL = 1.3  # widths of a picture that all cameras' pictures are cut from

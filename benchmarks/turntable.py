@@ -16,12 +16,12 @@ import torch
 
 from pimper_bench.datasets import read_rendered
 from pimper_bench.metrics.similarity import similarity_between_cameras
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.runtime.errors import PimperError, PimperWarning
+from pimper_torch.stages.sfm.reconstruct import Reconstruct
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 
 COLUMNS = ("scene", "masks", "views", "points", "centres %", "worst %", "doubtful", "CPU s")
 

@@ -22,11 +22,11 @@ from pimper_bench.datasets import read_rendered
 from pimper_bench.metrics.evaluation import camera_figures
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.method.sfm import reconstruct, registration
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.method.sfm.sparse_scene import assemble_scene
+from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Estimate, Mesh
+from pimper_torch.stages.sfm import reconstruct, registration
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 
 Spent = defaultdict[str, float]
 

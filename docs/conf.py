@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 
 from sphinx.application import Sphinx
 
-from pimper_torch.doors.io.version import installed_version
+from pimper_torch.io.version import installed_version
 
 project = "pimper_torch"
 author = "the authors of pimper_torch"

@@ -20,10 +20,10 @@ from PIL import Image
 
 import pimper_torch as pt
 from pimper_torch.cli.options import bundled_photographs
-from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Cameras, Mesh, Views
-from pimper_torch.result.viz.maps import normal_colors, view_maps
-from pimper_torch.result.viz.render import bounding_box, frame, shade
+from pimper_torch.viz.maps import normal_colors, view_maps
+from pimper_torch.viz.render import bounding_box, frame, shade
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
@@ -178,7 +178,7 @@ def stage_of(code: CodeType) -> str | None:
 
 
 def subpackage_of(code: CodeType) -> str | None:
-    """Return the subpackage of a function, or its layer."""
+    """Return the folder of a function, for stages the one inside `stages`."""
     try:
         folders = Path(code.co_filename).relative_to(PACKAGE).parts[:-1]
     except ValueError:

@@ -22,23 +22,16 @@ from importlib import import_module
 
 import lazy_loader
 
+from pimper_torch.runtime import former_modules
+
 # Public names are listed in `__init__.pyi`, also for type checkers. Modules that need torch are
 # imported on first use, so the command line starts fast.
 _public, _, _names = lazy_loader.attach_stub(__name__, __file__)
 
-# Public subpackages below a layer, and that layer.
-_LAYERS = {
-    "batches": "cli",
-    "errors": "runtime",
-    "export": "doors",
-    "prior_files": "priors",
-    "radiometry": "ground",
-    "scale": "doors",
-    "store": "runtime",
-    "viz": "result",
-}
+former_modules.install()
 
-_RENAMED = {"exchange": "export", "settled": "resolve_prior_conventions", "size": "scale"}
+# Public subpackages below another one.
+_NESTED = {"batches": "cli", "errors": "runtime", "prior_files": "priors"}
 
 __all__ = [
     *("batches", "errors", "export", "prior_files", "priors", "radiometry", "records"),
@@ -50,15 +43,11 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     if name == "__version__":
-        from pimper_torch.doors.io.version import installed_version
+        from pimper_torch.io.version import installed_version
 
         return installed_version()
-    if name in _RENAMED:
-        from pimper_torch.runtime.renamed import renamed
-
-        return __getattr__(renamed(f"pimper_torch.{name}", _RENAMED[name]))
-    if name in _LAYERS:
-        return import_module(f"{__name__}.{_LAYERS[name]}.{name}")
+    if name in _NESTED:
+        return import_module(f"{__name__}.{_NESTED[name]}.{name}")
     return _public(name)
 
 

@@ -77,7 +77,7 @@ def lit_before(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def small_pictures(monkeypatch: pytest.MonkeyPatch, lit_before: None) -> None:
     """Write results with small images: large ones take most of the time."""
-    from pimper_torch.doors.io import results
+    from pimper_torch.export import results
 
     draw, turn = results.draw_overview, results.draw_turn
     monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
@@ -91,9 +91,9 @@ def reconstruction():
 
     from pimper_bench.scenes.procedural_meshes import table
     from pimper_bench.scenes.scene_cameras import arc_cameras
-    from pimper_torch.ground.geometry.projection import project
-    from pimper_torch.ground.geometry.rigid import rigid
-    from pimper_torch.ground.geometry.surfaces import vertex_normals
+    from pimper_torch.geometry.projection import project
+    from pimper_torch.geometry.rigid import rigid
+    from pimper_torch.geometry.surfaces import vertex_normals
     from pimper_torch.records import (
         CameraModel,
         CoarseMesh,
@@ -221,11 +221,11 @@ def lift():
     from pimper_bench.scenes.scene_cameras import arc_cameras
     from pimper_bench.scenes.scene_lights import wandering_lights
     from pimper_bench.scenes.textures import random_speckle
-    from pimper_torch.ground.geometry.rigid import rotate
-    from pimper_torch.method.patches.decompose import Decompose
-    from pimper_torch.method.patches.patches_config import DecomposeConfig
-    from pimper_torch.method.patches.warp import Warp
+    from pimper_torch.geometry.rigid import rotate
     from pimper_torch.records import CoarseMesh, Mesh, PhotometricPatches
+    from pimper_torch.stages.patches.decompose import Decompose
+    from pimper_torch.stages.patches.patches_config import DecomposeConfig
+    from pimper_torch.stages.patches.warp import Warp
 
     slant = (0.15, -0.1, 1.0)
 
@@ -334,9 +334,9 @@ def problem(generator):
     """Random factors on the cone, their exact product, and a perturbed initial value."""
     from torch.nn.functional import normalize
 
-    from pimper_torch.method.photometry.bilinear import Bilinear
-    from pimper_torch.method.photometry.cone import project_to_cone
-    from pimper_torch.method.photometry.light_field import harmonics
+    from pimper_torch.lighting.light_field import harmonics
+    from pimper_torch.stages.photometry.bilinear import Bilinear
+    from pimper_torch.stages.photometry.cone import project_to_cone
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)

@@ -3,7 +3,7 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,44 +18,32 @@ PACKAGE = Path(pimper_torch.__file__).parent
 BENCH = Path(pimper_bench.__file__).parent
 ROOT = Path(__file__).parents[1]
 
-# A subpackage imports from those above it in this list. The last line has the optional ones: the
-# command line names their verbs, and imports one when it is called. viz is above io, which draws
-# the contact sheet of a result with it.
-SUBPACKAGES = [
-    *("journal", "errors", "renamed", "mapped", "config", "progress", "cores", "file_names"),
-    *("user_cache", "scratch"),
-    *("numpy_files", "shapes", "kernels", "radiometry", "records", "ledger", "failures"),
-    *("parallel", "stage", "store", "geometry", "memory", "linalg", "camera_files", "sfm"),
-    *("silhouettes", "coarse", "patches", "photometry", "sweep", "fusion", "published", "meshing"),
-    *("scale", "reporting", "priors", "viz", "asset", "relighting", "chains", "stages"),
-    *("report", "result_folder", "io", "export", "prior_files", "viewer", "doctor", "video", "cli"),
-    *("batches", "single_view", "__main__"),
+# A folder imports only itself and folders before it; a stage no other stage.
+FOLDERS = [
+    *("runtime", "records", "store", "radiometry", "kernels", "geometry", "linalg", "lighting"),
+    *("scale", "io", "priors", "stages", "chains", "paper", "presets", "single_view", "viz"),
+    *("export", "viewer", "cli"),
 ]
 
-LAYERS = {"runtime", "ground", "method", "priors", "result", "doors", "cli"}
-
-# The method: no step imports from another step.
-STEPS = {"sfm", "silhouettes", "coarse", "patches", "photometry", "sweep", "fusion", "meshing"}
-
 SOLE_IMPORTERS = {
-    "pycolmap": {"ground/geometry/colmap_library.py"},
-    "embreex": {"ground/geometry/visibility.py"},
-    "xatlas": {"result/asset/charts.py"},
-    "fcpw": {"ground/geometry/nearest.py"},
-    "tifffile": {"doors/io/decode.py"},
+    "pycolmap": {"geometry/colmap_library.py"},
+    "embreex": {"geometry/visibility.py"},
+    "xatlas": {"stages/texturing/charts.py"},
+    "fcpw": {"geometry/nearest.py"},
+    "tifffile": {"io/decode.py"},
     "cv2": {
-        "ground/geometry/opencv.py",
-        "doors/io/decode.py",
-        "doors/scale/aruco.py",
+        "geometry/opencv.py",
+        "io/decode.py",
+        "scale/aruco.py",
         "cli/video/choose.py",
     },
     "av": {"cli/video/read.py"},
-    "numba": {"ground/kernels/compile.py"},
+    "numba": {"kernels/compile.py"},
     "yaml": {"runtime/config.py"},
-    "tyro": {"cli/", "cli/batches/", "pimper_bench/cli/", "single_view/cli/"},
-    "matplotlib": {"result/viz/", "pimper_bench/bench/contact_sheet.py"},
-    "viser": {"result/viewer/"},
-    "pxr": {"result/asset/usd.py"},
+    "tyro": {"cli/", "pimper_bench/cli/"},
+    "matplotlib": {"viz/", "pimper_bench/bench/contact_sheet.py"},
+    "viser": {"viewer/"},
+    "pxr": {"io/assets/usd.py"},
     "onnxruntime": {"priors/network.py"},
     "distributed": {"cli/batches/engines.py"},
     "submitit": {"cli/batches/engines.py"},
@@ -104,38 +92,18 @@ def _imports(path: Path) -> Iterator[str]:
             yield str(node.module)
 
 
-def subpackage(parts: Sequence[str]) -> str:
-    """Return the subpackage of a file or module, inside a layer or at the top."""
-    first, second, *_ = (*parts, "")
-    return second if first in LAYERS and second in SUBPACKAGES else first
-
-
-def subpackage_of(path: Path) -> str:
-    return subpackage(path.relative_to(PACKAGE).with_suffix("").parts)
-
-
 @pytest.mark.parametrize("path", files(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_point_only_upward(path):
-    assert subpackage_of(path) in {*SUBPACKAGES, *LAYERS}, (
-        f"{subpackage_of(path)} has no place in the layout"
-    )
-    if subpackage_of(path) not in SUBPACKAGES:
-        assert path.name == "__init__.py"
-        return
+def test_folders_import_only_folders_before_them(path):
+    folder, inner, *_ = (*path.relative_to(PACKAGE).parts, "")
+    allowed = FOLDERS[: FOLDERS.index(folder) + 1] if path.parent != PACKAGE else FOLDERS
     for module in imports(path):
-        head, _, rest = module.partition(".")
-        assert head != "pimper_bench", "that is another distribution, which imports this one"
-        if head == "pimper_torch":
-            assert rest, f"{path.name} imports the package as a whole"
-            other = subpackage(rest.split("."))
-            assert SUBPACKAGES.index(other) <= SUBPACKAGES.index(subpackage_of(path)), module
-            assert not {other, subpackage_of(path)} <= STEPS or other == subpackage_of(path), module
-
-
-def test_the_top_folder_has_few_entries():
-    sources = (path for path in PACKAGE.rglob("*") if path.is_file() and path.suffix != ".pyc")
-    found = {path.relative_to(PACKAGE).parts[0] for path in sources} - {"__pycache__", "configs"}
-    assert len(found) <= 16, sorted(found)
+        package, head, inside, *_ = (*module.split("."), "", "")
+        assert package != "pimper_bench", "that is another distribution, which imports this one"
+        if package == "pimper_torch":
+            assert head, f"{path.name} imports the package as a whole"
+            assert head in allowed, module
+            if (folder, head) == ("stages", "stages") and path.name != "__init__.py":
+                assert inside in {inner, "stage"}, module
 
 
 @pytest.mark.parametrize("package", SOLE_IMPORTERS)

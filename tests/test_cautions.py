@@ -7,11 +7,11 @@ import torch
 from probes import small_scene
 from torch import nn
 
-from pimper_torch.method.chains.presets import load_chain
-from pimper_torch.method.meshing.repair import Repair
+from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.records import Silhouettes
 from pimper_torch.runtime.errors import PimperWarning, caution
-from pimper_torch.runtime.stage import Given, Then
+from pimper_torch.stages.meshing.repair import Repair
+from pimper_torch.stages.stage import Given, Then
 
 
 class Warner(nn.Module):

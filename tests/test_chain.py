@@ -21,12 +21,11 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.method.chains.coarse_to_fine import split_held_out
-from pimper_torch.method.coarse.surface import CoarseSurface
-from pimper_torch.published.published_config import TriangulateConfig
-from pimper_torch.published.triangulate import Triangulate
+from pimper_torch.chains.coarse_to_fine import split_held_out
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.paper.paper_config import TriangulateConfig
+from pimper_torch.paper.triangulate import Triangulate
 from pimper_torch.records import (
     CoarseMesh,
     Mesh,
@@ -36,7 +35,8 @@ from pimper_torch.records import (
     SweptPatches,
 )
 from pimper_torch.runtime.errors import PimperWarning
-from pimper_torch.runtime.stage import Given
+from pimper_torch.stages.coarse.surface import CoarseSurface
+from pimper_torch.stages.stage import Given
 from tests.coarse import ball
 
 log = logging.getLogger(__name__)  # pytest --log-cli-level=INFO shows the figures

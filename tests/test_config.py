@@ -5,7 +5,8 @@ from typing import Literal
 import pytest
 import yaml
 
-from pimper_torch.method.chains.chain_config import PublishedConfig, load_config
+from pimper_torch.paper.paper_config import PublishedConfig
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.runtime import config as config_module
 from pimper_torch.runtime.config import (
     build,

@@ -5,8 +5,8 @@ import os
 import pytest
 
 from pimper_torch.cli.main import main
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.runtime.cores import usable_cores
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 
 
 @pytest.mark.parametrize(

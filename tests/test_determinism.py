@@ -11,7 +11,7 @@ import torch
 from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.runtime.errors import PimperWarning
-from pimper_torch.runtime.store.digest import digest
+from pimper_torch.store.digest import digest
 from tests.test_chain import photographed, small_chain
 from tests.threads import on_threads
 

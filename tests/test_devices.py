@@ -12,9 +12,9 @@ from torch.utils import _pytree as pytree
 import pimper_torch as pt
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch import stages
-from pimper_torch.published.align import Align
-from pimper_torch.published.integrate import Integrate
-from pimper_torch.published.refine import Refine
+from pimper_torch.paper.align import Align
+from pimper_torch.paper.integrate import Integrate
+from pimper_torch.paper.refine import Refine
 from tests.coarse import ball
 from tests.sfm.ball import cameras_on_an_arc, photographs
 

@@ -26,14 +26,14 @@ from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_torch.cli.batches import task
 from pimper_torch.cli.options import InputOptions
-from pimper_torch.doors.camera_files import read_cameras
-from pimper_torch.method.chains import presets
-from pimper_torch.method.chains.chain_config import load_config
-from pimper_torch.method.photometry import factorize
-from pimper_torch.method.photometry.light_field import harmonics
-from pimper_torch.method.sfm.reconstruct import Reconstruct
+from pimper_torch.io.cameras import read_cameras
+from pimper_torch.lighting.light_field import harmonics
+from pimper_torch.presets import load_chain as presets
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.records import Silhouettes, SparseScene, Views
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.stages.photometry import factorize
+from pimper_torch.stages.sfm.reconstruct import Reconstruct
 from tests.relighting import ball
 
 PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]

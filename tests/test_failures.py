@@ -9,25 +9,25 @@ import torch
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.doors.io.reports import summary_report
-from pimper_torch.ground.linalg.prepared import SingularSystemError
-from pimper_torch.method.chains.photometric import Photometric
-from pimper_torch.method.fusion import estimate
-from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.patches_config import DecomposeConfig
-from pimper_torch.method.patches.warp import Warp
-from pimper_torch.method.photometry import factorize as factorization
-from pimper_torch.method.photometry.factorize import Factorize
-from pimper_torch.method.photometry.fit_light import FitLight
-from pimper_torch.method.sfm.sparse_scene import sound
-from pimper_torch.method.silhouettes.find import FindSilhouettes
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
-from pimper_torch.method.sweep.sweep import Sweep
+from pimper_torch.chains.photometric import Photometric
+from pimper_torch.export.reports import summary_report
+from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.records import Failure, PatchStatus, Silhouettes
 from pimper_torch.runtime.errors import OutOfMemoryError, PimperWarning, ReconstructionError
 from pimper_torch.runtime.failures import collecting as collecting_entries
 from pimper_torch.runtime.failures import distinct, skipped, solved_or, warn_of
-from pimper_torch.runtime.stage import Given
+from pimper_torch.stages.fusion import estimate
+from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.stages.patches.patches_config import DecomposeConfig
+from pimper_torch.stages.patches.warp import Warp
+from pimper_torch.stages.photometry import factorize as factorization
+from pimper_torch.stages.photometry.factorize import Factorize
+from pimper_torch.stages.photometry.fit_light import FitLight
+from pimper_torch.stages.sfm.sparse_scene import sound
+from pimper_torch.stages.silhouettes.find import FindSilhouettes
+from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.stages.stage import Given
+from pimper_torch.stages.sweep.sweep import Sweep
 
 # torch's message on the CPU.
 NO_MEMORY = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 123456789 bytes."

@@ -10,9 +10,9 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 import pimper_torch as pt
-from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import OrientedPoints
-from pimper_torch.runtime.stage import Given
+from pimper_torch.stages.stage import Given
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 

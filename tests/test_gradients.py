@@ -12,11 +12,11 @@ from torch.nn.functional import normalize
 import pimper_torch as pt
 from pimper_bench.scenes import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.method.photometry import lights
-from pimper_torch.method.photometry.factor_priors import FactorPrior, PriorTerms
-from pimper_torch.method.photometry.light_field import harmonics
+from pimper_torch.lighting import lights
+from pimper_torch.lighting.light_field import harmonics
 from pimper_torch.records import Silhouettes
-from pimper_torch.runtime.stage import Given
+from pimper_torch.stages.photometry.factor_priors import FactorPrior, PriorTerms
+from pimper_torch.stages.stage import Given
 
 # Tolerances; single stages agree far better. Kinks at borders of pixels that are too small to
 # separate from slopes remain, and a complete scene has more of them.

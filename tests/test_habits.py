@@ -11,7 +11,7 @@ from torch import nn
 
 import pimper_torch as pt
 from pimper_torch.records import Silhouettes
-from pimper_torch.runtime.stage import Given
+from pimper_torch.stages.stage import Given
 
 LIT = pytest.mark.filterwarnings("ignore:Factorization")  # few patches have enough lit views
 

@@ -5,12 +5,12 @@ import torch
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.method.meshing.extract import Extract
 from pimper_torch.records import Mesh, Surface
 from pimper_torch.runtime.errors import PimperWarning, caution
 from pimper_torch.runtime.reporting import SilentObserver
-from pimper_torch.runtime.stage import Given
-from pimper_torch.runtime.store import digest
+from pimper_torch.stages.meshing.extract import Extract
+from pimper_torch.stages.stage import Given
+from pimper_torch.store import digest
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 

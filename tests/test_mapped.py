@@ -9,14 +9,14 @@ import pytest
 import torch
 from PIL import Image
 
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.geometry.pyramids import prepare
-from pimper_torch.method.sfm.undistort import undistort
+from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.geometry.undistortion import undistort
+from pimper_torch.io.photographs import load_views
 from pimper_torch.records import CameraModel, Silhouettes
 from pimper_torch.runtime import mapped
 from pimper_torch.runtime.errors import OutputError
 from pimper_torch.runtime.memory import resident_bytes
-from pimper_torch.runtime.store import digest, realigned
+from pimper_torch.store import digest, realigned
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
 

@@ -5,10 +5,11 @@ import pytest
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.method.patches.decompose import Decompose
+from pimper_torch.chains.fusion_memory import largest_problem
 from pimper_torch.runtime.config import bytes_of
 from pimper_torch.runtime.errors import ConfigError, ReconstructionError
-from pimper_torch.runtime.memory import largest_problem, resident_bytes
+from pimper_torch.runtime.memory import resident_bytes
+from pimper_torch.stages.patches.decompose import Decompose
 
 
 @pytest.mark.parametrize(("text", "size"), [("4GB", 4e9), ("800 mb", 8e8), ("", float("inf"))])

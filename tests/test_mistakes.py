@@ -9,7 +9,7 @@ from probes import small_scene
 
 import pimper_torch as pt
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.radiometry import linear_from_srgb, to_bytes
+from pimper_torch.radiometry import linear_from_srgb, to_bytes
 from tests.coarse import ball
 
 FLIP = torch.tensor([1.0, -1, -1, 1]).diag()

@@ -5,8 +5,8 @@ import torch
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.method.photometry import Bilinear, Cone
 from pimper_torch.single_view import factorization
+from pimper_torch.stages.photometry import Bilinear, Cone
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import pytest
 from torch import nn
 
-from pimper_torch.method.chains.running import ChainRun
+from pimper_torch.chains.running import ChainRun
 from pimper_torch.runtime.errors import PimperWarning, caution
 
 

@@ -47,7 +47,7 @@ def test_nothing_is_unpickled():
 
 def test_no_network_connection_is_made():
     found = {path for path, name in imports() if name in NETWORK}
-    assert found == {"result/viewer/server.py"}  # checks whether an address is local
+    assert found == {"viewer/server.py"}  # checks whether an address is local
 
 
 def test_no_text_is_evaluated_as_code():
@@ -59,8 +59,8 @@ def test_no_text_is_evaluated_as_code():
 
 def test_only_baselines_and_python_are_run_as_processes():
     assert {path for path, name in imports() if name in ("subprocess", "pty")} == {
-        "result/asset/atlas.py",  # Python, which calls xatlas
+        "stages/texturing/atlas.py",  # Python, which calls xatlas
         "cli/batches/task.py",  # Python, which is `pimper reconstruct`
         "baselines/openmvs.py",
-        "ground/kernels/compile.py",  # Python, which compiles its kernels
+        "kernels/compile.py",  # Python, which compiles its kernels
     }

@@ -7,7 +7,7 @@ from solved import solved
 from torch import nn
 
 import pimper_torch as pt
-from pimper_torch.runtime.stage import Given
+from pimper_torch.stages.stage import Given
 
 # Some of the few patches have too few lit views.
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")

@@ -5,19 +5,19 @@ from torch.testing import assert_close
 from twins import using
 
 import pimper_torch as pt
-from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.ground.geometry.pyramids import prepare
-from pimper_torch.method.chains.photometric import Photometric
-from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.patches_config import DecomposeConfig
-from pimper_torch.method.patches.warp import Warp
-from pimper_torch.method.photometry.factorize import Factorize
-from pimper_torch.method.photometry.fit_light import FitLight
-from pimper_torch.method.photometry.lights import thinned
-from pimper_torch.method.sweep.sweep import Sweep
+from pimper_torch.chains.photometric import Photometric
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.lighting.lights import thinned
 from pimper_torch.records import Silhouettes, SparseScene, StageReport
 from pimper_torch.runtime.reporting import SilentObserver
-from pimper_torch.runtime.stage import Given
+from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.stages.patches.patches_config import DecomposeConfig
+from pimper_torch.stages.patches.warp import Warp
+from pimper_torch.stages.photometry.factorize import Factorize
+from pimper_torch.stages.photometry.fit_light import FitLight
+from pimper_torch.stages.stage import Given
+from pimper_torch.stages.sweep.sweep import Sweep
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 

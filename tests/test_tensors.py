@@ -11,8 +11,8 @@ import trimesh
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.ground.geometry.local_frame import from_local
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.local_frame import from_local
+from pimper_torch.geometry.projection import project
 from tests.sfm.ball import cameras_on_an_arc, photographs
 
 SCRIPT = Path(__file__).parent / "scripts" / "look_inside.py"

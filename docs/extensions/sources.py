@@ -27,7 +27,7 @@ class Source:
     """The source that one docstring states.
 
     Attributes:
-        module: Whose docstring, such as ``pimper_torch.method.photometry.cone``.
+        module: Whose docstring, such as ``pimper_torch.stages.photometry.cone``.
         name: Of the function or class; empty for the module itself.
         text: The citation, reStructuredText.
     """

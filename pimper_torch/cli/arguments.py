@@ -121,7 +121,7 @@ def summary(documented: object) -> str:
 def plain(text: str) -> str:
     """Remove reStructuredText markup from a text.
 
-    >>> plain("The ``encoding`` of :func:`~pimper_torch.doors.io.photographs.load_views`.")
+    >>> plain("The ``encoding`` of :func:`~pimper_torch.io.photographs.load_views`.")
     'The `encoding` of `load_views`.'
     """
     return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", r"`\1`", text).replace("``", "`")

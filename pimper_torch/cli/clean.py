@@ -9,7 +9,7 @@ import tyro
 
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.result_folder.folders import clean_output, require_cleanable
+from pimper_torch.export.result_folder.folders import clean_output, require_cleanable
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ import traceback
 from datetime import UTC, datetime
 from pathlib import Path
 
-from pimper_torch.doors.io.version import versions
+from pimper_torch.io.version import versions
 
 
 def what_killed(ended: int) -> str:

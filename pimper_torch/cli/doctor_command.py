@@ -11,8 +11,8 @@ import tyro
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.doctor.findings import Finding, machine
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.io.photograph_files import list_images
-from pimper_torch.ground.radiometry import FROM_FILES, Encoding
+from pimper_torch.io.photograph_files import list_images
+from pimper_torch.radiometry import FROM_FILES, Encoding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

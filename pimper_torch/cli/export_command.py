@@ -9,7 +9,7 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.result_folder.folders import prepare_output, require_apart, written_whole
+from pimper_torch.export.result_folder.folders import prepare_output, require_apart, written_whole
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import InputError
 
@@ -47,8 +47,8 @@ class ExportJob:
 
 def run(job: ExportJob, output: Output) -> None:
     """Run ``export``: read the result, and write all formats or none."""
-    from pimper_torch.doors.export.layouts import WITH_PHOTOGRAPHS, write_formats
-    from pimper_torch.doors.export.result import read_result, read_written
+    from pimper_torch.export.layouts import WITH_PHOTOGRAPHS, write_formats
+    from pimper_torch.export.result import read_result, read_written
     from pimper_torch.runtime.reporting import stage
 
     with output.observer(), written_whole(job.out, "data set", overwrite=job.overwrite) as staging:

@@ -9,7 +9,7 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.result_folder.folders import prepare_output, require_apart, written_whole
+from pimper_torch.export.result_folder.folders import prepare_output, require_apart, written_whole
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.progress import report

@@ -27,8 +27,8 @@ from typing import Any
 from pimper_torch.cli.crash_report import write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
-from pimper_torch.doors.io.version import versions
-from pimper_torch.doors.result_folder.files import require_name
+from pimper_torch.export.result_folder.files import require_name
+from pimper_torch.io.version import versions
 from pimper_torch.runtime.cores import usable_cores
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperError, PimperWarning
 
@@ -72,7 +72,7 @@ _COMMANDS = {
     "demo": "pimper_torch.cli.options",
     "config": "pimper_torch.cli.settings",
     "export": "pimper_torch.cli.export_command",
-    "gamma": "pimper_torch.single_view.cli.gamma",
+    "gamma": "pimper_torch.cli.gamma",
     "view": "pimper_torch.cli.view",
     "frames": "pimper_torch.cli.frames",
     "markers": "pimper_torch.cli.markers",

@@ -9,9 +9,9 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.result_folder.files import file_written_whole, prepare_file
-from pimper_torch.doors.scale.sheet import SIDE_MM, TITLE, Paper, layout
+from pimper_torch.export.result_folder.files import file_written_whole, prepare_file
 from pimper_torch.runtime.config import require
+from pimper_torch.scale.sheet import SIDE_MM, TITLE, Paper, layout
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +35,7 @@ class _Job:
 
 def run(job: _Job, output: Output) -> None:
     """Run ``markers``."""
-    from pimper_torch.result.viz.marker_sheet import write_sheet
+    from pimper_torch.viz.marker_sheet import write_sheet
 
     with file_written_whole(job.out) as fresh:
         write_sheet(fresh, job.side_mm, job.paper)

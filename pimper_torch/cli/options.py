@@ -11,17 +11,18 @@ import tyro
 
 from pimper_torch.cli.arguments import Flag, Option, options_of, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.io.photograph_files import image_name, list_images
-from pimper_torch.doors.result_folder.files import require_name
-from pimper_torch.doors.result_folder.folders import prepare_output, require_apart
-from pimper_torch.doors.scale import given
-from pimper_torch.method.chains.chain_config import Config, PublishedConfig, load_config
+from pimper_torch.export.result_folder.files import require_name
+from pimper_torch.export.result_folder.folders import prepare_output, require_apart
+from pimper_torch.io.assets.mesh_files import MeshFiles, MeshFormat, TextureFormat
+from pimper_torch.io.photograph_files import image_name, list_images
+from pimper_torch.paper.paper_config import PublishedConfig
+from pimper_torch.presets.load_config import Config, load_config
 from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
-from pimper_torch.result.asset.mesh_files import MeshFiles, MeshFormat, TextureFormat
-from pimper_torch.result.viewer.server import require_viser
 from pimper_torch.runtime.config import bytes_of, presets, require
 from pimper_torch.runtime.errors import ConfigError, InputError
 from pimper_torch.runtime.file_names import view_named
+from pimper_torch.scale import given
+from pimper_torch.viewer.server import require_viser
 
 
 def _word(kind: type, read: Callable[[str], object], metavar: str) -> Any:  # noqa: ANN401 - tyro's

@@ -9,37 +9,37 @@ from pathlib import Path
 
 import torch
 
+from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.doctor.checks import examine_views
 from pimper_torch.cli.doctor.cost import planned
 from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.cli.options import Job
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.view import print_address
-from pimper_torch.doors.io.decode import read_header
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.io.photograph_files import image_name, list_images
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.doors.io.results import RESULT_NAMES, write_result
-from pimper_torch.doors.result_folder.folders import held_output
-from pimper_torch.doors.result_folder.marker import STAGES
-from pimper_torch.doors.result_folder.stages import PREVIEW
-from pimper_torch.doors.scale import given
-from pimper_torch.doors.scale.find_scale import find_scale
-from pimper_torch.doors.scale.scale import Scale
-from pimper_torch.doors.scale.scaled import scaled
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.method.chains.presets import make_chain
+from pimper_torch.export.result_folder.folders import held_output
+from pimper_torch.export.result_folder.marker import STAGES
+from pimper_torch.export.result_folder.stages import PREVIEW
+from pimper_torch.export.results import RESULT_NAMES, write_result
+from pimper_torch.io.decode import read_header
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.io.photograph_files import image_name, list_images
+from pimper_torch.io.photographs import load_views
+from pimper_torch.presets.load_chain import make_chain
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
-from pimper_torch.result.viewer.show import COARSE, RESULT, add_found
-from pimper_torch.result.viewer.viewer import Viewer
-from pimper_torch.result.viz.overview import draw_preview, headline
 from pimper_torch.runtime.config import bytes_of
 from pimper_torch.runtime.errors import ConfigError, caution, cautioned
 from pimper_torch.runtime.ledger import closing_line
 from pimper_torch.runtime.reporting import accounted, reported, stage
-from pimper_torch.runtime.store import Store
+from pimper_torch.scale import given
+from pimper_torch.scale.find_scale import find_scale
+from pimper_torch.scale.scale import Scale
+from pimper_torch.scale.scaled import scaled
+from pimper_torch.store import Store
+from pimper_torch.viewer.show import COARSE, RESULT, add_found
+from pimper_torch.viewer.viewer import Viewer
+from pimper_torch.viz.overview import draw_preview, headline
 
 
 def carry_out(job: Job, output: Output) -> None:

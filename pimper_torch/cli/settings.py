@@ -12,7 +12,7 @@ import tyro
 
 from pimper_torch.cli.arguments import meanings, options_of, read_arguments, summary
 from pimper_torch.cli.output import Output
-from pimper_torch.method.chains.chain_config import Config, load_config
+from pimper_torch.presets.load_config import Config, load_config
 from pimper_torch.runtime.config import nearest, presets, to_mapping, written
 from pimper_torch.runtime.errors import ConfigError
 

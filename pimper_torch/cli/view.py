@@ -10,11 +10,11 @@ import tyro
 
 from pimper_torch.cli.arguments import read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.result.viewer.server import HOST, PORT, require_viser
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.viewer.server import HOST, PORT, require_viser
 
 if TYPE_CHECKING:
-    from pimper_torch.result.viewer.viewer import Viewer
+    from pimper_torch.viewer.viewer import Viewer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,8 +37,8 @@ class _Job:
 
 def run(job: _Job, output: Output) -> None:
     """Run ``view``."""
-    from pimper_torch.result.viewer.show import add_folder
-    from pimper_torch.result.viewer.viewer import Viewer
+    from pimper_torch.viewer.show import add_folder
+    from pimper_torch.viewer.viewer import Viewer
 
     # Ctrl-C is the regular end.
     with Viewer(job.host, job.port) as viewer, suppress(KeyboardInterrupt):

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.projection import project
 from pimper_torch.records import MapPrior, Record, SparseScene
 
 

@@ -1,8 +1,8 @@
 """Priors with resolved conventions that agree with the scene."""
 
-from pimper_torch.method.sfm.undistort import with_undistorted_priors
 from pimper_torch.priors.depth import resolve_depth_conventions
 from pimper_torch.priors.normals import resolve_normal_conventions
+from pimper_torch.priors.undistort import with_undistorted_priors
 from pimper_torch.records import DepthPrior, NormalPrior, Prior, Silhouettes, SparseScene
 
 

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.ground.shapes import Scalar
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.priors.at_points import AtPoints, at_points, exif_errors, means_by, reoriented
 from pimper_torch.priors.choice import better_change, clearly_better
 from pimper_torch.records import DepthPrior, SparseScene
+from pimper_torch.records.shapes import Scalar
 from pimper_torch.runtime.errors import InputError, caution, some
 
 Along = Literal["axis", "ray"]

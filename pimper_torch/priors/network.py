@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.priors import from_maps
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import AlbedoPrior, InlierPrior, Prior, SparseScene, Views
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import ConfigError, InputError

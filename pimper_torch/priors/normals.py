@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.contours import contour_rays
-from pimper_torch.ground.shapes import Points
+from pimper_torch.geometry.contours import contour_rays
 from pimper_torch.priors.at_points import (
     at_points,
     exif_errors,
@@ -28,6 +27,7 @@ from pimper_torch.priors.at_points import (
 from pimper_torch.priors.choice import better_change, clearly_better
 from pimper_torch.records import NormalPrior, Record, Silhouettes, SparseScene
 from pimper_torch.records.priors import AXES
+from pimper_torch.records.shapes import Points
 from pimper_torch.runtime.errors import InputError, caution, some
 
 _NAMED: list[tuple[int, ...]] = [signs for signs, _ in AXES.values()]

@@ -32,10 +32,7 @@ from pimper_torch.records.priors import NormalPrior as NormalPrior
 from pimper_torch.records.priors import Prior as Prior
 from pimper_torch.records.priors import SilhouettePrior as SilhouettePrior
 from pimper_torch.records.reconstruction import Estimate as Estimate
-from pimper_torch.records.reconstruction import Failure as Failure
 from pimper_torch.records.reconstruction import Reconstruction as Reconstruction
-from pimper_torch.records.reconstruction import Removal as Removal
-from pimper_torch.records.reconstruction import StageReport as StageReport
 from pimper_torch.records.record import Record as Record
 from pimper_torch.records.scene import CameraModel as CameraModel
 from pimper_torch.records.scene import CoarseMesh as CoarseMesh
@@ -53,6 +50,9 @@ from pimper_torch.records.stored import load_record as load_record
 from pimper_torch.records.stored import save_record as save_record
 from pimper_torch.records.views import Cameras as Cameras
 from pimper_torch.records.views import Views as Views
+from pimper_torch.runtime.events import Failure as Failure
+from pimper_torch.runtime.events import Removal as Removal
+from pimper_torch.runtime.events import StageReport as StageReport
 from pimper_torch.runtime.renamed import renamed_names
 
 __getattr__ = renamed_names(__name__, {"LeftOut": "Removal", "Lens": "CameraModel"})

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from pimper_torch.ground.shapes import FaceMask, Vertices
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import Mesh
+from pimper_torch.records.shapes import FaceMask, Vertices
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -8,6 +8,7 @@ and its outward normal is -z. A depth on the template is a coordinate along z.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
@@ -17,13 +18,14 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Faces, PerVertex, Scalars, VertexMask, Vertices
 from pimper_torch.records.record import AnyRecord, Record
 from pimper_torch.records.scene import CoarseMesh, Mesh
+from pimper_torch.records.shapes import Faces, PerVertex, Scalars, VertexMask, Vertices
 from pimper_torch.records.value_checks import (
     Faults,
     facing_away,
     faults_in,
+    mean,
     not_finite,
     not_unit,
     out_of_range,
@@ -195,6 +197,13 @@ class PatchSet(OverPatches):
             if not bool((bucket.spacing > 0).all()):
                 yield f"{name}.spacing", "is not above 0 everywhere", "scene units"
 
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        return {
+            "patches": self.num_patches,
+            "template_samples": sum(int(bucket.inside.sum()) for bucket in self.buckets),
+        }
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class PatchPriors(Record):
@@ -253,6 +262,13 @@ class PatchViews(OverPatches):
 
     patches: PatchSet
     buckets: tuple[Observations, ...]
+
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        pairs = list(zip(self.patches.buckets, self.buckets, strict=True))
+        samples = sum(int(bucket.inside.sum()) * views.valid.shape[1] for bucket, views in pairs)
+        valid = sum(int(views.valid.count_nonzero()) for _, views in pairs)
+        return {"samples": samples, "missing_samples": samples - valid}
 
 
 class StopCause(IntEnum):
@@ -441,6 +457,22 @@ class PhotometricPatches(OverPatches):
                 name = f"buckets[{index}].normals_patch"
                 yield name, f"is of {found}", f"{needed}, like its templates"
 
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        pairs = list(zip(self.patches.buckets, self.buckets, strict=True))
+        inside = sum(int(templates.inside.sum()) for templates, _ in pairs)
+        count = self.patches.num_patches
+        convergence = [bucket.convergence for _, bucket in pairs]
+        statuses = Counter(code for _, bucket in pairs for code in bucket.status.tolist())
+        return {
+            "valid_fraction": sum(int(bucket.valid.sum()) for _, bucket in pairs) / inside,
+            **{f"{status.name.lower()}_patches": statuses[status] for status in PatchStatus},
+            "converged_patches": sum(int(state.converged.sum()) for state in convergence),
+            "mean_iterations": sum(float(state.iterations.sum()) for state in convergence) / count,
+            "mean_residual": sum(float(state.residual.detach().sum()) for state in convergence)
+            / count,
+        }
+
 
 def _given(
     templates: Templates,
@@ -538,6 +570,31 @@ class SweptPatches(OverPhotometry):
     buckets: tuple[Heights, ...]
     averaged: float
 
+    def figures(self) -> dict[str, int | float]:
+        """Return the median deviation of priors over its stated error; 1 if variances are right."""
+        angles, normals, depths = [], [], []
+        for light, height in zip(self.photometric.buckets, self.buckets, strict=True):
+            if (prior := height.priors) is not None:
+                known = light.valid & (prior.normal_information > 0)
+                square = (prior.normals_patch - light.normals_patch)[known].square().sum(dim=-1)
+                variance = 1 / prior.normal_information[known] + 1 / light.information[known]
+                angles.append(square.detach())
+                normals.append((square / variance).detach())
+                known = (height.information > 0) & (prior.offset_information > 0)
+                square = (prior.offset - height.offset)[known].square()
+                variance = 1 / prior.offset_information[known] + 1 / height.information[known]
+                depths.append((square / variance).detach())
+        metrics: dict[str, int | float] = {}
+        if sum(map(len, normals)):
+            # Medians of squared Gaussian noise over their mean: log(2) in 2D, 0.4549 in 1D.
+            metrics["prior_normals_deg"] = math.degrees(float(torch.cat(angles).median()) ** 0.5)
+            metrics["prior_normals_over_claim"] = (
+                float(torch.cat(normals).median() / math.log(2)) ** 0.5
+            )
+        if sum(map(len, depths)):
+            metrics["prior_depths_over_claim"] = float(torch.cat(depths).median() / 0.4549) ** 0.5
+        return metrics
+
 
 class AlignStatus(IntEnum):
     """Whether a patch's height field overlaps a neighbour's."""
@@ -589,6 +646,18 @@ class DepthPatches(OverPhotometry):
 
     buckets: tuple[Depths, ...]
     mismatch: Float[Tensor, " round"] | None = None
+
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        metrics: dict[str, int | float] = {
+            "valid_depths": sum(int(bucket.valid.sum()) for bucket in self.buckets)
+        }
+        if all(bucket.status is not None for bucket in self.buckets):
+            metrics["aligned_patches"] = sum(int(bucket.aligned.sum()) for bucket in self.buckets)
+        if self.mismatch is not None:
+            metrics["mismatch_before"] = float(self.mismatch[0])
+            metrics["mismatch"] = float(self.mismatch[-1])
+        return metrics
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -649,3 +718,11 @@ class Surface(Record):
             confidence=self.confidence,
             expected_error=self.expected_error,
         )
+
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        return {
+            "subdivision_points": len(self.vertices_world),
+            "supported_fraction": mean(self.supported.float()),
+            "relative_residual": mean(self.convergence.residual),
+        }

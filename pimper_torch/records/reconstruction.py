@@ -1,7 +1,6 @@
-"""The complete result of a run, its failures, and estimates of other methods for comparison."""
+"""The complete result of a run, and estimates of other methods for comparison."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,62 +11,7 @@ from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
 from pimper_torch.records.silhouettes import Silhouettes
 from pimper_torch.records.views import Cameras
-
-What = Literal[
-    "photographs", "features", "matches", "points", "pixels", "facets", "faces", "warning"
-]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Failure(Record):
-    """One patch, view, point or solver that failed while the run continued.
-
-    Attributes:
-        what: ``view``, ``points``, ``patch`` or ``solver``.
-        name: Name of the view, system or task; the facet's number for a patch.
-        done: What was done instead.
-    """
-
-    stage: str
-    what: str
-    name: str
-    reason: str
-    done: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Removal(Record):
-    """Items that a guard removed or reported; see :mod:`pimper_torch.runtime.ledger`.
-
-    Attributes:
-        guard: Stage and name, such as ``extract.borders``.
-        what: Kind of the items; samples of photographs are pixels.
-        names: Names of the photographs, if known.
-    """
-
-    guard: str
-    what: What
-    count: int
-    total: int
-    reason: str
-    names: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StageReport(Record):
-    """Cost and figures of one stage.
-
-    Attributes:
-        peak_memory_mb: Highest resident memory of the process up to the stage's end.
-        figures: Counts and fractions, such as ``samples`` or ``missing_samples``.
-        kept: Whether the record is an earlier run's; time and memory are then that run's.
-    """
-
-    name: str
-    seconds: float
-    peak_memory_mb: float
-    figures: dict[str, int | float]
-    kept: bool = False
+from pimper_torch.runtime.events import Failure, Removal, StageReport
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -83,7 +27,7 @@ class Reconstruction(Record):
         left_out: Items that guards removed or reported, in order.
         held_out: Photographs for evaluation, used only to estimate cameras; ``None`` without any.
         finished: The surface as written. ``finished``, ``relighting`` and ``asset`` are ``None``
-            until :meth:`~pimper_torch.method.chains.chain.Chain.finish` has made them.
+            until :meth:`~pimper_torch.chains.chain.Chain.finish` has made them.
     """
 
     mesh: Mesh

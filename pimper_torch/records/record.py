@@ -71,6 +71,10 @@ class Record:
                 for name, found, needed in value.faults():
                     yield f"{field.name}.{name}", found, needed
 
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage that made the record."""
+        return {}
+
     def to(
         self: AnyRecord, target: torch.device | str | torch.dtype, dtype: torch.dtype | None = None
     ) -> AnyRecord:

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Faces, PerVertex, Points, VertexMask, Vertices
 from pimper_torch.records.record import Record
-from pimper_torch.records.value_checks import Faults, faults_in, not_finite, out_of_range
+from pimper_torch.records.shapes import Faces, PerVertex, Points, VertexMask, Vertices
+from pimper_torch.records.value_checks import Faults, faults_in, mean, not_finite, out_of_range
 from pimper_torch.records.views import Cameras, Views
 from pimper_torch.runtime.renamed import renamed_fields
 
@@ -63,7 +63,7 @@ class SparseScene(Record):
             without such a background.
         offset_world: Added to this scene's coordinates, it gives those of the model that was read.
             Scenes far from that model's origin have a local one, see
-            :func:`~pimper_torch.ground.geometry.local_frame.local_origin`.
+            :func:`~pimper_torch.geometry.local_frame.local_origin`.
         sessions: Number of each view's capture session if the object was moved relative to its
             surroundings between sessions. Empty otherwise.
     """
@@ -112,6 +112,17 @@ class SparseScene(Record):
         """True where a view observes a point."""
         shape = len(self.points_world), self.cameras.num_views
         return pairs_table(self.observation_point, self.observation_view, shape)
+
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        return {
+            "views": self.views.num_views + len(self.unregistered),
+            "registered": self.views.num_views,
+            "sparse_points": len(self.points_world),
+            "mean_track_length": len(self.observation_point) / max(1, len(self.points_world)),
+            "mean_reprojection_px": mean(self.reprojection_errors_px),
+            "doubtful": int(bool(self.diagnosis)),
+        }
 
 
 def pairs_table(
@@ -197,6 +208,10 @@ class Mesh(Record):
         )
         yield from faults_in("vertices_world", "finite vertices", not_finite, self.vertices_world)
 
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        return {"vertices": len(self.vertices_world), "faces": len(self.faces)}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class FacetPoints(Record):
@@ -247,3 +262,11 @@ class CoarseMesh(Record):
     covariance_world: Float[Tensor, "vertex 3 3"] | None = None
     points: FacetPoints | None = None
     support: Int[Tensor, " face"] | None = None
+
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        return {
+            "mesh_points": len(self.mesh.vertices_world),
+            "filled_points": int((~self.is_point).sum()),
+            "triangles": len(self.mesh.faces),
+        }

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Masks, Points
 from pimper_torch.records.record import Record
+from pimper_torch.records.shapes import Masks, Points
 from pimper_torch.records.views import Views
 from pimper_torch.runtime.mapped import by_view
 
@@ -64,6 +64,14 @@ class Silhouettes(Record):
         """True where the object is more likely than not."""
         return by_view(lambda inside: inside > 0.5, self.inside)
 
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        masks = self.masks
+        return {
+            "reliable_views": int(self.reliable.sum()),
+            "object_fraction": int(masks.count_nonzero()) / max(1, masks.numel()),
+        }
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ContourRays(Record):
@@ -115,6 +123,10 @@ class OrientedPoints(Record):
     normals_world: Points
     noise: Float[Tensor, " point"]
 
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        return {"points": len(self.points_world)}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SilhouetteCoverage(Record):
@@ -127,3 +139,14 @@ class SilhouetteCoverage(Record):
 
     uncovered: Float[Tensor, " view"]
     outside: Float[Tensor, " view"]
+
+    def figures(self) -> dict[str, int | float]:
+        """Return counts and fractions for the report of the stage."""
+        if not len(self.uncovered):
+            return {}
+        return {
+            "covered": 1 - float(self.uncovered.mean()),
+            "sticking_out": float(self.outside.mean()),
+            "least_covered": 1 - float(self.uncovered.max()),
+            "most_sticking_out": float(self.outside.max()),
+        }

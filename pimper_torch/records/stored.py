@@ -25,6 +25,7 @@ from torch.utils import _pytree as pytree
 
 from pimper_torch.records.record import AnyRecord, Record, choices
 from pimper_torch.runtime.errors import InputError, OutputError
+from pimper_torch.runtime.events import Event
 
 _KEY = "pimper_torch record 2"
 # A choice: a run's last record has less than 1 MB of structure, and a malicious file must not make
@@ -127,7 +128,7 @@ def as_json(value: object, names: Mapping[int, str] | None = None) -> str:
     """
 
     def plain(value: object) -> object:
-        if isinstance(value, Record):
+        if isinstance(value, Record | Event):
             fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
             return {"record": type(value).__name__, "fields": fields}
         kind = ""
@@ -156,7 +157,7 @@ def of_json(value: Any, hint: Any, where: str, tensors: Mapping[str, Tensor]) ->
         return of_json(item, hint, f"{where}.{name}", tensors)
 
     hints = typing.get_args(kind)
-    if _is_a(kind, Record):
+    if _is_a(kind, Record | Event):
         names = [field.name for field in dataclasses.fields(kind)]
         hint_of = typing.get_type_hints(kind)
         fields = value["fields"]
@@ -180,7 +181,7 @@ def _fits(value: Any, hint: Any, tensors: Mapping[str, Tensor]) -> bool:  # noqa
     if origin is typing.Literal:
         return any(type(value) is type(choice) and value == choice for choice in hints)
     match value:
-        case {"record": name, "fields": dict()} if _is_a(hint, Record):
+        case {"record": name, "fields": dict()} if _is_a(hint, Record | Event):
             return bool(name == hint.__name__)
         case {"tensor": str(name)} if _is_a(hint, AbstractArray | Tensor):
             return name in tensors

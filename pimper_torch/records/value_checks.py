@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from pimper_torch.ground.shapes import Vectors
+from pimper_torch.records.shapes import Vectors
 
 _passed: Any = WeakIdKeyDictionary()  # by tensor: its passed checks; torch does not type it
 
@@ -144,3 +144,8 @@ def not_pinhole(intrinsics: Float[Tensor, "view 3 3"]) -> str:
         return ""
     view = int(bad.nonzero()[0, 0])
     return f"has {int(bad.sum())} matrices that are not K, the first {intrinsics[view].tolist()}"
+
+
+def mean(values: Tensor) -> float:
+    """Return the mean, or 0 of no values."""
+    return float(values.mean()) if len(values) else 0.0

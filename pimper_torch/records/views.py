@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Masks
 from pimper_torch.records.priors import Prior
 from pimper_torch.records.record import Record
+from pimper_torch.records.shapes import Masks
 from pimper_torch.records.value_checks import (
     Faults,
     faults_in,

@@ -13,7 +13,6 @@ from typing import TypeVar
 import torch
 from jaxtyping import Int
 
-from pimper_torch.records.reconstruction import Failure, Removal
 from pimper_torch.runtime.errors import (
     NumericalError,
     OnFailure,
@@ -21,6 +20,7 @@ from pimper_torch.runtime.errors import (
     ReconstructionError,
     caution,
 )
+from pimper_torch.runtime.events import Failure, Removal
 from pimper_torch.runtime.journal import current, writing
 
 Result = TypeVar("Result")

@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Faces, Vertices
-from pimper_torch.records.reconstruction import Removal, What
 from pimper_torch.runtime.errors import some
+from pimper_torch.runtime.events import Removal, What
 from pimper_torch.runtime.journal import Journal, current, writing
 
 GUARDS: dict[str, tuple[What, str]] = {
@@ -70,7 +69,7 @@ GUARDS: dict[str, tuple[What, str]] = {
 }
 """All guards, in the order of the chain: the removed elements, or a warning, and the reason."""
 
-Places = Float[Tensor, "place 3"] | tuple[Vertices, Faces]
+Places = Float[Tensor, "place 3"] | tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
 Listener = Callable[[Removal, Tensor | None, Tensor | None], None]
 """Receives an entry, the mask of removed elements, and their positions in the world."""
 
@@ -118,7 +117,7 @@ def leave_out(
 def listening(listener: Listener) -> AbstractContextManager[Journal]:
     """Pass every entry of the ``with`` block and its threads to a listener, with masks.
 
-    Not of records kept by an earlier run (:mod:`pimper_torch.runtime.store`), which have no masks.
+    Not of records kept by an earlier run (:mod:`pimper_torch.store`), which have no masks.
     """
     return writing(replace(current(), masks=listener))
 

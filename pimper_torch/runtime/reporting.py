@@ -1,40 +1,15 @@
 """Stage reports: time, memory, and figures of the returned record."""
 
-import math
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import singledispatch
 from threading import Lock
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-import torch
-from torch import Tensor
-
-from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.ground.geometry.topology import boundary_loops
-from pimper_torch.records import (
-    CoarseMesh,
-    DepthPatches,
-    Mesh,
-    OrientedPoints,
-    PatchSet,
-    PatchStatus,
-    PatchViews,
-    PhotometricPatches,
-    SilhouetteCoverage,
-    Silhouettes,
-    SparseScene,
-    StageReport,
-    Surface,
-    SweptPatches,
-)
+from pimper_torch.runtime.events import StageReport
 from pimper_torch.runtime.journal import HASH, KEEP, Journal, current, writing
-
-R = TypeVar("R")
 
 _counting = Lock()
 
@@ -170,14 +145,6 @@ def add_counts(counts: Mapping[str, int | float]) -> None:
             metrics[name] = metrics.get(name, 0) + count
 
 
-def called(name: str, call: Callable[..., R], *inputs: object) -> R:
-    """Return the record of a stage, and report the call with the record's figures."""
-    with stage(name) as metrics:
-        record = call(*inputs)
-        metrics |= figures(record)
-    return record
-
-
 def peak_memory_mb() -> float:
     """Return the peak resident memory of this process so far, in MB; 0 on Windows."""
     if sys.platform == "win32":
@@ -186,156 +153,3 @@ def peak_memory_mb() -> float:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)  # bytes there, kilobytes here
-
-
-@singledispatch
-def figures(record: object) -> dict[str, int | float]:
-    """Return counts and fractions that characterize a record, for its report."""
-    return {}
-
-
-@figures.register
-def _(scene: SparseScene) -> dict[str, int | float]:
-    return {
-        "views": scene.views.num_views + len(scene.unregistered),
-        "registered": scene.views.num_views,
-        "sparse_points": len(scene.points_world),
-        "mean_track_length": len(scene.observation_point) / max(1, len(scene.points_world)),
-        "mean_reprojection_px": _mean(scene.reprojection_errors_px),
-        "doubtful": int(bool(scene.diagnosis)),
-    }
-
-
-@figures.register
-def _(silhouettes: Silhouettes) -> dict[str, int | float]:
-    masks = silhouettes.masks
-    return {
-        "reliable_views": int(silhouettes.reliable.sum()),
-        "object_fraction": int(masks.count_nonzero()) / max(1, masks.numel()),
-    }
-
-
-@figures.register
-def _(coverage: SilhouetteCoverage) -> dict[str, int | float]:
-    if not len(coverage.uncovered):
-        return {}
-    return {
-        "covered": 1 - float(coverage.uncovered.mean()),
-        "sticking_out": float(coverage.outside.mean()),
-        "least_covered": 1 - float(coverage.uncovered.max()),
-        "most_sticking_out": float(coverage.outside.max()),
-    }
-
-
-@figures.register
-def _(contours: Contours) -> dict[str, int | float]:
-    return {"contour_rays": len(contours.rays.view)}
-
-
-@figures.register
-def _(cloud: OrientedPoints) -> dict[str, int | float]:
-    return {"points": len(cloud.points_world)}
-
-
-@figures.register
-def _(coarse: CoarseMesh) -> dict[str, int | float]:
-    return {
-        "mesh_points": len(coarse.mesh.vertices_world),
-        "filled_points": int((~coarse.is_point).sum()),
-        "triangles": len(coarse.mesh.faces),
-    }
-
-
-@figures.register
-def _(patches: PatchSet) -> dict[str, int | float]:
-    return {
-        "patches": patches.num_patches,
-        "template_samples": sum(int(bucket.inside.sum()) for bucket in patches.buckets),
-    }
-
-
-@figures.register
-def _(observed: PatchViews) -> dict[str, int | float]:
-    pairs = list(zip(observed.patches.buckets, observed.buckets, strict=True))
-    samples = sum(int(bucket.inside.sum()) * views.valid.shape[1] for bucket, views in pairs)
-    valid = sum(int(views.valid.count_nonzero()) for _, views in pairs)
-    return {"samples": samples, "missing_samples": samples - valid}
-
-
-@figures.register
-def _(photometric: PhotometricPatches) -> dict[str, int | float]:
-    pairs = list(zip(photometric.patches.buckets, photometric.buckets, strict=True))
-    inside = sum(int(templates.inside.sum()) for templates, _ in pairs)
-    count = photometric.patches.num_patches
-    convergence = [bucket.convergence for _, bucket in pairs]
-    statuses = Counter(code for _, bucket in pairs for code in bucket.status.tolist())
-    return {
-        "valid_fraction": sum(int(bucket.valid.sum()) for _, bucket in pairs) / inside,
-        **{f"{status.name.lower()}_patches": statuses[status] for status in PatchStatus},
-        "converged_patches": sum(int(state.converged.sum()) for state in convergence),
-        "mean_iterations": sum(float(state.iterations.sum()) for state in convergence) / count,
-        "mean_residual": sum(float(state.residual.detach().sum()) for state in convergence) / count,
-    }
-
-
-@figures.register
-def _(swept: SweptPatches) -> dict[str, int | float]:
-    """Return the median deviation of priors over its stated error; 1 if variances are right."""
-    angles, normals, depths = [], [], []
-    for light, height in zip(swept.photometric.buckets, swept.buckets, strict=True):
-        if (prior := height.priors) is not None:
-            known = light.valid & (prior.normal_information > 0)
-            square = (prior.normals_patch - light.normals_patch)[known].square().sum(dim=-1)
-            variance = 1 / prior.normal_information[known] + 1 / light.information[known]
-            angles.append(square.detach())
-            normals.append((square / variance).detach())
-            known = (height.information > 0) & (prior.offset_information > 0)
-            square = (prior.offset - height.offset)[known].square()
-            variance = 1 / prior.offset_information[known] + 1 / height.information[known]
-            depths.append((square / variance).detach())
-    metrics: dict[str, int | float] = {}
-    if sum(map(len, normals)):
-        # Medians of squared Gaussian noise over their mean: log(2) in 2D, 0.4549 in 1D.
-        metrics["prior_normals_deg"] = math.degrees(float(torch.cat(angles).median()) ** 0.5)
-        metrics["prior_normals_over_claim"] = (
-            float(torch.cat(normals).median() / math.log(2)) ** 0.5
-        )
-    if sum(map(len, depths)):
-        metrics["prior_depths_over_claim"] = float(torch.cat(depths).median() / 0.4549) ** 0.5
-    return metrics
-
-
-@figures.register
-def _(depths: DepthPatches) -> dict[str, int | float]:
-    metrics: dict[str, int | float] = {
-        "valid_depths": sum(int(bucket.valid.sum()) for bucket in depths.buckets)
-    }
-    if all(bucket.status is not None for bucket in depths.buckets):
-        metrics["aligned_patches"] = sum(int(bucket.aligned.sum()) for bucket in depths.buckets)
-    if depths.mismatch is not None:
-        metrics["mismatch_before"] = float(depths.mismatch[0])
-        metrics["mismatch"] = float(depths.mismatch[-1])
-    return metrics
-
-
-@figures.register
-def _(surface: Surface) -> dict[str, int | float]:
-    return {
-        "subdivision_points": len(surface.vertices_world),
-        "supported_fraction": _mean(surface.supported.float()),
-        "relative_residual": _mean(surface.convergence.residual),
-    }
-
-
-@figures.register
-def _(mesh: Mesh) -> dict[str, int | float]:
-    _, loop = boundary_loops(mesh.faces)
-    return {
-        "vertices": len(mesh.vertices_world),
-        "faces": len(mesh.faces),
-        "openings": int(loop.max()) + 1 if len(loop) else 0,
-    }
-
-
-def _mean(values: Tensor) -> float:
-    return float(values.mean()) if len(values) else 0.0

@@ -16,23 +16,23 @@ from torch.nn.functional import grid_sample, normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.doors.io.meshes import write_glb
-from pimper_torch.ground.geometry.pinholes import look_at
-from pimper_torch.ground.geometry.rigid import rotate, transform
-from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.ground.radiometry import linear_from_srgb, srgb_from_linear
+from pimper_torch.geometry.pinholes import look_at
+from pimper_torch.geometry.rigid import rotate, transform
+from pimper_torch.geometry.tangents import tangents
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.io.assets.placement import Placement, standing
+from pimper_torch.io.assets.usd import write_usdz
+from pimper_torch.io.assets.write import write_asset, write_asset_obj
+from pimper_torch.io.meshes import write_glb
+from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear
+from pimper_torch.radiometry.base_color import base_color
 from pimper_torch.records import Cameras, Mesh, TexturedMesh
-from pimper_torch.result.asset import atlas as atlases
-from pimper_torch.result.asset.atlas import MAX_SIDE, by_triangles, unwrapped
-from pimper_torch.result.asset.bake import textured
-from pimper_torch.result.asset.inpaint import inpainted
-from pimper_torch.result.asset.placement import Placement, standing
-from pimper_torch.result.asset.tangents import tangents
-from pimper_torch.result.asset.usd import write_usdz
-from pimper_torch.result.asset.write import write_asset, write_asset_obj
-from pimper_torch.result.viz.maps import base_color
 from pimper_torch.runtime.errors import PimperWarning
 from pimper_torch.runtime.parallel import on_one_thread
+from pimper_torch.stages.texturing import atlas as atlases
+from pimper_torch.stages.texturing.atlas import MAX_SIDE, by_triangles, unwrapped
+from pimper_torch.stages.texturing.bake import textured
+from pimper_torch.stages.texturing.inpaint import inpainted
 
 
 def ball(level: int) -> Mesh:

@@ -20,7 +20,7 @@ from pimper_torch.cli.batches.many_objects import batch
 from pimper_torch.cli.batches.objects import read_objects
 from pimper_torch.cli.batches.plan import planned_batch
 from pimper_torch.cli.batches.task import Outcome, carry_out, is_whole
-from pimper_torch.doors.result_folder.stages import locked
+from pimper_torch.export.result_folder.stages import locked
 from pimper_torch.runtime.errors import ConfigError, OutputError
 
 

@@ -7,8 +7,8 @@ import torch
 from guard_sets import SETS
 from guards import CHANGES, PATCHES, Heard, Judge, table
 
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.method.chains.chain_config import load_config
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.ledger import GUARDS, leave_out, listening
 

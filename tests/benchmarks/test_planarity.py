@@ -6,7 +6,7 @@ from planarity import dihedrals, planar_faces
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.subdivision import subdivide
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from pimper_bench.datasets.posed import file_in
-from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.io.cameras.layout import DataSetPath
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.numpy_files import read_npy, read_npz
 

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.doors.camera_files.transforms_json import read_cloud
-from pimper_torch.doors.export.nerfstudio import write_transforms
-from pimper_torch.method.sfm.existing import existing_model
-from pimper_torch.method.sfm.undistort import pinholes_for
+from pimper_torch.export.nerfstudio import write_transforms
+from pimper_torch.geometry.undistortion import pinholes_for
+from pimper_torch.io.cameras.existing import existing_model
+from pimper_torch.io.cameras.transforms_json import read_cloud
 from pimper_torch.records import Cameras, Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 

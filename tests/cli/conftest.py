@@ -18,7 +18,7 @@ def photos(tmp_path):
 @pytest.fixture
 def ctrl_c(monkeypatch):
     """Simulate Ctrl-C while a page is served."""
-    from pimper_torch.result.viewer.viewer import Viewer
+    from pimper_torch.viewer.viewer import Viewer
 
     def pressed(_):
         raise KeyboardInterrupt
@@ -29,9 +29,9 @@ def ctrl_c(monkeypatch):
 @pytest.fixture
 def chain(reconstruction, monkeypatch, lit_before):
     """Replace the real chain by one that records its arguments."""
+    from pimper_torch.chains.coarse_to_fine import CoarseToFine
     from pimper_torch.cli import run
-    from pimper_torch.doors.io import results
-    from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
+    from pimper_torch.export import results
 
     class Chain:
         given = None

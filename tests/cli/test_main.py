@@ -14,16 +14,17 @@ import pytest
 import torch
 from PIL import Image
 
+from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.main import main
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.doors.io.results import RESULT_NAMES, write_result
-from pimper_torch.doors.io.version import installed_version
-from pimper_torch.doors.result_folder.marker import MARKER
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig, load_config
-from pimper_torch.method.silhouettes.find import FindSilhouettes
+from pimper_torch.export.result_folder.marker import MARKER
+from pimper_torch.export.results import RESULT_NAMES, write_result
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.version import installed_version
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.records import Mesh, Removal, Silhouettes
 from pimper_torch.runtime.errors import PimperWarning, ReconstructionError
+from pimper_torch.stages.silhouettes.find import FindSilhouettes
 
 
 def run(*arguments):
@@ -390,7 +391,7 @@ def test_a_run_with_a_viewer_stays_until_ctrl_c(reconstruct, chain, reconstructi
 
 
 def test_without_a_viewer_a_run_is_refused(reconstruct, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pimper_torch.result.viewer.server.find_spec", lambda _: None)
+    monkeypatch.setattr("pimper_torch.viewer.server.find_spec", lambda _: None)
     assert reconstruct("--view") == 2
     assert "pip install 'pimper_torch[view]'" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()

@@ -13,14 +13,16 @@ import pytest
 from stand_ins import CHILD, children_stand_in, write_slurm
 
 from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.batches import task
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
-from pimper_torch.doors.io.meshes import read_mesh, write_ply
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig, PublishedConfig, load_config
+from pimper_torch.io.meshes import read_mesh, write_ply
+from pimper_torch.paper.paper_config import PublishedConfig
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import ConfigError
-from pimper_torch.runtime.store import Store
+from pimper_torch.store import Store
 from tests.video.clips import written
 
 # The values of each option; {names} are paths in the folder of `world`.

@@ -6,8 +6,8 @@ import pytest
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli.main import main
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.doors.result_folder.folders import held_output
+from pimper_torch.export.result_folder.folders import held_output
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 
 

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from pimper_torch.cli.main import main
-from pimper_torch.method.chains.chain_config import load_config
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.runtime.config import presets, to_mapping
 
 

@@ -11,12 +11,12 @@ from PIL import Image
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.cli.run import bars_in_files, scale_message
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.doors.scale.given import Mark
-from pimper_torch.doors.scale.marks import place_of
-from pimper_torch.doors.scale.scale import Scale
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.io.photographs import load_views
+from pimper_torch.scale.given import Mark
+from pimper_torch.scale.marks import place_of
+from pimper_torch.scale.scale import Scale
 
 # The surface of the small result has a random confidence.
 UNSURE = "ignore:.*hardly determine the surface:pimper_torch.runtime.errors.PimperWarning"

@@ -14,7 +14,7 @@ from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli import supervise
 from pimper_torch.cli.options import bundled_photographs
 from pimper_torch.cli.stopping import stoppable
-from pimper_torch.doors.io.meshes import write_ply
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process alone")

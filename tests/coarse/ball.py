@@ -5,11 +5,11 @@ from torch.nn.functional import normalize
 
 from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.method.coarse.coarse_config import CoarseSurfaceConfig
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Silhouettes
+from pimper_torch.stages.coarse.coarse_config import CoarseSurfaceConfig
 
 SETTINGS = CoarseSurfaceConfig(num_facets=600, levels=1)
 

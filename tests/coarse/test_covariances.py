@@ -4,7 +4,7 @@ from torch.testing import assert_close
 from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.method.coarse.surface import point_covariances
+from pimper_torch.stages.coarse.surface import point_covariances
 
 
 def noisy_cloud(noise_px, seed, span_deg=50.0):

@@ -7,30 +7,30 @@ from pimper_bench.scenes.procedural_meshes import icosphere, table
 from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.ground.geometry.poisson import poisson_surface
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.topology import connected_to
-from pimper_torch.method.coarse.densify import (
+from pimper_torch.geometry.poisson import poisson_surface
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.topology import connected_to
+from pimper_torch.records import Support
+from pimper_torch.stages.coarse.densify import (
     choose_sources,
     count_agreeing,
     push_pull,
     step_for_one_pixel,
 )
-from pimper_torch.method.coarse.oriented import (
+from pimper_torch.stages.coarse.oriented import (
     OrientedPoints,
     no_points,
     refit_normals,
     sparse_oriented,
     thinned,
 )
-from pimper_torch.method.coarse.trim import (
+from pimper_torch.stages.coarse.trim import (
     ViewCounts,
     near_points,
     supported_components,
     without_small_holes,
 )
-from pimper_torch.method.coarse.window_matching import level_of, pair
-from pimper_torch.records import Support
+from pimper_torch.stages.coarse.window_matching import level_of, pair
 from tests.coarse.ball import mottled
 
 

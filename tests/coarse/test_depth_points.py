@@ -4,13 +4,13 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from pimper_torch.doors.io.tensors import scene_of
-from pimper_torch.ground.geometry.pixels import scale_intrinsics
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.coarse.depth_points import depth_points
-from pimper_torch.method.sfm.triangulation import FEW_OBSERVED, lacks_points
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.tensors import scene_of
 from pimper_torch.records import SparseScene
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.coarse.depth_points import depth_points
+from pimper_torch.stages.sfm.triangulation import FEW_OBSERVED, lacks_points
 from tests.sfm.ball import cameras_on_an_arc, photographs
 
 

@@ -5,17 +5,17 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.topology import face_components, face_pairs
-from pimper_torch.method.coarse import trim
-from pimper_torch.method.coarse.fine_surface import closed_surface, cropped
-from pimper_torch.method.coarse.oriented import no_points
-from pimper_torch.method.coarse.surface import CoarseSurface
-from pimper_torch.method.coarse.trim import ViewCounts, seen_surface
-from pimper_torch.method.silhouettes.trace import TraceContours
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import face_components, face_pairs
 from pimper_torch.records import Support
 from pimper_torch.runtime.errors import ReconstructionError
+from pimper_torch.stages.coarse import trim
+from pimper_torch.stages.coarse.fine_surface import closed_surface, cropped
+from pimper_torch.stages.coarse.oriented import no_points
+from pimper_torch.stages.coarse.surface import CoarseSurface
+from pimper_torch.stages.coarse.trim import ViewCounts, seen_surface
+from pimper_torch.stages.silhouettes.trace import TraceContours
 from tests.coarse.ball import SETTINGS, mottled, photographed, silhouettes_of
 
 

@@ -6,15 +6,15 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.geometry.local_frame import to_local
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.topology import boundary_loops, face_components
-from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.method.chains.presets import load_chain
-from pimper_torch.method.coarse.given_mesh import oriented_outward, prepared
+from pimper_torch.geometry.local_frame import to_local
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import boundary_loops, face_components
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.records import Mesh, Silhouettes
 from pimper_torch.runtime.errors import InputError, PimperWarning
+from pimper_torch.stages.coarse.given_mesh import oriented_outward, prepared
 from tests.coarse.ball import all_round, silhouettes_of
 
 

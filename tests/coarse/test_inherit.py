@@ -4,10 +4,10 @@ from surfaces import surface_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.surfaces import barycentric_2d, vertex_normals
-from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.method.coarse.splitting import fitted_normals, split_edges
+from pimper_torch.geometry.surfaces import barycentric_2d, vertex_normals
+from pimper_torch.geometry.topology import face_edges
 from pimper_torch.records import Mesh
+from pimper_torch.stages.coarse.splitting import fitted_normals, split_edges
 
 
 def square():

@@ -2,10 +2,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.coarse.densify import DepthMaps
-from pimper_torch.method.coarse.oriented import count_contradictions, fitted_planes
-from pimper_torch.method.coarse.window_matching import MatchingLevel
+from pimper_torch.geometry.projection import project
+from pimper_torch.stages.coarse.densify import DepthMaps
+from pimper_torch.stages.coarse.oriented import count_contradictions, fitted_planes
+from pimper_torch.stages.coarse.window_matching import MatchingLevel
 
 
 def plane_round(depth, valid, row, column, step):

@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.method.coarse.reference import reference_view
+from pimper_torch.stages.coarse.reference import reference_view
 
 
 def test_the_frontal_view_is_the_centre_of_the_arc(dome_cloud):

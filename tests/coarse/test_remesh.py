@@ -6,14 +6,14 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.subdivision import subdivide
-from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
-from pimper_torch.ground.geometry.topology import boundary_vertices
-from pimper_torch.method.coarse.coarse_config import RemeshConfig
-from pimper_torch.method.coarse.remesh import remesh
-from pimper_torch.published.cloud_filters import delaunay
+from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, vertex_normals
+from pimper_torch.geometry.topology import boundary_vertices
+from pimper_torch.paper.cloud_filters import delaunay
 from pimper_torch.records import CoarseMesh, FacetPoints, Mesh
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.stages.coarse.coarse_config import RemeshConfig
+from pimper_torch.stages.coarse.remesh import remesh
 
 SPACING = 0.02
 

@@ -4,9 +4,9 @@ from scenes import edge_counts
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.method.coarse.splitting import mark_edges, split_edges
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import face_edges
+from pimper_torch.stages.coarse.splitting import mark_edges, split_edges
 
 
 def areas(vertices, faces):

@@ -6,18 +6,18 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.ground.geometry.topology import face_components, face_pairs
-from pimper_torch.method.coarse.surface import (
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.topology import face_components, face_pairs
+from pimper_torch.records import Mesh, Silhouettes, Support
+from pimper_torch.runtime.errors import InputError, ReconstructionError
+from pimper_torch.stages.coarse.surface import (
     CoarseSurface,
     facets_of,
     limit_faces_per_edge,
     smoothed_normals,
 )
-from pimper_torch.records import Mesh, Silhouettes, Support
-from pimper_torch.runtime.errors import InputError, ReconstructionError
 from tests.coarse.ball import SETTINGS, photographed
 
 

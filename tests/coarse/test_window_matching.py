@@ -3,7 +3,7 @@ from scipy.ndimage import map_coordinates
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.method.coarse.window_matching import RADIUS, Matcher, MatchingLevel, pair
+from pimper_torch.stages.coarse.window_matching import RADIUS, Matcher, MatchingLevel, pair
 
 OFFSETS = [-0.2, -0.003, 0.0, 0.004, 0.05]
 

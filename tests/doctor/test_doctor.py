@@ -21,10 +21,10 @@ from pimper_torch.cli.doctor.findings import available_gb, machine, total_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
 from pimper_torch.cli.doctor.photograph import Photograph, edge_blur_px, of_views, summarize
 from pimper_torch.cli.main import main
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.method.sfm.matching import VerifiedPair
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Mesh
+from pimper_torch.stages.sfm.matching import VerifiedPair
 
 
 @pytest.fixture

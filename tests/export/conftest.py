@@ -7,16 +7,15 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.doors.export import read_result
-from pimper_torch.doors.io import results
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.ground.radiometry import Encoding, to_bytes
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.method.sfm.sparse_scene import assemble_scene
+from pimper_torch.chains.chain_config import CoarseToFineConfig
+from pimper_torch.export import read_result, results
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import Encoding, to_bytes
 from pimper_torch.records import CameraModel, Removal, Silhouettes
+from pimper_torch.records.sparse_model import SparseModel
+from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 
 ENCODING = Encoding(response="linear")
 

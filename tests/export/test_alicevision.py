@@ -4,10 +4,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_camera_file
-from pimper_torch.doors.camera_files.meshroom_sfm import read_meshroom_cameras
-from pimper_torch.doors.export.alicevision import write_alicevision, write_sfm
-from pimper_torch.ground.geometry.lens_models import pinhole_of
-from pimper_torch.result.viz.maps import view_maps
+from pimper_torch.export.alicevision import write_alicevision, write_sfm
+from pimper_torch.geometry.lens_models import pinhole_of
+from pimper_torch.io.cameras.meshroom_sfm import read_meshroom_cameras
+from pimper_torch.viz.maps import view_maps
 
 
 def parsed(path):

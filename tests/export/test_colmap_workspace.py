@@ -6,11 +6,11 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_colmap
-from pimper_torch.doors.export.colmap_workspace import write_workspace
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.model_files import read_model
-from pimper_torch.result.viz.maps import view_maps
+from pimper_torch.export.colmap_workspace import write_workspace
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.viz.maps import view_maps
 
 FILES = ("a.png", "b.png", "c.png")
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.doors.export.map_files import with_axes, write_maps
-from pimper_torch.doors.export.openexr import write_exr
-from pimper_torch.doors.io.decode import decode
-from pimper_torch.result.viz.maps import view_maps
+from pimper_torch.export.map_files import with_axes, write_maps
+from pimper_torch.io.decode import decode
+from pimper_torch.io.openexr import write_exr
 from pimper_torch.runtime.numpy_files import read_npz
+from pimper_torch.viz.maps import view_maps
 
 
 @pytest.mark.parametrize("shape", [(37, 53, 3), (37, 53, 1), (1, 1, 1), (16, 5, 3), (33, 4, 1)])

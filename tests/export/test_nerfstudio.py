@@ -8,11 +8,11 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
-from pimper_torch.doors.export.nerfstudio import depth_unit, thinned, write_nerfstudio
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.result.viz.maps import view_maps
+from pimper_torch.export.nerfstudio import depth_unit, thinned, write_nerfstudio
+from pimper_torch.geometry.rigid import rigid
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.viz.maps import view_maps
 
 
 def test_an_export_survives_a_round_trip(result, tmp_path, same_cameras):

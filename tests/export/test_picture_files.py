@@ -1,6 +1,6 @@
 import pytest
 
-from pimper_torch.doors.export.picture_files import file_names, refuse_skew
+from pimper_torch.export.picture_files import file_names, refuse_skew
 from pimper_torch.runtime.errors import InputError
 
 

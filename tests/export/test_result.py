@@ -9,14 +9,13 @@ from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
 from pimper_bench.metrics.estimates import estimate_of
-from pimper_torch.doors.export import read_result, read_written, write_formats
-from pimper_torch.doors.export.nerfstudio import write_nerfstudio
-from pimper_torch.doors.io import results
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.radiometry import Encoding
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.result.asset.mesh_files import MeshFiles
+from pimper_torch.chains.chain_config import CoarseToFineConfig
+from pimper_torch.export import read_result, read_written, results, write_formats
+from pimper_torch.export.nerfstudio import write_nerfstudio
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.assets.mesh_files import MeshFiles
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import Encoding
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 

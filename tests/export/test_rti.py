@@ -5,11 +5,11 @@ from PIL import Image
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.doors.export.map_files import with_axes
-from pimper_torch.doors.export.rti import write_rti
-from pimper_torch.ground.radiometry import linear_from_srgb
-from pimper_torch.result.viz.maps import view_maps
+from pimper_torch.export.map_files import with_axes
+from pimper_torch.export.rti import write_rti
+from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.viz.maps import view_maps
 
 
 @pytest.fixture

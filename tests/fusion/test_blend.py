@@ -7,10 +7,10 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.subdivision import subdivide
-from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
-from pimper_torch.method.fusion.problem import transferred_height_fields
+from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.records import Heights, SweptPatches
+from pimper_torch.stages.fusion.blend import blend_patches, ray_directions, vertex_spacing
+from pimper_torch.stages.fusion.problem import transferred_height_fields
 
 FIRST, SECOND = 400.0, 100.0  # inverse variances
 LEAN = torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64)

@@ -4,11 +4,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.subdivision import subdivide
-from pimper_torch.ground.geometry.topology import face_counts, face_edges
-from pimper_torch.method.fusion.blocks import Coarse, block_of, parts_of, pooled
-from pimper_torch.method.fusion.fuse import Fuse
+from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.geometry.topology import face_counts, face_edges
 from pimper_torch.records import Mesh
+from pimper_torch.stages.fusion.blocks import Coarse, block_of, parts_of, pooled
+from pimper_torch.stages.fusion.fuse import Fuse
 from tests.fusion.test_sphere import cap_of, free, noisy, off_sphere
 from tests.threads import on_threads
 

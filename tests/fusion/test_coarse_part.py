@@ -3,7 +3,7 @@ import torch
 from scenes import FACETS, subdivided_square
 from torch.testing import assert_close
 
-from pimper_torch.method.fusion.normal_bias import PiecewiseLinearFit
+from pimper_torch.stages.fusion.normal_bias import PiecewiseLinearFit
 
 
 @pytest.fixture

@@ -3,8 +3,8 @@ import torch
 from scenes import subdivided_square
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.ground.linalg.continuation import about_mean, continued, enclosed
+from pimper_torch.geometry.topology import face_edges
+from pimper_torch.linalg.continuation import about_mean, continued, enclosed
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,10 @@ from scenes import subdivided_square
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.method.fusion.equations import (
+from pimper_torch.geometry.topology import face_edges
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.records import ContourPoints, FacetPoints
+from pimper_torch.stages.fusion.equations import (
     BaseSurface,
     SharedError,
     cloud_points,
@@ -19,7 +20,6 @@ from pimper_torch.method.fusion.equations import (
     swept_heights,
     upright,
 )
-from pimper_torch.records import ContourPoints, FacetPoints
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

@@ -3,11 +3,11 @@ import torch
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.ground.linalg.multigrid import Multigrid
-from pimper_torch.ground.linalg.prepared import SingularSystemError
-from pimper_torch.method.fusion.equations import Equations
-from pimper_torch.method.fusion.estimate import fuse_like, fuse_terms, noise_factor
+from pimper_torch.linalg.multigrid import Multigrid
+from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.fusion.equations import Equations
+from pimper_torch.stages.fusion.estimate import fuse_like, fuse_terms, noise_factor
 
 COUNT = 900
 
@@ -143,10 +143,10 @@ def test_cholesky_solves_if_multigrid_does_not_converge(generator, monkeypatch, 
         stuck.append(arguments)
         raise SingularSystemError("no convergence")
 
-    monkeypatch.setattr("pimper_torch.ground.linalg.systems._CHOLESKY_UNKNOWNS", 100)
-    monkeypatch.setattr("pimper_torch.ground.linalg.systems._COMPILED_CHOLESKY_UNKNOWNS", 100)
+    monkeypatch.setattr("pimper_torch.linalg.systems._CHOLESKY_UNKNOWNS", 100)
+    monkeypatch.setattr("pimper_torch.linalg.systems._COMPILED_CHOLESKY_UNKNOWNS", 100)
     monkeypatch.setattr(Multigrid, "solve", refusing)
-    monkeypatch.setattr("pimper_torch.ground.linalg.systems.solve_by_cycles", refusing)
+    monkeypatch.setattr("pimper_torch.linalg.systems.solve_by_cycles", refusing)
     with using(kernels), pytest.warns(PimperWarning, match="solved by a Cholesky factor"):
         found = fused(kinds)
     assert stuck

@@ -4,12 +4,12 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import table
-from pimper_torch.ground.geometry.subdivision import subdivide
-from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.method.fusion.equations import Equations
-from pimper_torch.method.fusion.estimate import fuse_terms
-from pimper_torch.method.fusion.expected_error import expected_error, regions
-from pimper_torch.method.fusion.normal_bias import PiecewiseLinearFit
+from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.geometry.topology import face_edges
+from pimper_torch.stages.fusion.equations import Equations
+from pimper_torch.stages.fusion.estimate import fuse_terms
+from pimper_torch.stages.fusion.expected_error import expected_error, regions
+from pimper_torch.stages.fusion.normal_bias import PiecewiseLinearFit
 
 # Standard errors from 300 draws are off by 4 %; the worst of all vertices, by three times that.
 DRAWS, CLOSE = 300, 0.13

@@ -9,14 +9,16 @@ from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.ground.geometry.rigid import rotate
-from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.method.chains.photometric import warn_of_priors
-from pimper_torch.method.fusion.equations import Equations
-from pimper_torch.method.fusion.fuse import Fuse
-from pimper_torch.method.fusion.fuse_config import KINDS, FuseConfig
-from pimper_torch.method.fusion.terms import (
+from pimper_torch.chains.photometric import warn_of_priors
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.rigid import rotate
+from pimper_torch.geometry.topology import face_edges
+from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
+from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.stages.fusion.equations import Equations
+from pimper_torch.stages.fusion.fuse import Fuse
+from pimper_torch.stages.fusion.fuse_config import KINDS, FuseConfig
+from pimper_torch.stages.fusion.terms import (
     TERMS,
     KeptSlopes,
     Normals,
@@ -24,10 +26,7 @@ from pimper_torch.method.fusion.terms import (
     Term,
     TouchedRays,
 )
-from pimper_torch.method.sweep.sweep import Sweep
-from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
-from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
-from pimper_torch.runtime.reporting import figures
+from pimper_torch.stages.sweep.sweep import Sweep
 
 
 def without(*names: str) -> tuple[str, ...]:
@@ -428,10 +427,10 @@ def test_normal_priors_determine_slopes_of_unlit_surface(swept):
 
 def test_disagreement_of_priors_is_reported_and_warned_of(swept):
     lifted, given = swept(0.5)
-    assert figures(given) == {}
-    right = figures(with_prior_normals(lifted, given, lean=0.0, error_deg=1.0))
+    assert given.figures() == {}
+    right = with_prior_normals(lifted, given, lean=0.0, error_deg=1.0).figures()
     assert right["prior_normals_deg"] < 0.1
-    wrong = figures(with_prior_normals(lifted, given, lean=0.3, error_deg=1.0))
+    wrong = with_prior_normals(lifted, given, lean=0.3, error_deg=1.0).figures()
     assert abs(wrong["prior_normals_deg"] - math.degrees(math.atan(0.3))) < 0.5
     with pytest.warns(PimperWarning, match=r"Prior normals deviate .* 7\.0 times"):
         warn_of_priors(wrong)

@@ -4,9 +4,9 @@ from scenes import FACETS, subdivided_square
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.subdivision import subdivide
-from pimper_torch.method.fusion.equations import swept_heights
-from pimper_torch.method.fusion.normal_bias import common_variance, normal_bias, shared_error
+from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.stages.fusion.equations import swept_heights
+from pimper_torch.stages.fusion.normal_bias import common_variance, normal_bias, shared_error
 
 
 @pytest.fixture

@@ -8,19 +8,10 @@ from scenes import each_bucket
 from scipy.spatial import Delaunay
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.ground.geometry.template_normals import transferred_normals
-from pimper_torch.method.fusion.blend import vertex_spacing
-from pimper_torch.method.fusion.detail import spacing_of
-from pimper_torch.method.fusion.estimate import fuse_terms
-from pimper_torch.method.fusion.fuse import Fuse
-from pimper_torch.method.fusion.fuse_config import FuseConfig
-from pimper_torch.method.fusion.problem import build_problem, subdivide_facets
-from pimper_torch.method.fusion.terms import KeptSlopes, Normals, SweptHeights
-from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.patches_config import DecomposeConfig
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.template_normals import transferred_normals
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -30,6 +21,15 @@ from pimper_torch.records import (
     Silhouettes,
     SweptPatches,
 )
+from pimper_torch.stages.fusion.blend import vertex_spacing
+from pimper_torch.stages.fusion.detail import spacing_of
+from pimper_torch.stages.fusion.estimate import fuse_terms
+from pimper_torch.stages.fusion.fuse import Fuse
+from pimper_torch.stages.fusion.fuse_config import FuseConfig
+from pimper_torch.stages.fusion.problem import build_problem, subdivide_facets
+from pimper_torch.stages.fusion.terms import KeptSlopes, Normals, SweptHeights
+from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.stages.patches.patches_config import DecomposeConfig
 from tests.threads import on_threads
 
 # Center of the sphere of radius 1, which is seen from -z.

@@ -22,22 +22,22 @@ from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.video.read import luma_frames
-from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.read_cameras import read_cameras
-from pimper_torch.doors.export.openexr import write_exr
-from pimper_torch.doors.io.decode import decode, write_deep_png
-from pimper_torch.doors.io.meshes import read_mesh, write_glb, write_ply
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.doors.io.responses import read_curve
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.method.sfm.colmap import reconstruction_of, write_binary
-from pimper_torch.method.sfm.existing import existing_model
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.io.cameras.existing import existing_model
+from pimper_torch.io.cameras.layout import DataSetPath
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.cameras.read_cameras import read_cameras
+from pimper_torch.io.decode import decode, write_deep_png
+from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
+from pimper_torch.io.openexr import write_exr
+from pimper_torch.io.photographs import load_views
+from pimper_torch.io.responses import read_curve
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.runtime.config import build, read_mapping, to_yaml
+from pimper_torch.stages.sfm.colmap import reconstruction_of, write_binary
 from tests.io.dng import write_dng
 from tests.io.heic_files import UPRIGHT
 

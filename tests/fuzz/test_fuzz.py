@@ -27,8 +27,8 @@ import torch
 from hypothesis import HealthCheck, Phase, given, note, settings
 from hypothesis import strategies as st
 
-from pimper_torch.method.sfm.model import SparseModel
 from pimper_torch.records import Record
+from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.errors import PimperError
 from tests.fuzz.seeds import make_seeds
 

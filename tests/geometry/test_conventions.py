@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pixels import (
+from pimper_torch.geometry.pixels import (
     crop_intrinsics,
     grid_from_pixels,
     indices_from_pixels,
@@ -13,7 +13,7 @@ from pimper_torch.ground.geometry.pixels import (
     pixels_from_indices,
     scale_intrinsics,
 )
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.projection import project
 
 WIDTH, HEIGHT = 7, 5
 

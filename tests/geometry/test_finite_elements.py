@@ -3,11 +3,11 @@ import torch
 from scipy.spatial import Delaunay
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
-from pimper_torch.ground.geometry.topology import boundary_vertices
-from pimper_torch.ground.linalg.multigrid import Multigrid
-from pimper_torch.ground.linalg.sparse import SparseCholesky
-from pimper_torch.ground.linalg.systems import prepare
+from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
+from pimper_torch.geometry.topology import boundary_vertices
+from pimper_torch.linalg.multigrid import Multigrid
+from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.systems import prepare
 
 
 def random(generator, *shape):

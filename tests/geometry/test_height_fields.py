@@ -2,7 +2,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.height_fields import intersect_height_field, sample_raster
+from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
 
 
 def raster(spacing, half_width=1.0):

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local, local_origin, to_local
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local, local_origin, to_local
+from pimper_torch.geometry.rigid import transform
 from tests.coarse.ball import all_round
 
 UTM = (448231.25, 5411923.5, 312.125)

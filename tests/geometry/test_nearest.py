@@ -4,7 +4,7 @@ from scenes import CORNERS, FACETS
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.nearest import NearestSurface, closest_on_triangles
+from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
 

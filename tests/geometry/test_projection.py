@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry import projection
-from pimper_torch.ground.geometry.projection import project, rays_through, triangulation_angles
+from pimper_torch.geometry import projection
+from pimper_torch.geometry.projection import project, rays_through, triangulation_angles
 
 
 @pytest.fixture

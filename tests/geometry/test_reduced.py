@@ -3,8 +3,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.poisson import reduced
-from pimper_torch.ground.geometry.topology import boundary_vertices, half_edges
+from pimper_torch.geometry.poisson import reduced
+from pimper_torch.geometry.topology import boundary_vertices, half_edges
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import ConfigError
 

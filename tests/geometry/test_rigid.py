@@ -2,7 +2,7 @@ import torch
 from scipy.spatial.transform import RigidTransform, Rotation
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.rigid import invert_rigid, rigid, rotate, transform
+from pimper_torch.geometry.rigid import invert_rigid, rigid, rotate, transform
 
 
 def random_rigid(generator, *batch):

@@ -4,8 +4,8 @@ from scenes import CORNERS, FACETS, edge_counts, subdivided_square
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.subdivision import Subdivision, subdivide, transferred
-from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.geometry.subdivision import Subdivision, subdivide, transferred
+from pimper_torch.geometry.surfaces import face_normals
 
 
 def ragged_fan(seed=41):

@@ -2,7 +2,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.supporting_plane import fixation, supporting_plane
+from pimper_torch.geometry.supporting_plane import fixation, supporting_plane
 
 
 def cameras(elevation_deg=40.0):

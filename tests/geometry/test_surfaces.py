@@ -5,7 +5,7 @@ from slopes import normals_from_slopes
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.surfaces import (
+from pimper_torch.geometry.surfaces import (
     barycentric_2d,
     face_normals,
     slopes_from_normals,

@@ -2,8 +2,8 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.surfaces import component_areas
-from pimper_torch.ground.geometry.topology import (
+from pimper_torch.geometry.surfaces import component_areas
+from pimper_torch.geometry.topology import (
     boundary_loops,
     boundary_vertices,
     corners_of,

@@ -4,7 +4,7 @@ from torch.testing import assert_close
 from pimper_bench.scenes.procedural_meshes import icosphere, table
 from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.visibility import RayCaster, cast_view
+from pimper_torch.geometry.visibility import RayCaster, cast_view
 from pimper_torch.records import Mesh
 
 

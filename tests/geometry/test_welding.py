@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.topology import boundary_loops
-from pimper_torch.ground.geometry.welding import TOLERANCE, welded
+from pimper_torch.geometry.topology import boundary_loops
+from pimper_torch.stages.coarse.welding import TOLERANCE, welded
 
 
 def soup(vertices, faces):

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from sparse_models import observed
 
-from pimper_torch.doors.export.alicevision import write_sfm
-from pimper_torch.doors.export.nerfstudio import write_transforms
-from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
-from pimper_torch.method.sfm import colmap
+from pimper_torch.export.alicevision import write_sfm
+from pimper_torch.export.nerfstudio import write_transforms
+from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.records import Cameras, Views
+from pimper_torch.stages.sfm import colmap
 
 WIDTH, HEIGHT = 64, 48
 NAMES = ("10.png", "2.png", "a b.png")

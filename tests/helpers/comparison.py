@@ -6,8 +6,8 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_bench.metrics.in_view import angles_deg, meet_in_view, relative_error
-from pimper_torch.ground.geometry.rigid import rotate, transform
-from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.rigid import rotate, transform
+from pimper_torch.geometry.surfaces import vertex_normals
 
 
 def compare_in_view(

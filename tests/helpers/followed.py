@@ -10,8 +10,8 @@ from collections.abc import Callable
 from torch import nn
 
 import pimper_torch as pt
-from pimper_torch.method.chains.chain_config import load_config
-from pimper_torch.method.chains.presets import make_chain
+from pimper_torch.presets.load_chain import make_chain
+from pimper_torch.presets.load_config import load_config
 
 
 def _own(kind: object) -> bool:

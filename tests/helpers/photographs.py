@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from pimper_torch.doors.export.picture_files import write_picture
-from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.ground.radiometry import linear_from_srgb
+from pimper_torch.export.picture_files import write_picture
+from pimper_torch.geometry.rigid import rigid
+from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.records import Cameras, Views
 
 

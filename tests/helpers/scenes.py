@@ -5,10 +5,10 @@ from pathlib import Path
 import torch
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.ground.geometry.subdivision import subdivide
-from pimper_torch.ground.geometry.topology import half_edges
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.geometry.topology import half_edges
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh, SparseScene
 
 # A square of side 1 and its two facets.

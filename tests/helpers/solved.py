@@ -1,8 +1,8 @@
 """Photometry of samples as in a chain: light, factorization and gauge."""
 
-from pimper_torch.method.photometry.fit_light import FitLight
-from pimper_torch.method.photometry.gauge import FixGauge
-from pimper_torch.method.photometry.photometry_config import FitLightConfig
+from pimper_torch.stages.photometry.fit_light import FitLight
+from pimper_torch.stages.photometry.gauge import FixGauge
+from pimper_torch.stages.photometry.photometry_config import FitLightConfig
 
 
 def solved(factorize, seen, **light):

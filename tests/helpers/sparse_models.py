@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from pimper_torch.ground.geometry.lens_models import pinhole_lenses
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.geometry.lens_models import pinhole_lenses
+from pimper_torch.geometry.projection import project
 from pimper_torch.records import CameraModel, Cameras, Views
+from pimper_torch.records.sparse_model import SparseModel
 
 
 def views_of(images: Tensor, sizes: list[tuple[int, int]] | None = None, **more: object) -> Views:

@@ -17,7 +17,7 @@ def event(event, **about):
 def end():
     (out / ".stages").mkdir(parents=True, exist_ok=True)
     (out / "summary.json").write_text(json.dumps({"views": 8, "faces": 99, "seconds": 1.5}))
-    from pimper_torch.doors.result_folder.marker import seal
+    from pimper_torch.export.result_folder.marker import seal
     seal(out, "result")
 def fail(kind, code, message="it is so."):
     event("error", kind=kind, message=message, exit_code=code)

@@ -2,7 +2,7 @@
 
 import torch
 
-from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Convergence, Surface
 
 

@@ -14,7 +14,7 @@ import tyro
 from pimper_torch.cli.arguments import REQUIRED, Option, options_of
 from pimper_torch.cli.main import commands
 from pimper_torch.cli.output import split
-from pimper_torch.method.chains.chain_config import load_config
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.runtime.errors import ConfigError, PimperError
 
 COMMANDS = commands()

@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import decode, read_header, rotated, write_deep_png
-from pimper_torch.doors.io.header import focal_from_exif
+from pimper_torch.io.decode import decode, read_header, rotated, write_deep_png
+from pimper_torch.io.header import focal_from_exif
 from pimper_torch.runtime.errors import InputError
 
 PLANES = {"photometric": "rgb", "planarconfig": "separate"}
@@ -208,8 +208,8 @@ def test_other_formats_are_refused_by_name(tmp_path, pixels):
     ("limit", "most", "why"),
     [
         ("PIL.Image.MAX_IMAGE_PIXELS", 10, "has more than 160 million pixels"),
-        ("pimper_torch.doors.io.decode.MAX_PIXELS", 95, "has 12 x 8 pixels"),
-        ("pimper_torch.doors.io.decode._MAX_BYTES", 10, r"has \d+ bytes"),
+        ("pimper_torch.io.decode.MAX_PIXELS", 95, "has 12 x 8 pixels"),
+        ("pimper_torch.io.decode._MAX_BYTES", 10, r"has \d+ bytes"),
     ],
 )
 def test_images_too_large_are_refused(tmp_path, monkeypatch, pixels, limit, most, why):

@@ -6,11 +6,11 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.metrics.estimates import estimate_of
-from pimper_torch.doors.io import results
-from pimper_torch.doors.io.estimates import read_estimate
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.result.asset.mesh_files import MeshFiles
+from pimper_torch.chains.chain_config import CoarseToFineConfig
+from pimper_torch.export import results
+from pimper_torch.io.assets.mesh_files import MeshFiles
+from pimper_torch.io.estimates import read_estimate
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.runtime.errors import InputError
 
 

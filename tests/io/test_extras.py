@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import decode, read_header
-from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.io.decode import decode, read_header
+from pimper_torch.io.photographs import load_views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.io.dng import write_dng
 from tests.io.heic_files import DEEP, STORED
@@ -32,7 +32,7 @@ def test_without_its_package_a_format_is_refused(tmp_path, monkeypatch, pixels, 
         write(tmp_path / f"{index}{suffix}")
     find = importlib.util.find_spec
     monkeypatch.setattr(
-        "pimper_torch.doors.io.extras.find_spec",
+        "pimper_torch.io.extras.find_spec",
         lambda name: None if name.endswith(package) else find(name),
     )
     for read in (load_views, lambda folder: read_header(folder / f"0{suffix}")):
@@ -59,7 +59,7 @@ def test_damaged_and_huge_files_are_refused_by_name(tmp_path, monkeypatch, suffi
         write(tmp_path / "huge.dng", size=(30000, 20000))
         with pytest.raises(InputError, match=r"huge\.dng: cannot be read as camera raw"):
             decode(tmp_path / "huge.dng")
-    monkeypatch.setattr("pimper_torch.doors.io.decode.MAX_PIXELS", 1000)
+    monkeypatch.setattr("pimper_torch.io.decode.MAX_PIXELS", 1000)
     with pytest.raises(InputError, match=rf"a\{suffix}: has (60 x 40|64 x 48) pixels"):
         decode(path)
     with pytest.raises(InputError, match=rf"gone\{suffix}: cannot be read \(No such file"):
@@ -71,7 +71,7 @@ def test_damaged_and_huge_files_are_refused_by_name(tmp_path, monkeypatch, suffi
     [(".heic", "TIFF", False), (".cr2", "JPEG", True), (".png", "JPEG", True)],
 )
 def test_images_are_read_with_any_suffix(tmp_path, monkeypatch, suffix, name, lossy):
-    monkeypatch.setattr("pimper_torch.doors.io.extras.find_spec", lambda _: None)  # not needed
+    monkeypatch.setattr("pimper_torch.io.extras.find_spec", lambda _: None)  # not needed
     for index in range(3):
         Image.fromarray(STORED).save(tmp_path / f"{index}{suffix}", format=name)
     decoded = decode(tmp_path / f"0{suffix}")

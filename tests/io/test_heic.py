@@ -6,9 +6,9 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import decode, read_header
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.radiometry import Srgb
+from pimper_torch.io.decode import decode, read_header
+from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import Srgb
 from pimper_torch.runtime.errors import PimperWarning
 from tests.io.heic_files import DEEP, STORED, UPRIGHT
 

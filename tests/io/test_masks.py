@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pimper_torch.doors.io.decode import rotated
-from pimper_torch.doors.io.photographs import load_views, read_mask
+from pimper_torch.io.decode import rotated
+from pimper_torch.io.photographs import load_views, read_mask
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 NAMES = ("1", "2", "10")

@@ -7,13 +7,13 @@ import trimesh
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.io.results import write_result
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.ground.radiometry import Encoding
+from pimper_torch.export.results import write_result
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.assets.mesh_files import MeshFiles
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import Encoding
+from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh
-from pimper_torch.result.asset.mesh_files import MeshFiles
-from pimper_torch.result.viz.maps import albedo_scale
 from pimper_torch.runtime.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("small_pictures")

@@ -11,9 +11,9 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.doors.io.meshes import read_mesh, write_glb, write_ply
+from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
+from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh
-from pimper_torch.result.viz.maps import albedo_scale
 from pimper_torch.runtime.errors import InputError
 
 

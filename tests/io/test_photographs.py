@@ -12,11 +12,11 @@ from PIL import Image
 from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.radiometry import LINEAR, linear_from_srgb
-from pimper_torch.method.sfm.lenses import choose_lenses
+from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import LINEAR, linear_from_srgb
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from pimper_torch.runtime.progress import listening
+from pimper_torch.stages.sfm.lenses import choose_lenses
 
 
 def save(path, array, **options):

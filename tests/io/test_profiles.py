@@ -10,11 +10,11 @@ import torch
 from PIL import Image, ImageCms
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import read_header
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.doors.io.profiles import colour_of_codes, read_profile
-from pimper_torch.ground.radiometry import Curve, Encoding, Gamma, Linear, Srgb, linear_from_srgb
-from pimper_torch.ground.radiometry.primaries import (
+from pimper_torch.io.decode import read_header
+from pimper_torch.io.photographs import load_views
+from pimper_torch.io.profiles import colour_of_codes, read_profile
+from pimper_torch.radiometry import Curve, Encoding, Gamma, Linear, Srgb, linear_from_srgb
+from pimper_torch.radiometry.primaries import (
     ADOBE_RGB,
     DISPLAY_P3,
     REC_709,

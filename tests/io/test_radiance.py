@@ -4,9 +4,9 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.doors.io.radiance import resized, resized_radiance
-from pimper_torch.ground.radiometry import LINEAR, SATURATED, Encoding
+from pimper_torch.io.photographs import load_views
+from pimper_torch.io.radiance import resized, resized_radiance
+from pimper_torch.radiometry import LINEAR, SATURATED, Encoding
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 

@@ -6,10 +6,10 @@ import torch
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import decode, read_header, rotated
-from pimper_torch.doors.io.photograph_files import list_images
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.radiometry import Linear
+from pimper_torch.io.decode import decode, read_header, rotated
+from pimper_torch.io.photograph_files import list_images
+from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import Linear
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from tests.io.dng import XYZ_TO_CAMERA, write_dng
 
@@ -90,7 +90,7 @@ def test_samples_are_scaled_from_black_to_saturation(folder, colours):
 
 
 def test_a_level_of_saturation_below_full_scale_is_counted_from_black(folder, monkeypatch, colours):
-    monkeypatch.setattr("pimper_torch.doors.io.raw._white", lambda _: 3000)
+    monkeypatch.setattr("pimper_torch.io.raw._white", lambda _: 3000)
     inner = (slice(None), slice(3, -3), slice(3, -3))
     found = decode(folder / "0.dng").samples
     wanted = sensor_of(colours).float() * (WHITE - BLACK) / (3000 - BLACK)

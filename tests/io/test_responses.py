@@ -3,8 +3,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.responses import read_curve, response_of
-from pimper_torch.ground.radiometry import Encoding, Gamma, Linear, Srgb
+from pimper_torch.io.responses import read_curve, response_of
+from pimper_torch.radiometry import Encoding, Gamma, Linear, Srgb
 from pimper_torch.runtime.errors import InputError
 
 LEVELS = np.arange(256.0)

@@ -14,24 +14,24 @@ from torch.testing import assert_close
 
 from pimper_bench.metrics.estimates import estimate_of
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.doors.io import results
-from pimper_torch.doors.io.estimates import read_estimate
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.io.reports import common_lights, lights_report, summary_report, world_lights
-from pimper_torch.doors.io.results import RESULT_NAMES, write_result
-from pimper_torch.doors.result_folder.folders import prepare_output
-from pimper_torch.doors.result_folder.marker import MARKER
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.ground.radiometry import srgb_from_linear
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.export import results
+from pimper_torch.export.reports import common_lights, lights_report, summary_report, world_lights
+from pimper_torch.export.result_folder.folders import prepare_output
+from pimper_torch.export.result_folder.marker import MARKER
+from pimper_torch.export.results import RESULT_NAMES, write_result
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.io.assets.mesh_files import MeshFiles
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.estimates import read_estimate
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh
-from pimper_torch.result.asset.finish import written_channels
-from pimper_torch.result.asset.mesh_files import MeshFiles
-from pimper_torch.result.report.vertex_layers import surface_layers
-from pimper_torch.result.viz.maps import albedo_scale
 from pimper_torch.runtime.errors import OutputError
 from pimper_torch.runtime.progress import listening
+from pimper_torch.stages.meshing.finish import written_channels
+from pimper_torch.viz.report.vertex_layers import surface_layers
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from pimper_torch.doors.io.thumbnails import compare_thumbnails, thumbnails
-from pimper_torch.ground.radiometry import to_bytes
+from pimper_torch.io.thumbnails import compare_thumbnails, thumbnails
+from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
 

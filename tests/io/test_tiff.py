@@ -4,9 +4,9 @@ import tifffile
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import decode, read_header
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.radiometry import LINEAR, Encoding
+from pimper_torch.io.decode import decode, read_header
+from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-import pimper_torch.ground.kernels
-from pimper_torch.ground.kernels.compile import (
+import pimper_torch.kernels
+from pimper_torch.kernels.compile import (
     COARSE,
     GRADIENTS,
     PHOTOMETRY,
@@ -23,7 +23,7 @@ from pimper_torch.ground.kernels.compile import (
     load,
 )
 
-AHEAD = "from pimper_torch.ground.kernels.compile import *; children = compile_ahead(); "
+AHEAD = "from pimper_torch.kernels.compile import *; children = compile_ahead(); "
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_compiled_functions_agree_with_python():
 def test_compile_all_keeps_torch_threads_and_leaves_nothing_to_compile():
     code = (
         "import torch; torch.set_num_threads(2)\n"
-        "from pimper_torch.ground.kernels.compile import compile_ahead, compile_all\n"
+        "from pimper_torch.kernels.compile import compile_ahead, compile_all\n"
         "compile_all(); assert torch.get_num_threads() == 2; assert not compile_ahead.__wrapped__()"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -57,7 +57,7 @@ def test_compile_all_keeps_torch_threads_and_leaves_nothing_to_compile():
 def test_every_kernel_of_a_run_is_compiled():
     listed = [name for row in ROWS for name in row]
     assert sorted(listed) == sorted((*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE))
-    sources = Path(pimper_torch.ground.kernels.__path__[0]).glob("*.py")
+    sources = Path(pimper_torch.kernels.__path__[0]).glob("*.py")
     with_types = {
         path.stem
         for path in sources
@@ -68,9 +68,9 @@ def test_every_kernel_of_a_run_is_compiled():
 
 def test_a_run_waits_for_kernels_that_another_process_compiles(fresh):
     code = (
-        "from pimper_torch.ground.kernels.compile import cache_folder, load\n"
+        "from pimper_torch.kernels.compile import cache_folder, load\n"
         "print(cache_folder(), flush=True); input(); load(('line_matches',))\n"
-        "from pimper_torch.ground.kernels.line_matches import most_alike as kernel\n"
+        "from pimper_torch.kernels.line_matches import most_alike as kernel\n"
         "print(*kernel.stats.cache_hits.values())"
     )
     with started(code) as run:
@@ -106,7 +106,7 @@ def test_the_compiling_process_ends_with_its_parent(fresh, end):
 def test_kernels_are_compiled_after_the_compiling_process_died(fresh):
     code = (
         f"{AHEAD} [each.kill() for each in children]; load(('line_matches',))\n"
-        "from pimper_torch.ground.kernels.line_matches import most_alike as kernel\n"
+        "from pimper_torch.kernels.line_matches import most_alike as kernel\n"
         "print(dict(kernel.stats.cache_misses))"
     )
     with started(code) as parent:
@@ -119,9 +119,9 @@ def test_a_kernel_is_bitwise_reproducible_from_disk_and_in_any_order(fresh, tmp_
     """The kernel calls many functions, some of which are shared with another kernel."""
     code = (
         "import numpy as np\n"
-        "from pimper_torch.ground.kernels.compile import load\n"
+        "from pimper_torch.kernels.compile import load\n"
         "load(('lights_and_albedo',))\n"
-        "from pimper_torch.ground.kernels import lights_and_albedo as lights\n"
+        "from pimper_torch.kernels import lights_and_albedo as lights\n"
         "random, views, samples = np.random.default_rng(5), 7, 4 * lights.TILE\n"
         "normals = random.normal(size=(3, samples))\n"
         "normals /= np.linalg.norm(normals, axis=0)\n"
@@ -134,7 +134,7 @@ def test_a_kernel_is_bitwise_reproducible_from_disk_and_in_any_order(fresh, tmp_
         "misses = sum(lights.fit.stats.cache_misses.values())\n"
         "print(misses, light.tobytes().hex(), albedo.tobytes().hex())"
     )
-    other = "import pimper_torch.ground.kernels.factorization\n" + code.replace("load((", "print((")
+    other = "import pimper_torch.kernels.factorization\n" + code.replace("load((", "print((")
     first, later = (subprocess.check_output([sys.executable, "-c", code]) for _ in range(2))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "another"))
     anew = subprocess.check_output([sys.executable, "-c", other])
@@ -155,7 +155,7 @@ def test_machine_code_is_found_by_the_hash_of_the_kernels(tmp_path, monkeypatch)
     for place, code in (("one", "pass"), ("two", "pass"), ("two", "pass  # edited")):
         (tmp_path / place).mkdir(exist_ok=True)
         (tmp_path / place / "kernel.py").write_text(code)
-        monkeypatch.setattr("pimper_torch.ground.kernels.__path__", [str(tmp_path / place)])
+        monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path / place)])
         found.append(cache_folder.__wrapped__())
     assert found[0] == found[1] != found[2]
     assert {folder.parent for folder in found} == {tmp_path / "cache"}
@@ -164,7 +164,7 @@ def test_machine_code_is_found_by_the_hash_of_the_kernels(tmp_path, monkeypatch)
 @pytest.mark.skipif(sys.platform == "win32", reason="has no such modes")
 def test_machine_code_is_only_read_from_folders_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr("pimper_torch.ground.kernels.__path__", [str(tmp_path)])
+    monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path)])
     folder = cache_folder.__wrapped__()
     assert folder.stat().st_mode & 0o777 == 0o700
     folder.chmod(0o770)

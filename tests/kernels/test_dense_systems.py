@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.kernels.dense_systems import eliminate, solve_damped
+from pimper_torch.kernels.dense_systems import eliminate, solve_damped
 
 
 def test_damped_systems_are_solved_as_by_lapack():

@@ -7,7 +7,7 @@ import torch
 from torch.nn.functional import grid_sample
 from torch.testing import assert_close
 
-from pimper_torch.ground.kernels.lookup import bilinear, blended_level, corners
+from pimper_torch.kernels.lookup import bilinear, blended_level, corners
 
 
 @pytest.mark.parametrize("real", [torch.float32, torch.uint8])

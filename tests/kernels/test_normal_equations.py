@@ -3,9 +3,9 @@ import torch
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.ground.linalg.least_squares import compressed_equations, normal_equations
-from pimper_torch.method.fusion.equations import Equations
-from pimper_torch.method.fusion.estimate import _evaluated
+from pimper_torch.linalg.least_squares import compressed_equations, normal_equations
+from pimper_torch.stages.fusion.equations import Equations
+from pimper_torch.stages.fusion.estimate import _evaluated
 
 
 @pytest.mark.parametrize("real", [torch.float32, torch.float64])

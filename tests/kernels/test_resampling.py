@@ -3,13 +3,13 @@ import torch
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.ground.geometry.pyramids import prepare
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.method.patches.patches_config import WarpConfig
-from pimper_torch.method.patches.warp import Warp
-from pimper_torch.method.sweep.costs import Hypotheses, costs_of
-from pimper_torch.method.sweep.sweep import Sweep
+from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import Mesh
+from pimper_torch.stages.patches.patches_config import WarpConfig
+from pimper_torch.stages.patches.warp import Warp
+from pimper_torch.stages.sweep.costs import Hypotheses, costs_of
+from pimper_torch.stages.sweep.sweep import Sweep
 
 
 def height_field(templates):

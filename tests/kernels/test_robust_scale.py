@@ -3,8 +3,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.kernels.robust_scale import robust_variance as compiled_variance
-from pimper_torch.ground.linalg.robust import robust_variance
+from pimper_torch.kernels.robust_scale import robust_variance as compiled_variance
+from pimper_torch.linalg.robust import robust_variance
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])

@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.ground.kernels.switch import compiled_for
+from pimper_torch.kernels.switch import compiled_for
 
 
 def test_kernels_are_used_only_without_gradients_and_on_the_cpu():

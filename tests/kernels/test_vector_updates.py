@@ -5,8 +5,8 @@ from scipy.sparse import diags_array
 from scipy.sparse.linalg import LinearOperator, cg, spsolve
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg.conjugate_gradients import compressed_gradients
-from pimper_torch.ground.linalg.hierarchy import Hierarchy
+from pimper_torch.linalg.conjugate_gradients import compressed_gradients
+from pimper_torch.linalg.hierarchy import Hierarchy
 from tests.linalg.laplacians import triangles
 from tests.threads import on_threads
 

@@ -36,7 +36,7 @@ def main(folder: Path, count: int, seed: int) -> None:
     import pycolmap  # noqa: F401
 
     import pimper_bench.cli.render_command  # noqa: F401
-    from pimper_torch.ground.kernels.compile import compile_all
+    from pimper_torch.kernels.compile import compile_all
 
     compile_all()
     scene, moments = folder / "scene", random.Random(seed)

@@ -4,14 +4,14 @@ import torch
 from scipy.sparse import diags_array
 from torch.testing import assert_close
 
-from pimper_torch.ground.kernels import multigrid_levels as kernels
-from pimper_torch.ground.linalg.aggregation import (
+from pimper_torch.kernels import multigrid_levels as kernels
+from pimper_torch.linalg.aggregation import (
     coarser,
     dominant_diagonal,
     parts_of,
     prolongation,
 )
-from pimper_torch.ground.linalg.hierarchy import Hierarchy
+from pimper_torch.linalg.hierarchy import Hierarchy
 from tests.linalg.laplacians import triangles
 
 

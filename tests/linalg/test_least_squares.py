@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg.least_squares import normal_equations
+from pimper_torch.linalg.least_squares import normal_equations
 
 
 def random(generator, *shape):

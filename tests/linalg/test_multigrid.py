@@ -4,13 +4,13 @@ import torch
 from scipy.sparse import csr_array
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg import hierarchy
-from pimper_torch.ground.linalg.aggregation import prolongation
-from pimper_torch.ground.linalg.hierarchy import Hierarchy
-from pimper_torch.ground.linalg.multigrid import Multigrid
-from pimper_torch.ground.linalg.prepared import SingularSystemError
-from pimper_torch.ground.linalg.sparse import SparseCholesky
-from pimper_torch.ground.linalg.systems import prepare
+from pimper_torch.linalg import hierarchy
+from pimper_torch.linalg.aggregation import prolongation
+from pimper_torch.linalg.hierarchy import Hierarchy
+from pimper_torch.linalg.multigrid import Multigrid
+from pimper_torch.linalg.prepared import SingularSystemError
+from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.systems import prepare
 
 
 def random(generator, *shape):
@@ -158,7 +158,7 @@ def test_a_smooth_solution_is_accepted_once_its_error_is_below_the_tolerance(gen
 
 
 def test_the_solver_is_chosen_by_the_matrix(generator, monkeypatch):
-    monkeypatch.setattr("pimper_torch.ground.linalg.systems._CHOLESKY_UNKNOWNS", 100)
+    monkeypatch.setattr("pimper_torch.linalg.systems._CHOLESKY_UNKNOWNS", 100)
     rows, cols, values = entries(200, generator)
     assert isinstance(prepare(rows, cols, values, 200), Multigrid)
     loop = torch.arange(200)  # positive couplings, made definite

@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg.prepared import SingularSystemError
-from pimper_torch.ground.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.prepared import SingularSystemError
+from pimper_torch.linalg.sparse import SparseCholesky
 
 
 def edges_of_a_path_with_shortcuts(size):
@@ -112,7 +112,7 @@ def test_systems_without_a_unique_solution_are_rejected(rows, cols, values, rhs,
 
 def test_exit_is_clean_with_a_live_differentiable_result():
     program = (
-        "import torch; from pimper_torch.ground.linalg.sparse import SparseCholesky; "
+        "import torch; from pimper_torch.linalg.sparse import SparseCholesky; "
         "index = torch.arange(2); entries = torch.tensor([2.0, 4.0], requires_grad=True); "
         "found = SparseCholesky(index, index, entries, size=2).solve(torch.ones(2))"
     )

@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg.sums import average, total
+from pimper_torch.linalg.sums import average, total
 from tests.threads import on_threads
 
 

@@ -4,8 +4,8 @@ import torch
 import trimesh
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.method.meshing import borders
+from pimper_torch.geometry.topology import face_edges
+from pimper_torch.stages.meshing import borders
 from tests.meshing.sheets import sheet_of
 
 LENGTH = 3.0

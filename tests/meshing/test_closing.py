@@ -4,10 +4,10 @@ import trimesh
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.topology import face_components
-from pimper_torch.method.meshing.closing import border_cycles, closed
+from pimper_torch.geometry.topology import face_components
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.stages.meshing.closing import border_cycles, closed
 
 
 def ball(*, above: float, level: int = 4) -> Mesh:

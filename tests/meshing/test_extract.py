@@ -4,10 +4,10 @@ import trimesh
 from surfaces import surface_of
 from torch.testing import assert_close
 
-from pimper_torch.method.meshing.extract import Extract
-from pimper_torch.method.meshing.faults import diagonal
-from pimper_torch.method.meshing.meshing_config import ExtractConfig
 from pimper_torch.runtime.errors import ReconstructionError
+from pimper_torch.stages.meshing.extract import Extract
+from pimper_torch.stages.meshing.faults import diagonal
+from pimper_torch.stages.meshing.meshing_config import ExtractConfig
 from tests.meshing.sheets import sheet_of
 
 SIDE = 21

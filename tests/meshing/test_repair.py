@@ -7,18 +7,18 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.ground.geometry.topology import (
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.topology import (
     boundary_loops,
     boundary_vertices,
     face_edges,
     vertex_components,
 )
-from pimper_torch.method.meshing import repair as repairing
-from pimper_torch.method.meshing.extract import Extract
-from pimper_torch.method.meshing.faults import faults
-from pimper_torch.method.meshing.repair import Repair, minimize_bending, repair, surroundings
 from pimper_torch.records import Mesh
+from pimper_torch.stages.meshing import repair as repairing
+from pimper_torch.stages.meshing.extract import Extract
+from pimper_torch.stages.meshing.faults import faults
+from pimper_torch.stages.meshing.repair import Repair, minimize_bending, repair, surroundings
 
 
 def supported(vertices, faces, facet=None):

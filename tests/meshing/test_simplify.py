@@ -4,10 +4,10 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.nearest import NearestSurface, closest_on_triangles
-from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.method.meshing.simplify import simplify
+from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
+from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Mesh
+from pimper_torch.stages.meshing.simplify import simplify
 from tests.threads import on_threads
 
 

@@ -2,11 +2,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.patches.decompose import Decompose, enlarge, group_by_size, views_facing
-from pimper_torch.method.patches.patches_config import DecomposeConfig
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.runtime.errors import ReconstructionError
+from pimper_torch.stages.patches.decompose import Decompose, enlarge, group_by_size, views_facing
+from pimper_torch.stages.patches.patches_config import DecomposeConfig
 
 
 def test_the_facet_is_in_the_plane_z_0_and_faces_the_camera(plane_scene, plane_mesh):

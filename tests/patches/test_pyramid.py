@@ -3,7 +3,7 @@ import torch
 from kornia.geometry.transform import pyrdown
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pyramids import halve, look_up
+from pimper_torch.geometry.pyramids import halve, look_up
 
 
 @pytest.mark.parametrize("size", [(12, 20), (13, 7)])

@@ -7,11 +7,11 @@ from derivatives import check_derivatives
 from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.rigid import rotate
-from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.warp import Warp
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.records import DepthPrior, InlierPrior, LightPrior, NormalPrior
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.stages.patches.warp import Warp
 from tests.patches.conftest import TILTED
 
 NORMAL = normalize(torch.tensor(TILTED.normal, dtype=torch.float64), dim=0)

@@ -4,13 +4,13 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import table
-from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.ground.geometry.template_normals import coarse_normals, transferred_normals
-from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.patches_config import DecomposeConfig
-from pimper_torch.method.patches.transfer import transfer
-from pimper_torch.method.patches.warp import Warp
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.geometry.template_normals import coarse_normals, transferred_normals
 from pimper_torch.records import CoarseMesh, Mesh
+from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.stages.patches.patches_config import DecomposeConfig
+from pimper_torch.stages.patches.transfer import transfer
+from pimper_torch.stages.patches.warp import Warp
 
 
 def bump(xy: torch.Tensor) -> torch.Tensor:

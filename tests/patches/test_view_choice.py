@@ -7,13 +7,13 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import turntable_directions
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.method.patches.decompose import Decompose, views_facing
-from pimper_torch.method.patches.patches_config import DecomposeConfig
-from pimper_torch.method.patches.view_choice import best_views, view_blocks, view_weights
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, CoarseMesh, Mesh
+from pimper_torch.stages.patches.decompose import Decompose, views_facing
+from pimper_torch.stages.patches.patches_config import DecomposeConfig
+from pimper_torch.stages.patches.view_choice import best_views, view_blocks, view_weights
 from tests.threads import on_threads
 
 FOCAL, DISTANCE, SPACING = 100.0, 4.0, 0.02

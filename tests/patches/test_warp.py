@@ -2,14 +2,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pyramids import look_up, pyramid_level
-from pimper_torch.ground.geometry.rigid import invert_rigid
-from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.patches_config import WarpConfig
-from pimper_torch.method.patches.warp import Warp
+from pimper_torch.geometry.pyramids import look_up, pyramid_level
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import CoarseMesh, Mesh
 from pimper_torch.runtime.errors import ConfigError
-from pimper_torch.runtime.reporting import figures
+from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.stages.patches.patches_config import WarpConfig
+from pimper_torch.stages.patches.warp import Warp
 from tests.patches.test_transfer import places
 
 
@@ -34,7 +33,7 @@ def test_every_view_gives_the_albedo_at_each_sample_point(registered):
 def test_missing_samples_are_zero(registered):
     for seen in registered.buckets:
         assert (seen.radiance * ~seen.valid[:, :, None]).abs().max() == 0
-    counts = figures(registered)
+    counts = registered.figures()
     assert 0 <= counts["missing_samples"] < 0.2 * counts["samples"]
 
 

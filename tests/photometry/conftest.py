@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.rigid import invert_rigid, rigid, transform
-from pimper_torch.ground.geometry.surfaces import barycentric_2d, face_normals
-from pimper_torch.ground.geometry.template_normals import coarse_normals
-from pimper_torch.method.photometry.light_field import harmonics, rotate_lights
+from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
+from pimper_torch.geometry.surfaces import barycentric_2d, face_normals
+from pimper_torch.geometry.template_normals import coarse_normals
+from pimper_torch.lighting.light_field import harmonics, rotate_lights
 from pimper_torch.records import CoarseMesh, Mesh, Observations, PatchSet, PatchViews, Templates
 
 

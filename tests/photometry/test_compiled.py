@@ -9,13 +9,13 @@ from solved import solved
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.ground.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
-from pimper_torch.method.photometry.bilinear import residual_deviation
-from pimper_torch.method.photometry.factorize import LOSSES, Factorize
-from pimper_torch.method.photometry.fit_light import FitLight
-from pimper_torch.method.photometry.lights import thinned
-from pimper_torch.method.photometry.photometry_config import FactorizeConfig
-from pimper_torch.method.photometry.variable_projection import solve_variable_projection
+from pimper_torch.lighting.lights import thinned
+from pimper_torch.linalg.robust import Cauchy, GemanMcClure, Huber, Loss, Squares
+from pimper_torch.stages.photometry.bilinear import residual_deviation
+from pimper_torch.stages.photometry.factorize import LOSSES, Factorize
+from pimper_torch.stages.photometry.fit_light import FitLight
+from pimper_torch.stages.photometry.photometry_config import FactorizeConfig
+from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
 
 def solve(given, how, iterations=60, tolerance=1e-4, **settings):
@@ -127,7 +127,7 @@ def test_factorizations_agree_and_nan_counts_as_missing(scene):
 
 def test_thinned_templates_keep_sample_positions(scene, monkeypatch):
     true = scene(bumps=0.0)
-    monkeypatch.setattr("pimper_torch.method.photometry.lights.LIGHT_SAMPLES", 30)
+    monkeypatch.setattr("pimper_torch.lighting.lights.LIGHT_SAMPLES", 30)
     thin = thinned(true.seen.patches)
     registered = []
     for few, templates, each in zip(

@@ -2,7 +2,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.cone import project_to_cone, split_shading, tangent_columns
+from pimper_torch.stages.photometry.cone import project_to_cone, split_shading, tangent_columns
 
 
 def test_projection_is_the_nearest_point_of_the_cone(generator):

@@ -8,11 +8,11 @@ from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.ground.geometry.contours import Contours
-from pimper_torch.method.photometry.depth_from_light import DepthFromLight
-from pimper_torch.method.photometry.light_field import LightField
-from pimper_torch.method.silhouettes.trace import TraceContours
+from pimper_torch.geometry.contours import Contours
+from pimper_torch.lighting.light_field import LightField
 from pimper_torch.records import Mesh, Silhouettes
+from pimper_torch.stages.light_depth.depth_from_light import DepthFromLight
+from pimper_torch.stages.silhouettes.trace import TraceContours
 
 VIEWS = 16
 

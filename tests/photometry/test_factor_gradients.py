@@ -7,13 +7,13 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.ground.linalg.robust import Cauchy, GemanMcClure, Huber, Squares
-from pimper_torch.method.photometry.bilinear import Bilinear
-from pimper_torch.method.photometry.cone import Cone
-from pimper_torch.method.photometry.factor_gradients import differentiable
-from pimper_torch.method.photometry.quadratics import outer
-from pimper_torch.method.photometry.variable_projection import solve_variable_projection
+from pimper_torch.linalg.robust import Cauchy, GemanMcClure, Huber, Squares
 from pimper_torch.single_view.factorization.low_rank import FreeManifold
+from pimper_torch.stages.photometry.bilinear import Bilinear
+from pimper_torch.stages.photometry.cone import Cone
+from pimper_torch.stages.photometry.factor_gradients import differentiable
+from pimper_torch.stages.photometry.quadratics import outer
+from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
 
 @pytest.fixture

@@ -6,16 +6,16 @@ from solved import solved
 from torch import nn
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.factor_priors import (
+from pimper_torch.records import PatchPriors
+from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.stages.photometry.factor_priors import (
     FieldLights,
     MapPriors,
     SurfaceNormals,
     views_worth,
 )
-from pimper_torch.method.photometry.factorize import Factorize
-from pimper_torch.method.photometry.photometry_config import FactorizeConfig
-from pimper_torch.records import PatchPriors
-from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.stages.photometry.factorize import Factorize
+from pimper_torch.stages.photometry.photometry_config import FactorizeConfig
 from tests.photometry.test_factorize import median_error
 
 

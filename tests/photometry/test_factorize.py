@@ -8,16 +8,15 @@ from solved import solved
 from torch.nn.functional import pad
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.template_normals import coarse_normals
-from pimper_torch.method.chains.chain_config import load_config
-from pimper_torch.method.photometry import factorize
-from pimper_torch.method.photometry.factorize import Factorize
-from pimper_torch.method.photometry.fit_light import FitLight
-from pimper_torch.method.photometry.light_field import LightField, harmonics
-from pimper_torch.method.photometry.photometry_config import FactorizeConfig
+from pimper_torch.geometry.template_normals import coarse_normals
+from pimper_torch.lighting.light_field import LightField, harmonics
+from pimper_torch.presets.load_config import load_config
 from pimper_torch.records import PatchStatus, PatchViews
 from pimper_torch.runtime.errors import PimperWarning
-from pimper_torch.runtime.reporting import figures
+from pimper_torch.stages.photometry import factorize
+from pimper_torch.stages.photometry.factorize import Factorize
+from pimper_torch.stages.photometry.fit_light import FitLight
+from pimper_torch.stages.photometry.photometry_config import FactorizeConfig
 
 EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
 
@@ -156,7 +155,7 @@ def test_a_shadowed_patch_has_albedo_only_under_constant_light(scene, monkeypatc
 
     monkeypatch.setattr(factorize, "_illuminated", illuminated)
     photometric = solved(Factorize(), true.seen)
-    found, counts = photometric.buckets[0], figures(photometric)
+    found, counts = photometric.buckets[0], photometric.figures()
     assert counts["few_views_patches"] == 1  # one of 8: a figure, not a warning
     assert counts["constant_light_patches"] == (0 if moves else 7)
     assert counts["determined_patches"] == (7 if moves else 0)

@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg.robust import CAUCHY_TUNING
-from pimper_torch.method.photometry.light_models import ImageSamples
+from pimper_torch.lighting.light_models import ImageSamples
+from pimper_torch.linalg.robust import CAUCHY_TUNING
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from solved import solved
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.factorize import Factorize
 from pimper_torch.records import PatchViews
+from pimper_torch.stages.photometry.factorize import Factorize
 
 SEEDS = st.integers(0, 2**31 - 1)
 

@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.method.photometry.light_models import left_out, predicts_better
+from pimper_torch.lighting.light_models import left_out, predicts_better
 
 
 def test_a_fifth_of_seen_samples_is_held_out_per_sample_and_view(generator):

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.light_colour import exposures, light_colours
+from pimper_torch.lighting.light_colour import exposures, light_colours
 
 
 def scene(generator, views=8, samples=900):

@@ -3,14 +3,14 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.light_field import (
+from pimper_torch.lighting.light_field import (
     LightField,
     faces_light,
     harmonics,
     linearized,
     second_harmonics,
 )
-from pimper_torch.method.photometry.lights import fit_light_field
+from pimper_torch.lighting.lights import fit_light_field
 
 
 @pytest.fixture

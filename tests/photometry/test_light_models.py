@@ -5,8 +5,8 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.light_field import LightField, harmonics, second_harmonics
-from pimper_torch.method.photometry.light_models import MIN_DISTANCE, LightModel
+from pimper_torch.lighting.light_field import LightField, harmonics, second_harmonics
+from pimper_torch.lighting.light_models import MIN_DISTANCE, LightModel
 
 
 def basis(normals):

@@ -3,11 +3,11 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.rigid import rigid, rotate
-from pimper_torch.method.photometry.light_field import harmonics, rotate_lights, second_harmonics
-from pimper_torch.method.photometry.light_fit import LightFit
-from pimper_torch.method.photometry.light_models import ImageSamples, LightModel
-from pimper_torch.method.photometry.lights import _fit_room, fit_light_field
+from pimper_torch.geometry.rigid import rigid, rotate
+from pimper_torch.lighting.light_field import harmonics, rotate_lights, second_harmonics
+from pimper_torch.lighting.light_fit import LightFit
+from pimper_torch.lighting.light_models import ImageSamples, LightModel
+from pimper_torch.lighting.lights import _fit_room, fit_light_field
 
 
 def data(generator, samples=800, views=9):
@@ -71,7 +71,7 @@ def test_shading_is_the_same_in_every_frame(generator):
 def test_lights_fitted_in_groups_are_exact(generator, monkeypatch):
     J, n, lights, _ = data(generator, views=11)
     seen = torch.rand(J.shape, generator=generator) > 0.3
-    monkeypatch.setattr("pimper_torch.method.photometry.lights._TOGETHER", 4)
+    monkeypatch.setattr("pimper_torch.lighting.lights._TOGETHER", 4)
     found = fit_light_field(torch.where(seen, J, torch.nan), seen, n)
     assert (found.point_light == 0).all()
     assert_close(found.soft[:, :4], lights, rtol=1e-5, atol=1e-5)  # one scale for all groups
@@ -83,7 +83,7 @@ def test_gradients_of_lights_fitted_in_groups_match_differences(generator, monke
     J = J + 0.01 * torch.randn(J.shape, generator=generator, dtype=torch.float64)
     change = 0.01 * torch.randn(J.shape, generator=generator, dtype=torch.float64)
     weight = torch.randn(7, 9, generator=generator, dtype=torch.float64)
-    monkeypatch.setattr("pimper_torch.method.photometry.lights._TOGETHER", 4)
+    monkeypatch.setattr("pimper_torch.lighting.lights._TOGETHER", 4)
 
     def evaluate(step):
         radiance = (J + step * change).requires_grad_()

@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.quadratics import apply_packed, congruence, outer, solve_packed
+from pimper_torch.stages.photometry.quadratics import apply_packed, congruence, outer, solve_packed
 
 
 def dense(packed, size):

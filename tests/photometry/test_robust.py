@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg.robust import (
+from pimper_torch.linalg.robust import (
     Cauchy,
     GemanMcClure,
     Huber,

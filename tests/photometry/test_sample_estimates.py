@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from pimper_torch.method.photometry.bilinear import Factors, equations_of_samples, update_shading
-from pimper_torch.method.photometry.sample_estimates import fit_albedo, refine_on_manifold
 from pimper_torch.records import Convergence
+from pimper_torch.stages.photometry.bilinear import Factors, equations_of_samples, update_shading
+from pimper_torch.stages.photometry.sample_estimates import fit_albedo, refine_on_manifold
 
 
 def solved_under(problem, lights):

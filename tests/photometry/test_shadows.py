@@ -5,10 +5,10 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_bench.scenes.procedural_meshes import icosphere, join, moved, table
-from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.method.photometry.light_field import LightField
-from pimper_torch.method.photometry.shadows import cast_shadows, cast_shadows_on_rasters
+from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.lighting.light_field import LightField
 from pimper_torch.records import Mesh
+from pimper_torch.stages.photometry.shadows import cast_shadows, cast_shadows_on_rasters
 
 RADIUS, HEIGHT = 0.5, 1.2  # of the ball, above the plane z = 0
 

@@ -2,12 +2,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg.robust import Cauchy
-from pimper_torch.method.photometry.balm import solve_balm
-from pimper_torch.method.photometry.bilinear import equations_of_samples, evaluate, update_shading
-from pimper_torch.method.photometry.sample_estimates import refine_on_manifold
-from pimper_torch.method.photometry.variable_projection import solve_variable_projection
+from pimper_torch.linalg.robust import Cauchy
 from pimper_torch.single_view.factorization.ambiguity import align_factorizations
+from pimper_torch.stages.photometry.balm import solve_balm
+from pimper_torch.stages.photometry.bilinear import equations_of_samples, evaluate, update_shading
+from pimper_torch.stages.photometry.sample_estimates import refine_on_manifold
+from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
 
 def objective(*given):

@@ -1,7 +1,7 @@
 import torch
 
-from pimper_torch.method.photometry.status import light_varies, patch_status
 from pimper_torch.records import PatchStatus
+from pimper_torch.stages.photometry.status import light_varies, patch_status
 
 
 def test_light_variation_is_the_ratio_of_the_third_singular_value(generator):

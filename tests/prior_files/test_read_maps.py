@@ -8,8 +8,8 @@ import torch
 from PIL import Image, PngImagePlugin
 from torch.testing import assert_close
 
-from pimper_torch.doors.export.openexr import read_exr, write_exr
-from pimper_torch.doors.io.decode import write_deep_png
+from pimper_torch.io.decode import write_deep_png
+from pimper_torch.io.openexr import read_exr, write_exr
 from pimper_torch.priors.map_config import NORMALS_ERROR_DEG
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.records import Views

@@ -4,11 +4,11 @@ import torch
 from PIL import Image
 
 from pimper_torch.cli.options import parse
-from pimper_torch.doors.io.decode import write_deep_png
-from pimper_torch.doors.scale.given import Mark, PixelMark
+from pimper_torch.io.decode import write_deep_png
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import ConfigError, InputError
+from pimper_torch.scale.given import Mark, PixelMark
 
 SOFT = np.linspace(0, 1, 24 * 16).reshape(16, 24).astype(np.float32)
 

@@ -4,8 +4,8 @@ from scenes import observing, without_points
 from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import rotated
-from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.io.decode import rotated
 from pimper_torch.priors.at_points import reoriented, reoriented_vectors
 from pimper_torch.priors.conventions import resolve_prior_conventions
 from pimper_torch.records import DepthPrior, NormalPrior

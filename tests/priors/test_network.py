@@ -5,8 +5,8 @@ from torch.nn.functional import avg_pool2d, interpolate, normalize
 from torch.testing import assert_close
 
 import pimper_torch as pt
-from pimper_torch.ground.radiometry import srgb_from_linear
 from pimper_torch.priors.map_config import DEPTH_ERROR
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.runtime.errors import ConfigError, InputError
 from tests.priors.onnx_files import model
 

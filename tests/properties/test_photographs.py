@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pimper_torch.doors.io.photographs import load_views
+from pimper_torch.io.photographs import load_views
 
 # EXIF orientation, and the stored pixels that it makes upright.
 STORED = {

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.linalg.robust import robust_variance
-from pimper_torch.method.meshing.closing import closed
-from pimper_torch.method.meshing.simplify import simplify
+from pimper_torch.linalg.robust import robust_variance
 from pimper_torch.records import Mesh
+from pimper_torch.stages.meshing.closing import closed
+from pimper_torch.stages.meshing.simplify import simplify
 
 SEEDS = st.integers(0, 2**31 - 1)
 

@@ -3,11 +3,9 @@
 import torch
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.rigid import invert_rigid, transform
-from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.method.patches.decompose import Decompose
-from pimper_torch.method.patches.patches_config import DecomposeConfig
-from pimper_torch.published.cloud_filters import delaunay
+from pimper_torch.geometry.rigid import invert_rigid, transform
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.paper.cloud_filters import delaunay
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -16,6 +14,8 @@ from pimper_torch.records import (
     Mesh,
     PhotometricPatches,
 )
+from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.stages.patches.patches_config import DecomposeConfig
 
 IDENTITY = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
 

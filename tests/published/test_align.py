@@ -3,10 +3,10 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.rigid import invert_rigid, rigid
-from pimper_torch.published.align import Align, patch_status, vertex_anchors
-from pimper_torch.published.published_config import AlignConfig
-from pimper_torch.published.seams import (
+from pimper_torch.geometry.rigid import invert_rigid, rigid
+from pimper_torch.paper.align import Align, patch_status, vertex_anchors
+from pimper_torch.paper.paper_config import AlignConfig
+from pimper_torch.paper.seams import (
     AlignTerms,
     curvature_along,
     find_seams,
@@ -15,7 +15,6 @@ from pimper_torch.published.seams import (
     solve_transforms,
 )
 from pimper_torch.records import AlignStatus
-from pimper_torch.runtime.reporting import figures
 from tests.published.scenes import (
     IDENTITY,
     ball,
@@ -157,9 +156,9 @@ def test_the_status_records_alignment(sphere):
     found = Align()(sphere)
     assert (statuses(found) == ALIGNED).all()
     assert all(height_field.aligned.all() for height_field in found.buckets)
-    assert "aligned_patches" not in figures(sphere)
-    assert figures(found)["aligned_patches"] == found.patches.num_patches
-    assert figures(found)["mismatch"] == float(found.mismatch[-1])
+    assert "aligned_patches" not in sphere.figures()
+    assert found.figures()["aligned_patches"] == found.patches.num_patches
+    assert found.figures()["mismatch"] == float(found.mismatch[-1])
 
 
 def test_a_patch_without_heights_at_its_border_is_alone(generator):

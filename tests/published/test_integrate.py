@@ -3,9 +3,9 @@ import torch
 from slopes import normals_from_slopes
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.height_fields import sample_raster
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.published.integrate import (
+from pimper_torch.geometry.height_fields import sample_raster
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.paper.integrate import (
     Integrate,
     differences,
     differences_transposed,

@@ -2,12 +2,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.subdivision import subdivide
-from pimper_torch.ground.geometry.surfaces import unit_face_normals
-from pimper_torch.ground.geometry.topology import face_edges
-from pimper_torch.method.fusion.blend import blend_patches, ray_directions, vertex_spacing
-from pimper_torch.published.published_config import RefineConfig
-from pimper_torch.published.refine import Refine, seam_weight, smooth_seams
+from pimper_torch.geometry.subdivision import subdivide
+from pimper_torch.geometry.surfaces import unit_face_normals
+from pimper_torch.geometry.topology import face_edges
+from pimper_torch.paper.paper_config import RefineConfig
+from pimper_torch.paper.refine import Refine, seam_weight, smooth_seams
+from pimper_torch.stages.fusion.blend import blend_patches, ray_directions, vertex_spacing
 from tests.published.scenes import ball, changed, facets_over, height_fields, level, rings
 
 SPACING = 0.02

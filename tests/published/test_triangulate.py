@@ -2,10 +2,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths
-from pimper_torch.ground.geometry.topology import face_components, half_edges
-from pimper_torch.published.cloud_filters import (
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import face_normals, side_lengths
+from pimper_torch.geometry.topology import face_components, half_edges
+from pimper_torch.paper.cloud_filters import (
     consistent_points,
     delaunay,
     facets_under,
@@ -15,8 +15,8 @@ from pimper_torch.published.cloud_filters import (
     spread_to_count,
     without_isolated_corners,
 )
-from pimper_torch.published.published_config import TriangulateConfig
-from pimper_torch.published.triangulate import Triangulate, peel
+from pimper_torch.paper.paper_config import TriangulateConfig
+from pimper_torch.paper.triangulate import Triangulate, peel
 from pimper_torch.runtime.errors import ReconstructionError
 
 

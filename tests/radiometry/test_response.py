@@ -2,8 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.radiometry import Encoding, Gamma, Linear, Srgb
-from pimper_torch.ground.radiometry.response import curve_from_table
+from pimper_torch.radiometry import Encoding, Gamma, Linear, Srgb
+from pimper_torch.radiometry.response import curve_from_table
 from pimper_torch.runtime.errors import ConfigError, InputError
 
 LEVELS = torch.arange(256, dtype=torch.float64)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from pimper_torch.ground.radiometry import find_saturation
+from pimper_torch.radiometry import find_saturation
 
 
 def photographs(generator, count=4, pixels=20_000, brightest=1.5):

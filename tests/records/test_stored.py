@@ -14,7 +14,7 @@ from torch import Tensor
 
 import pimper_torch as pt
 from pimper_torch import records
-from pimper_torch.method.chains.chain import Step
+from pimper_torch.chains.chain import Step
 from pimper_torch.records import Record, stored
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.runtime.errors import InputError, OutputError

@@ -6,11 +6,11 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.doors.io.tensors import scene_of
-from pimper_torch.ground.geometry.directions import even_directions
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.geometry.directions import even_directions
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.io.tensors import scene_of
 from pimper_torch.records import Mesh, ViewLights
 
 SIDE = 80

@@ -3,13 +3,13 @@ import math
 import pytest
 import torch
 
-from pimper_torch.doors.io.reports import relighting_report
-from pimper_torch.ground.geometry.poisson import reduced
-from pimper_torch.method.chains.coarse_to_fine import split_held_out
+from pimper_torch.chains.coarse_to_fine import split_held_out
+from pimper_torch.export.reports import relighting_report
+from pimper_torch.geometry.poisson import reduced
 from pimper_torch.records import Silhouettes
-from pimper_torch.result.asset.bake import textured
-from pimper_torch.result.relighting.held_out import Relight, judge_textures
 from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.stages.relighting.held_out import Relight, judge_textures
+from pimper_torch.stages.texturing.bake import textured
 from tests.relighting.ball import ball_mesh, photographed
 
 GLOSSY = (0.0, 0.3, 1.0)

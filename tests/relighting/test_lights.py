@@ -5,12 +5,12 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_bench.scenes.procedural_meshes import icosphere, join, moved, table
-from pimper_torch.doors.io.tensors import scene_of
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.io.tensors import scene_of
 from pimper_torch.records import Mesh, ViewLights
-from pimper_torch.result.relighting.fit_lights import lights_of, observe_all
-from pimper_torch.result.relighting.held_out import predict
-from pimper_torch.result.relighting.lit_surface import LitSurface
+from pimper_torch.stages.relighting.fit_lights import lights_of, observe_all
+from pimper_torch.stages.relighting.held_out import predict
+from pimper_torch.stages.relighting.lit_surface import LitSurface
 from tests.relighting.ball import ball_mesh, photographed
 
 MATTE, GLOSSY = (0.0, 1.0, 0.0), (0.0, 0.3, 1.0)

@@ -1,10 +1,10 @@
 import pytest
 import torch
 
-from pimper_torch.result.relighting.fit_lights import lights_of, observe_all
-from pimper_torch.result.relighting.fit_materials import clusters, materials_under
-from pimper_torch.result.relighting.held_out import psnr, shaded
-from pimper_torch.result.relighting.lit_surface import LitSurface, response
+from pimper_torch.stages.relighting.fit_lights import lights_of, observe_all
+from pimper_torch.stages.relighting.fit_materials import clusters, materials_under
+from pimper_torch.stages.relighting.held_out import psnr, shaded
+from pimper_torch.stages.relighting.lit_surface import LitSurface, response
 from tests.relighting.ball import ball_mesh, colours, photographed, textbook
 from tests.threads import on_threads
 

@@ -11,15 +11,16 @@ import pytest
 import torch
 from PIL import Image
 
-from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.io.assets.placement import Placement, standing
+from pimper_torch.io.assets.write import write_asset
+from pimper_torch.radiometry import srgb_from_linear
+from pimper_torch.radiometry.base_color import base_color
 from pimper_torch.records import Materials, Relighting, Silhouettes, ViewErrors
-from pimper_torch.result.asset.bake import textured
-from pimper_torch.result.asset.placement import Placement, standing
-from pimper_torch.result.asset.write import write_asset
-from pimper_torch.result.relighting.held_out import predict
-from pimper_torch.result.report.page import write_page
-from pimper_torch.result.report.predictions import predictions
-from pimper_torch.result.viz.maps import base_color, view_maps
+from pimper_torch.stages.relighting.held_out import predict
+from pimper_torch.stages.texturing.bake import textured
+from pimper_torch.viz.maps import view_maps
+from pimper_torch.viz.report.page import write_page
+from pimper_torch.viz.report.predictions import predictions
 from tests.relighting.ball import SIDE, ball_mesh, photographed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -11,11 +11,11 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Materials, Mesh, Relighting, ViewErrors, ViewLights
-from pimper_torch.result.report.openness import openness
-from pimper_torch.result.report.page import left_out_by_pass, write_page
-from pimper_torch.result.report.predictions import (
+from pimper_torch.viz.report.openness import openness
+from pimper_torch.viz.report.page import left_out_by_pass, write_page
+from pimper_torch.viz.report.predictions import (
     Prediction,
     jpeg,
     longest_px,
@@ -24,7 +24,7 @@ from pimper_torch.result.report.predictions import (
     shrunk,
     view_entries,
 )
-from pimper_torch.result.report.vertex_layers import (
+from pimper_torch.viz.report.vertex_layers import (
     VertexLayer,
     length_layer,
     length_unit,

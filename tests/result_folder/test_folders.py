@@ -15,14 +15,14 @@ from pathlib import Path
 import pytest
 
 from pimper_torch.cli.main import main
-from pimper_torch.doors.result_folder.folders import (
+from pimper_torch.export.result_folder.folders import (
     clean_output,
     held_output,
     prepare_output,
     require_apart,
     written_whole,
 )
-from pimper_torch.doors.result_folder.marker import MARKER, STAGES, read_marker
+from pimper_torch.export.result_folder.marker import MARKER, STAGES, read_marker
 from pimper_torch.runtime.errors import InputError, OutputError
 
 
@@ -205,7 +205,7 @@ def test_a_failed_run_leaves_only_the_former_result(out, tmp_path, error):
 KILLED_AT_EVERY_STEP = """
 import os, shutil, signal, sys
 from pathlib import Path
-from pimper_torch.doors.result_folder.folders import held_output, written_whole
+from pimper_torch.export.result_folder.folders import held_output, written_whole
 folder = Path(sys.argv[1])
 first = {"mesh.ply": "first", "masks/a.png": "the same", "masks/b.png": "first"}
 second = {"mesh.ply": "second", "masks/a.png": "the same", "lights/all/c.json": "second"}
@@ -284,7 +284,7 @@ def test_the_current_directory_survives_a_replacement(out, monkeypatch):
 HOLDS = """
 import sys, time
 from pathlib import Path
-from pimper_torch.doors.result_folder.folders import held_output, written_whole
+from pimper_torch.export.result_folder.folders import held_output, written_whole
 folder = Path(sys.argv[1])
 with held_output(folder, "result", overwrite=True):
     (folder / ".stages" / "mesh.pt").write_bytes(b"kept")

@@ -4,7 +4,7 @@ from scenes import without_points
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.method.sfm.undistort import pinhole_for
+from pimper_torch.geometry.undistortion import pinhole_for
 from pimper_torch.records import CameraModel, Mesh, Silhouettes
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 700.0

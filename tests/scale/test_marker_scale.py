@@ -11,15 +11,15 @@ from PIL import Image
 import pimper_torch as pt
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.cli.options import bundled_photographs
-from pimper_torch.doors.scale import marker_scale
-from pimper_torch.doors.scale.aruco import find_squares
-from pimper_torch.doors.scale.find_scale import find_scale
-from pimper_torch.doors.scale.given import CameraDistance
-from pimper_torch.doors.scale.marker_scale import Marker, find_markers, scale_of_markers
-from pimper_torch.doors.scale.sheet import MAX_SIDE_MM, MIN_SIDE_MM, PAPERS_MM, layout, side_of
-from pimper_torch.ground.geometry.opencv import shrunk, warped
-from pimper_torch.ground.geometry.pixels import scale_intrinsics
-from pimper_torch.result.viz.marker_sheet import draw_sheet
+from pimper_torch.geometry.opencv import shrunk, warped
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.scale import marker_scale
+from pimper_torch.scale.aruco import find_squares
+from pimper_torch.scale.find_scale import find_scale
+from pimper_torch.scale.given import CameraDistance
+from pimper_torch.scale.marker_scale import Marker, find_markers, scale_of_markers
+from pimper_torch.scale.sheet import MAX_SIDE_MM, MIN_SIDE_MM, PAPERS_MM, layout, side_of
+from pimper_torch.viz.marker_sheet import draw_sheet
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
 FINE = 4  # oversampling

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from pimper_torch.doors.scale.find_scale import scale_of_bars, scale_of_cameras
-from pimper_torch.doors.scale.given import CameraDistance, Mark, PixelMark, ScaleBar
-from pimper_torch.doors.scale.marks import place_of
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Silhouettes
 from pimper_torch.runtime.errors import ConfigError, InputError
+from pimper_torch.scale.find_scale import scale_of_bars, scale_of_cameras
+from pimper_torch.scale.given import CameraDistance, Mark, PixelMark, ScaleBar
+from pimper_torch.scale.marks import place_of
 
 
 def direction(*values):

@@ -8,10 +8,10 @@ import torch
 
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_torch.cli.main import main
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.cameras.model_files import read_model
 
 log = logging.getLogger(__name__)
 SIZE = {"width": 640, "height": 480}

@@ -10,8 +10,7 @@ from probes import small_scene
 from torch.utils import _pytree as pytree
 
 import pimper_torch as pt
-from pimper_torch.doors.scale.scaled import LAST, POSES, POWERS, scaled
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.projection import project
 from pimper_torch.records import (
     CoarseMesh,
     Depths,
@@ -23,6 +22,7 @@ from pimper_torch.records import (
     Surface,
 )
 from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.scale.scaled import LAST, POSES, POWERS, scaled
 
 # Fields without a unit of length: pixels, angles, radiance, fractions.
 WITHOUT = {

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Makes pimper_torch/result/report/three.js anew: what the page of a run uses of three.js, in one file.
 set -euo pipefail
-page="$(cd "$(dirname "$0")/../../pimper_torch/result/report" && pwd)"
+page="$(cd "$(dirname "$0")/../../pimper_torch/viz/report" && pwd)"
 work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
 cd "$work"

@@ -4,11 +4,11 @@ import torch
 from sparse_models import observed, views_of
 from torch import Tensor
 
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import CameraModel, Cameras, Views
+from pimper_torch.records.sparse_model import SparseModel
 
 WIDTH, HEIGHT, FOCAL = 480, 360, 840.0
 

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from pimper_bench.scenes.scene_cameras import FRONT, UP, arc_cameras
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.static_background import StaticBackground, find_static_background
+from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras
+from pimper_torch.stages.sfm.static_background import StaticBackground, find_static_background
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0
 

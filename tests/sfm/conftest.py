@@ -2,11 +2,11 @@ import pytest
 import torch
 from sparse_models import views_of
 
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.method.sfm.sparse_scene import assemble_scene
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import CameraModel, SparseScene, Views
+from pimper_torch.records.sparse_model import SparseModel
+from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 
 
 @pytest.fixture

@@ -4,9 +4,9 @@ import torch
 
 from pimper_bench.scenes.scene_cameras import turntable_directions
 from pimper_bench.scenes.whole_scene import upside_down
-from pimper_torch.ground.geometry.pinholes import look_at
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.geometry.pinholes import look_at
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 
 K = torch.tensor([[400.0, 0, 160], [0, 400, 120], [0, 0, 1]]).double()
 

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.rigid import rigid, transform
-from pimper_torch.method.sfm.diagnose import agreement, verify_model
-from pimper_torch.method.sfm.matching import VerifiedPair, all_pairs
-from pimper_torch.method.sfm.model import select_views
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.rigid import rigid, transform
+from pimper_torch.records.sparse_model import select_views
+from pimper_torch.stages.sfm.diagnose import agreement, verify_model
+from pimper_torch.stages.sfm.matching import VerifiedPair, all_pairs
 from tests.sfm import ball
 
 

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from pimper_torch.method.sfm.cloud import cloud_tracks, visible_from
-from pimper_torch.method.sfm.colmap import observation_errors
-from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.method.sfm.triangulation import triangulate
 from pimper_torch.records import Views
+from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.sfm.cloud import cloud_tracks, visible_from
+from pimper_torch.stages.sfm.colmap import observation_errors
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.stages.sfm.triangulation import triangulate
 from tests.sfm.ball import cameras_on_an_arc, model_of, photographs
 
 

@@ -6,7 +6,7 @@ import sys
 SCRIPT = """
 import os, signal
 import numpy as np
-from pimper_torch.ground.geometry.colmap_library import loaded
+from pimper_torch.geometry.colmap_library import loaded
 
 def interrupt(number, frame):
     raise KeyboardInterrupt
@@ -25,7 +25,7 @@ except KeyboardInterrupt:
 WRONG_ORDER = """
 import pycolmap
 import PIL.Image
-from pimper_torch.ground.geometry.colmap_library import loaded
+from pimper_torch.geometry.colmap_library import loaded
 loaded()
 """
 

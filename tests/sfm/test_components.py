@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from pimper_torch.ground.geometry.rigid import rigid
-from pimper_torch.method.sfm.diagnose import choose_component, count_spread_views
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.runtime.errors import ReconstructionError
+from pimper_torch.stages.sfm.diagnose import choose_component, count_spread_views
 
 NAMES = tuple(f"{index:02d}.jpg" for index in range(20))
 

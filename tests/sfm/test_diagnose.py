@@ -2,11 +2,11 @@ import pytest
 import torch
 from sparse_models import observed, views_of
 
-from pimper_torch.method.sfm.camera_in_place import follows_camera_in_place, mapped
-from pimper_torch.method.sfm.diagnose import count_views_with_depth, diagnose, following_fraction
-from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.sparse_scene import assemble_scene, write_model
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.sfm.camera_in_place import follows_camera_in_place, mapped
+from pimper_torch.stages.sfm.diagnose import count_views_with_depth, diagnose, following_fraction
+from pimper_torch.stages.sfm.reconstruct import Reconstruct
+from pimper_torch.stages.sfm.sparse_scene import assemble_scene, write_model
 from tests.sfm.captured import HEIGHT, UP, WIDTH, orbit, seen_of_ball
 
 

@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.radiometry import to_bytes
-from pimper_torch.method.sfm.colmap import write_binary
-from pimper_torch.method.sfm.existing import existing_model
-from pimper_torch.method.sfm.lenses import QUARTERS
-from pimper_torch.method.sfm.sparse_scene import assemble_scene
+from pimper_torch.geometry.quarter_turns import QUARTERS
+from pimper_torch.io.cameras.existing import existing_model
+from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
+from pimper_torch.stages.sfm.colmap import write_binary
+from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 from tests.sfm import ball
 from tests.sfm.ball import HEIGHT, WIDTH
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.geometry.colmap_library import loaded, quiet
-from pimper_torch.method.sfm.epipolar import sampson_errors
-from pimper_torch.method.sfm.features import find_features, workspace
-from pimper_torch.method.sfm.matching import (
+from pimper_torch.geometry.colmap_library import loaded, quiet
+from pimper_torch.io.photographs import load_views
+from pimper_torch.stages.sfm.epipolar import sampson_errors
+from pimper_torch.stages.sfm.features import find_features, workspace
+from pimper_torch.stages.sfm.matching import (
     Features,
     Near,
     guided_matches,
@@ -20,7 +20,7 @@ from pimper_torch.method.sfm.matching import (
     most_similar,
     verified_pairs,
 )
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 
 CONFIG = ReconstructConfig(threads=1)
 

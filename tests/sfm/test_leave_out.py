@@ -1,9 +1,9 @@
 import numpy as np
 import torch
 
-from pimper_torch.ground.geometry.colmap_library import loaded
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.method.sfm.static_background import remove_static_features
+from pimper_torch.geometry.colmap_library import loaded
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.stages.sfm.static_background import remove_static_features
 from tests.sfm.captured import FOCAL, HEIGHT, WIDTH, Captured, orbit, seen_of_ball, turntable
 
 SETTINGS = ReconstructConfig(threads=1)

@@ -6,9 +6,9 @@ import torch
 from sparse_models import views_of
 from torch.testing import assert_close
 
-from pimper_torch.method.sfm.lenses import choose_lenses, group_lenses
-from pimper_torch.method.sfm.reconstruct import structure_from_motion
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.stages.sfm.lenses import choose_lenses, group_lenses
+from pimper_torch.stages.sfm.reconstruct import structure_from_motion
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 from tests.sfm.ball import cameras_on_an_arc, photographs
 
 NAN = math.nan

@@ -1,4 +1,4 @@
-from pimper_torch.method.sfm.matching import all_pairs, strongest, tiles
+from pimper_torch.stages.sfm.matching import all_pairs, strongest, tiles
 
 
 def test_tiles_contain_every_pair_once_and_few_photographs_each():

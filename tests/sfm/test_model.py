@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.method.sfm.model import drop_weak_views, longest_tracks, select_views
+from pimper_torch.records.sparse_model import drop_weak_views, longest_tracks, select_views
 
 
 def test_a_point_seen_by_only_one_kept_view_is_removed(model):

@@ -9,10 +9,10 @@ from sparse_models import observed
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.colmap_library import loaded
-from pimper_torch.method.sfm.colmap import model_of, reconstruction_of, write_binary
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.geometry.colmap_library import loaded
+from pimper_torch.io.cameras.model_files import read_model
 from pimper_torch.runtime.errors import InputError, PimperWarning
+from pimper_torch.stages.sfm.colmap import model_of, reconstruction_of, write_binary
 
 POINTS, VIEWS = 20, 4
 COLORS = torch.zeros(POINTS, 3, dtype=torch.uint8)

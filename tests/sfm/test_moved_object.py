@@ -2,7 +2,7 @@ from itertools import combinations
 
 import torch
 
-from pimper_torch.method.sfm.moved_object import (
+from pimper_torch.stages.sfm.moved_object import (
     clusters,
     find_moved_object,
     object_votes,

@@ -6,16 +6,16 @@ from sparse_models import views_of
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.method.sfm.model import SparseModel
-from pimper_torch.method.sfm.poses import (
+from pimper_torch.records import CameraModel, SilhouettePrior
+from pimper_torch.records.sparse_model import SparseModel
+from pimper_torch.runtime.errors import InputError
+from pimper_torch.stages.sfm.poses import (
     equal_poses,
     expand_to_photographs,
     mean_images,
     one_view_per_pose,
     with_poses,
 )
-from pimper_torch.records import CameraModel, SilhouettePrior
-from pimper_torch.runtime.errors import InputError
 
 POSES = (0, 1, 0, 2, 1, 0)
 

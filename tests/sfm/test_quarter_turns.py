@@ -2,10 +2,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.lenses import turned_lens, turned_pixels, turned_pose
-from pimper_torch.method.sfm.model_files import camera_models
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.quarter_turns import turned_lens, turned_pixels, turned_pose
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.cameras.model_files import camera_models
 from pimper_torch.records import CameraModel
 
 COUNTS = dict(camera_models().values())

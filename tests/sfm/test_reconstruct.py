@@ -8,16 +8,16 @@ from PIL import Image
 from sparse_models import views_of
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pixels import scale_intrinsics
-from pimper_torch.method.sfm import reconstruct, registration, retrieval, track_observations
-from pimper_torch.method.sfm.features import workspace
-from pimper_torch.method.sfm.reconstruct import Reconstruct, find_model, structure_from_motion
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.method.sfm.sparse_scene import write_model
+from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning, ReconstructionError
 from pimper_torch.runtime.progress import listening
-from pimper_torch.runtime.store import Store, digest
+from pimper_torch.stages.sfm import reconstruct, registration, retrieval, track_observations
+from pimper_torch.stages.sfm.features import workspace
+from pimper_torch.stages.sfm.reconstruct import Reconstruct, find_model, structure_from_motion
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.stages.sfm.sparse_scene import write_model
+from pimper_torch.store import Store, digest
 
 
 def blank(sizes: list[tuple[int, int]]) -> Views:
@@ -192,7 +192,7 @@ def test_photographs_are_written_as_srgb_without_padding_with_masks():
 
 @pytest.mark.slow
 def test_eight_photographs_of_the_skull_are_registered():
-    from pimper_torch.doors.io.photographs import load_views
+    from pimper_torch.io.photographs import load_views
 
     views = load_views(str(files("pimper_torch").joinpath("data/skull")))
     chosen = [views.names.index(f"{number}.jpg") for number in (35, 36, 37, 38, 53, 54, 55, 56)]
@@ -219,7 +219,7 @@ def test_eight_photographs_of_the_skull_are_registered():
 @pytest.mark.slow
 @pytest.mark.parametrize("small", [66, 4], ids=["few", "many"])
 def test_the_same_photographs_give_the_same_bits_on_any_number_of_threads(small, monkeypatch):
-    from pimper_torch.doors.io.photographs import load_views
+    from pimper_torch.io.photographs import load_views
 
     for module in (retrieval, track_observations, registration):
         monkeypatch.setattr(module, "MOST_PAIRED", small)

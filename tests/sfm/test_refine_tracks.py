@@ -1,10 +1,10 @@
 import torch
 
 from pimper_bench.metrics.similarity import similarity_between_points
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import rigid, transform
-from pimper_torch.method.sfm.colmap import bundle, observation_errors
-from pimper_torch.method.sfm.refine_tracks import refine_tracks
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import rigid, transform
+from pimper_torch.stages.sfm.colmap import bundle, observation_errors
+from pimper_torch.stages.sfm.refine_tracks import refine_tracks
 from tests.sfm import ball
 
 

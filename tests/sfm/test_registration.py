@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pimper_torch.method.sfm import registration
-from pimper_torch.method.sfm.diagnose import MatchConsistency, count_views_with_depth
-from pimper_torch.method.sfm.features import Workspace
-from pimper_torch.method.sfm.matching import VerifiedPair, all_pairs
-from pimper_torch.method.sfm.model import select_views
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.method.sfm.registration import register
-from pimper_torch.method.sfm.static_background import StaticBackground
+from pimper_torch.records.sparse_model import select_views
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.sfm import registration
+from pimper_torch.stages.sfm.diagnose import MatchConsistency, count_views_with_depth
+from pimper_torch.stages.sfm.features import Workspace
+from pimper_torch.stages.sfm.matching import VerifiedPair, all_pairs
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.stages.sfm.registration import register
+from pimper_torch.stages.sfm.static_background import StaticBackground
 
 SETTINGS = ReconstructConfig(guided_pairs=1, starts=2, seed=5, threads=1)
 

@@ -1,6 +1,6 @@
 import torch
 
-from pimper_torch.method.sfm.retrieval import global_descriptors, nearest_pairs, vocabulary
+from pimper_torch.stages.sfm.retrieval import global_descriptors, nearest_pairs, vocabulary
 
 
 def walk(count, generator, seen=40):

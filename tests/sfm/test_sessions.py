@@ -5,12 +5,12 @@ import torch
 from sparse_models import observed
 
 from pimper_bench.scenes.whole_scene import upside_down
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.matching import VerifiedPair
-from pimper_torch.method.sfm.moved_object import sessions_in, with_sessions
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Cameras
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.sfm.matching import VerifiedPair
+from pimper_torch.stages.sfm.moved_object import sessions_in, with_sessions
 from tests.sfm.moved import K, bodies, poses
 
 

@@ -2,15 +2,15 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.colmap import reprojection_errors
-from pimper_torch.method.sfm.model_files import read_model
-from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.sparse_scene import assemble_scene, point_colors, write_model
-from pimper_torch.method.silhouettes.cues import cues_of
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.stages.sfm.colmap import reprojection_errors
+from pimper_torch.stages.sfm.reconstruct import Reconstruct
+from pimper_torch.stages.sfm.sparse_scene import assemble_scene, point_colors, write_model
+from pimper_torch.stages.silhouettes.cues import cues_of
+from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
 
 
 def test_writing_a_model_and_reading_it_gives_the_same_scene(scene, views, tmp_path):

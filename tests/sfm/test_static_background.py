@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.epipolar import fundamental_matrix, sampson_errors, shared_geometry
-from pimper_torch.method.sfm.matching import pixels_of
-from pimper_torch.method.sfm.static_background import moving_matches
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.stages.sfm.epipolar import fundamental_matrix, sampson_errors, shared_geometry
+from pimper_torch.stages.sfm.matching import pixels_of
+from pimper_torch.stages.sfm.static_background import moving_matches
 from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable
 
 

@@ -1,7 +1,7 @@
 import torch
 
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.track_observations import (
+from pimper_torch.geometry.projection import project
+from pimper_torch.stages.sfm.track_observations import (
     evenly,
     plane_homographies,
     plane_normals,

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.track_observations import log_pictures, observe_points, tangents
+from pimper_torch.geometry.projection import project
+from pimper_torch.stages.sfm.track_observations import log_pictures, observe_points, tangents
 from tests.sfm import ball
 
 

@@ -8,19 +8,19 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from pimper_torch.ground.geometry.lens_models import pinhole_of, undistort_pixels
-from pimper_torch.ground.geometry.local_frame import from_local
-from pimper_torch.ground.geometry.pixels import grid_from_pixels, pixel_centers
-from pimper_torch.ground.geometry.rigid import invert_rigid
-from pimper_torch.method.sfm.colmap import observation_errors
-from pimper_torch.method.sfm.epipolar import inliers, pinholes_of
-from pimper_torch.method.sfm.existing import existing_model
-from pimper_torch.method.sfm.matching import VerifiedPair
-from pimper_torch.method.sfm.model import SparseModel, select_views
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.method.sfm.triangulation import lacks_points, triangulate
+from pimper_torch.geometry.lens_models import pinhole_of, pinholes_of, undistort_pixels
+from pimper_torch.geometry.local_frame import from_local
+from pimper_torch.geometry.pixels import grid_from_pixels, pixel_centers
+from pimper_torch.geometry.rigid import invert_rigid
+from pimper_torch.io.cameras.existing import existing_model
 from pimper_torch.records import CameraModel, Views
+from pimper_torch.records.sparse_model import SparseModel, select_views
 from pimper_torch.runtime.errors import InputError, PimperWarning, ReconstructionError
+from pimper_torch.stages.sfm.colmap import observation_errors
+from pimper_torch.stages.sfm.epipolar import inliers
+from pimper_torch.stages.sfm.matching import VerifiedPair
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.stages.sfm.triangulation import lacks_points, triangulate
 from tests.sfm.ball import cameras_on_an_arc, model_of, photographs, points_on_the_ball
 
 SETTINGS = ReconstructConfig(threads=1)

@@ -3,9 +3,9 @@ import torch
 
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.sfm.reconstruct import Reconstruct
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 from tests.sfm.test_turntable import center_errors, photographs
 
 

@@ -7,11 +7,11 @@ from pimper_bench.scenes.procedural_meshes import potato
 from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.reconstruct import Reconstruct
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.runtime.errors import PimperWarning, ReconstructionError
+from pimper_torch.stages.sfm.reconstruct import Reconstruct
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 
 QUICK = ReconstructConfig(
     peak_threshold=0.0067,

@@ -3,11 +3,11 @@ import torch
 from sparse_models import views_of
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.lens_models import distort, is_pinhole, undistort_pixels
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.radiometry import SATURATED
-from pimper_torch.method.sfm.model_files import camera_models
-from pimper_torch.method.sfm.undistort import photograph_pixels, pinhole_for, undistort
+from pimper_torch.geometry.lens_models import distort, is_pinhole, undistort_pixels
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.undistortion import photograph_pixels, pinhole_for, undistort
+from pimper_torch.io.cameras.model_files import camera_models
+from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import CameraModel, Views
 
 

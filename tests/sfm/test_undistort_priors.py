@@ -3,8 +3,9 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.method.sfm.undistort import photograph_pixels, with_undistorted_priors
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.undistortion import photograph_pixels
+from pimper_torch.priors.undistort import with_undistorted_priors
 from pimper_torch.records import (
     AlbedoPrior,
     CameraModel,

@@ -6,9 +6,9 @@ from sparse_models import observed
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.rigid import invert_rigid, rigid, transform
-from pimper_torch.method.sfm.lenses import turned_pose
-from pimper_torch.method.sfm.upright import level_up, upright
+from pimper_torch.geometry.quarter_turns import turned_pose
+from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
+from pimper_torch.stages.sfm.upright import level_up, upright
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ from scenes import observed
 from torch import Tensor
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import project, rays_through
-from pimper_torch.method.silhouettes import cuts
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.records import CameraModel, Cameras, SparseScene, Views
+from pimper_torch.stages.silhouettes import cuts
+from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
 from tests.silhouettes.shapes import all_round
 
 # The ball is supported by the plane z = 0.

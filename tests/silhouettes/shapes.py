@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.method.silhouettes.cuts import Cuts
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Cameras, Silhouettes
+from pimper_torch.stages.silhouettes.cuts import Cuts
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 120, 100, 180.0, 5.0
 PIXEL = DISTANCE / FOCAL  # at the origin

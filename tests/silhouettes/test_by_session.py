@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from pimper_torch.method.silhouettes.find import by_session
 from pimper_torch.records import Silhouettes
+from pimper_torch.stages.silhouettes.find import by_session
 
 
 @pytest.fixture

@@ -4,10 +4,10 @@ from functools import partial
 import pytest
 import torch
 
-from pimper_torch.ground.geometry.visual_hull import bounding_box
-from pimper_torch.method.silhouettes import trace
-from pimper_torch.method.silhouettes.trace import TraceContours
+from pimper_torch.geometry.visual_hull import bounding_box
 from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.stages.silhouettes import trace
+from pimper_torch.stages.silhouettes.trace import TraceContours
 from tests.silhouettes.shapes import ball, silhouettes_of, two_balls
 
 

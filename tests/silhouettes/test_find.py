@@ -2,23 +2,23 @@ import pytest
 import torch
 from scenes import observing
 
-from pimper_torch.ground.geometry.opencv import signed_distance
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.supporting_plane import Plane, fixation
-from pimper_torch.method.silhouettes import cuts, find
-from pimper_torch.method.silhouettes.cues import Cues, cues_of
-from pimper_torch.method.silhouettes.cuts import cuts_of
-from pimper_torch.method.silhouettes.find import FindSilhouettes, masked
-from pimper_torch.method.silhouettes.parallax import (
+from pimper_torch.geometry.opencv import signed_distance
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.supporting_plane import Plane, fixation
+from pimper_torch.records import Silhouettes, Views
+from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.stages.silhouettes import cuts, find
+from pimper_torch.stages.silhouettes.cues import Cues, cues_of
+from pimper_torch.stages.silhouettes.cuts import cuts_of
+from pimper_torch.stages.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.stages.silhouettes.parallax import (
     background_agreement,
     plane_agreement,
     static_background_maps,
     working_pictures,
 )
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
-from pimper_torch.records import Silhouettes, Views
-from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
 from tests.silhouettes import shapes
 from tests.silhouettes.conftest import SMALL, overlap
 

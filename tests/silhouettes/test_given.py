@@ -8,15 +8,15 @@ from scenes import observed, observing
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.doors.io.decode import rotated
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig
-from pimper_torch.method.chains.coarse_to_fine import CoarseToFine
-from pimper_torch.method.silhouettes.given import AS_THEY_ARE, Reading, right_reading
-from pimper_torch.method.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.chains.chain_config import CoarseToFineConfig
+from pimper_torch.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.decode import rotated
 from pimper_torch.records import CameraModel, SilhouettePrior, Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
-from pimper_torch.runtime.stage import Stage
+from pimper_torch.stages.silhouettes.given import AS_THEY_ARE, Reading, right_reading
+from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
+from pimper_torch.stages.stage import Stage
 from tests.silhouettes.shapes import FOCAL, HEIGHT, WIDTH, all_round, silhouettes_of
 
 # Three balls without symmetry, and the radius of background points.

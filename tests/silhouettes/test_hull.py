@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
+from pimper_torch.geometry.visual_hull import margins, visual_hull
 from tests.silhouettes import shapes
 from tests.silhouettes.shapes import HEIGHT, WIDTH, silhouettes_of
 

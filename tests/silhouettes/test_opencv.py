@@ -4,14 +4,14 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from pimper_torch.ground.geometry.opencv import (
+from pimper_torch.geometry.opencv import (
     BACKGROUND,
     OBJECT,
     PERHAPS_BACKGROUND,
     grab_cut_halved,
     signed_distance,
 )
-from pimper_torch.ground.geometry.pixels import pixel_centers
+from pimper_torch.geometry.pixels import pixel_centers
 
 
 def test_a_cut_at_half_resolution_has_an_error_below_two_pixels(generator):

@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.metrics.in_view import angles_deg
-from pimper_torch.ground.geometry.contours import contour_rays
+from pimper_torch.geometry.contours import contour_rays
 from tests.silhouettes.shapes import PIXEL, ball, nearest_to, ring, silhouettes_of
 
 

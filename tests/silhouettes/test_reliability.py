@@ -2,9 +2,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.method.silhouettes.cuts import repaired
-from pimper_torch.method.silhouettes.reliability import agreement_of
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.stages.silhouettes.cuts import repaired
+from pimper_torch.stages.silhouettes.reliability import agreement_of
 from tests.silhouettes import shapes
 
 VIEWS = 8

@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from pimper_torch.ground.geometry.opencv import (
+from pimper_torch.geometry.opencv import (
     BACKGROUND,
     OBJECT,
     PERHAPS_BACKGROUND,
     PERHAPS_OBJECT,
     signed_distance,
 )
-from pimper_torch.method.silhouettes.cuts import (
+from pimper_torch.stages.silhouettes.cuts import (
     exposed_fraction,
     filled,
     held_fraction,

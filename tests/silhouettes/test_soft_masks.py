@@ -3,11 +3,11 @@ import torch
 from scenes import observing
 from torch.nn.functional import interpolate
 
-from pimper_torch.ground.geometry.visual_hull import margins, visual_hull
-from pimper_torch.method.silhouettes.cues import keep_seeded_components, soft_masks_of
-from pimper_torch.method.silhouettes.find import FindSilhouettes
+from pimper_torch.geometry.visual_hull import margins, visual_hull
 from pimper_torch.records import SilhouettePrior
 from pimper_torch.runtime.errors import InputError, PimperWarning
+from pimper_torch.stages.silhouettes.cues import keep_seeded_components, soft_masks_of
+from pimper_torch.stages.silhouettes.find import FindSilhouettes
 from tests.silhouettes.conftest import SMALL, overlap
 from tests.silhouettes.shapes import HEIGHT, WIDTH, all_round, silhouettes_of
 

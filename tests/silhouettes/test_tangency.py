@@ -2,8 +2,8 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_bench.metrics.in_view import angles_deg
-from pimper_torch.ground.geometry.contours import ambiguous, contour_points, contour_rays
-from pimper_torch.ground.geometry.visual_hull import visual_hull
+from pimper_torch.geometry.contours import ambiguous, contour_points, contour_rays
+from pimper_torch.geometry.visual_hull import visual_hull
 from tests.silhouettes.shapes import CENTERS, DISTANCE, PIXEL, ball, ring, silhouettes_of, two_balls
 
 BOX = torch.tensor([[-1.6, -1.6, -1.6], [1.6, 1.6, 1.6]])

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from pimper_torch.runtime.store.digest import code, is_known
+from pimper_torch.store.digest import code, is_known
 
 # The package's attribute of this name is the function, not the module.
 module = sys.modules[code.__module__]
@@ -31,5 +31,5 @@ def test_the_hash_covers_source_files_their_names_and_versions(tmp_path, monkeyp
 
 
 def test_code_outside_the_package_has_no_hash():
-    assert is_known("pimper_torch.method.fusion.fuse")
+    assert is_known("pimper_torch.stages.fusion.fuse")
     assert not any(map(is_known, ["torch.nn", "pimper_torch_extra.fuse", "__main__"]))

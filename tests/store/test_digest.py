@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import nn
 
-from pimper_torch.method.fusion.fuse import Fuse
-from pimper_torch.method.fusion.fuse_config import FuseConfig
-from pimper_torch.method.meshing.extract import Extract
-from pimper_torch.runtime.store import digest, opened
+from pimper_torch.stages.fusion.fuse import Fuse
+from pimper_torch.stages.fusion.fuse_config import FuseConfig
+from pimper_torch.stages.meshing.extract import Extract
+from pimper_torch.store import digest, opened
 
 
 class Color(Enum):

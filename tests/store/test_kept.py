@@ -8,7 +8,7 @@ from pimper_torch.runtime.errors import PimperWarning, caution
 from pimper_torch.runtime.failures import collecting, skipped
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.reporting import SilentObserver, called, recorded
-from pimper_torch.runtime.store import Store, digest, kept
+from pimper_torch.store import Store, digest, kept
 
 
 def cameras():

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from pimper_torch.records import Cameras, Record, StageReport
 from pimper_torch.runtime.errors import OutputError
-from pimper_torch.runtime.store import Store, digest, opened, realigned
 from pimper_torch.runtime.user_cache import user_cache
+from pimper_torch.store import Store, digest, opened, realigned
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

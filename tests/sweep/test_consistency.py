@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.sweep.costs import inconsistency
+from pimper_torch.stages.sweep.costs import inconsistency
 
 VIEWS = 8
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.sweep.minimum import parabola_minimum, posterior_variance
+from pimper_torch.stages.sweep.minimum import parabola_minimum, posterior_variance
 
 
 def costs(place: float, curvature: float, count: int = 9) -> torch.Tensor:

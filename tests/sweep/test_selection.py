@@ -1,7 +1,7 @@
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.sweep.costs import best_views, poses_first, view_scores
+from pimper_torch.stages.sweep.costs import best_views, poses_first, view_scores
 
 
 def test_only_the_best_usable_views_are_chosen():

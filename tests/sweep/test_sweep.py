@@ -3,10 +3,10 @@ import torch
 from scenes import each_bucket
 from torch.testing import assert_close
 
-from pimper_torch.method.patches.warp import Warp
-from pimper_torch.method.sweep.sweep import Sweep
-from pimper_torch.method.sweep.sweep_config import SweepConfig
 from pimper_torch.records import SweptPatches
+from pimper_torch.stages.patches.warp import Warp
+from pimper_torch.stages.sweep.sweep import Sweep
+from pimper_torch.stages.sweep.sweep_config import SweepConfig
 
 
 def sweep(lifted, config: SweepConfig | None = None) -> SweptPatches:

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.sweep.windows import flat_weight, window_mean, window_size
+from pimper_torch.stages.sweep.windows import flat_weight, window_mean, window_size
 
 
 @pytest.mark.parametrize("radius", [1.5, 2.5])

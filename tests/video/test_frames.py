@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from pimper_torch.cli.main import main
 from pimper_torch.cli.video.choose import motion, scanned, sharpness, thumbnail
 from pimper_torch.cli.video.read import frame_pictures, luma_frames
-from pimper_torch.doors.io.photograph_files import list_images
+from pimper_torch.io.photograph_files import list_images
 from pimper_torch.runtime.errors import PimperWarning
 from tests.video.clips import COUNT, HEIGHT, WIDTH, positions, texture, written
 

@@ -5,7 +5,7 @@ import pytest
 def viewer():
     """An empty page on a free port."""
     pytest.importorskip("viser")
-    from pimper_torch.result.viewer.viewer import Viewer
+    from pimper_torch.viewer.viewer import Viewer
 
     with Viewer(port=0) as viewer:
         yield viewer

@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.records import Mesh, Views
-from pimper_torch.result.viewer.show import add_found
+from pimper_torch.viewer.show import add_found
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DRAWN_IN_SOFTWARE = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -3,9 +3,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Cameras
-from pimper_torch.result.viewer.viewer import frame_of_cameras
+from pimper_torch.viewer.viewer import frame_of_cameras
 
 
 def cameras_on_a_ring(count, distance, height):

@@ -10,13 +10,13 @@ from urllib.request import urlopen
 import pytest
 
 from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.main import main
-from pimper_torch.doors.io import results
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.method.chains.chain_config import CoarseToFineConfig
+from pimper_torch.export import results
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
-from pimper_torch.result.viewer.show import add_folder, show
 from pimper_torch.runtime.errors import InputError, PimperWarning
+from pimper_torch.viewer.show import add_folder, show
 
 pytest.importorskip("viser")
 

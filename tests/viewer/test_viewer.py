@@ -12,17 +12,17 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.doors.export.result import Result
-from pimper_torch.ground.geometry.rigid import invert_rigid, transform
-from pimper_torch.ground.radiometry import linear_from_srgb
+from pimper_torch.export.result import Result
+from pimper_torch.geometry.rigid import invert_rigid, transform
+from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh
-from pimper_torch.result.report.vertex_layers import surface_layers
-from pimper_torch.result.viewer import layers
-from pimper_torch.result.viewer import server as server_module
-from pimper_torch.result.viewer.server import open_server, require_viser
-from pimper_torch.result.viewer.show import add_found, show
-from pimper_torch.result.viewer.viewer import NO_PHOTOGRAPH, Viewer, frame_of_cameras, frame_of_mesh
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.viewer import layers
+from pimper_torch.viewer import server as server_module
+from pimper_torch.viewer.server import open_server, require_viser
+from pimper_torch.viewer.show import add_found, show
+from pimper_torch.viewer.viewer import NO_PHOTOGRAPH, Viewer, frame_of_cameras, frame_of_mesh
+from pimper_torch.viz.report.vertex_layers import surface_layers
 from tests.viewer.test_frame import cameras_on_a_ring
 
 pytest.importorskip("viser")

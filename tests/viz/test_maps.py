@@ -3,8 +3,9 @@ import torch
 from scenes import from_above, tilted_square
 from torch.testing import assert_close
 
+from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh
-from pimper_torch.result.viz.maps import albedo_scale, normal_colors, view_maps
+from pimper_torch.viz.maps import normal_colors, view_maps
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ from PIL import Image
 from scipy import ndimage
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.radiometry import srgb_from_linear
+from pimper_torch.geometry.projection import project
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Silhouettes, Views
-from pimper_torch.result.viz.overview import (
+from pimper_torch.viz.overview import (
     RELIABLE,
     UNRELIABLE,
     _selected,
@@ -21,7 +21,7 @@ from pimper_torch.result.viz.overview import (
     panels_of,
     thumbnails,
 )
-from pimper_torch.result.viz.render import frame, shade
+from pimper_torch.viz.render import frame, shade
 
 
 def drawn(path):

@@ -3,9 +3,9 @@ import torch
 from scenes import from_above, tilted_square
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.projection import project
 from pimper_torch.records import Mesh
-from pimper_torch.result.viz.render import bounding_box, frame, rotation, shade
+from pimper_torch.viz.render import bounding_box, frame, rotation, shade
 
 
 @pytest.fixture

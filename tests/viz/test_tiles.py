@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pimper_torch.result.viz.tiles import Tile, encoded, fitted, sheet, with_triangles
+from pimper_torch.viz.tiles import Tile, encoded, fitted, sheet, with_triangles
 
 
 def plain(color, height=30, width=40):

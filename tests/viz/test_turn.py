@@ -5,10 +5,10 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.projection import project
 from pimper_torch.records import Mesh
-from pimper_torch.result.viz import turn
-from pimper_torch.result.viz.turn import circling, draw_turn, up_world
+from pimper_torch.viz import turn
+from pimper_torch.viz.turn import circling, draw_turn, up_world
 
 UP = torch.tensor([0.0, 1.0, 0.0])
 

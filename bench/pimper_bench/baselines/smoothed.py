@@ -19,19 +19,19 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
 
-from pimper_torch.ground.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
-from pimper_torch.ground.geometry.subdivision import Subdivision, subdivide
-from pimper_torch.ground.geometry.surfaces import face_normals, side_lengths, vertex_normals
-from pimper_torch.ground.geometry.topology import (
+from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
+from pimper_torch.geometry.subdivision import Subdivision, subdivide
+from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
+from pimper_torch.geometry.topology import (
     boundary_vertices,
     face_counts,
     face_edges,
     half_edges,
 )
-from pimper_torch.ground.linalg.sparse import SparseCholesky
+from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
 from pimper_torch.runtime.errors import ReconstructionError
-from pimper_torch.runtime.stage import Stage
+from pimper_torch.stages.stage import Stage
 
 # Vertices of the smooth mesh if its facets are of one size, about twice as many with those of a
 # sparse cloud: more vertices would not show more detail.

@@ -19,16 +19,16 @@ from pimper_bench.metrics.surface_distances import TrueSurface
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.truth import Capture
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.method.chains.chain_config import Config, load_config
-from pimper_torch.method.chains.presets import make_chain
-from pimper_torch.method.sfm.reconstruct import Reconstruct, find_model, placed_scene
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.published.triangulate import Triangulate
+from pimper_torch.io.photographs import load_views
+from pimper_torch.paper.triangulate import Triangulate
+from pimper_torch.presets.load_chain import make_chain
+from pimper_torch.presets.load_config import Config, load_config
 from pimper_torch.records import CoarseMesh, Estimate, Record, SparseScene
 from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.errors import ConfigError
-from pimper_torch.runtime.store import opened
+from pimper_torch.stages.sfm.reconstruct import Reconstruct, find_model, placed_scene
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
+from pimper_torch.store import opened
 
 SCENES = ("mug", "jar", "balls", "potatoes")
 METHODS = {"quick": ("default", "smoothed"), "full": ("default", "paper", "smoothed", "openmvs")}
@@ -153,14 +153,14 @@ class MethodRun(Record):
 
     Attributes:
         seconds: Wall clock without structure from motion.
-        figures: Of its stages, such as ``samples``, the samples of all templates times views,
+        counts: Figures of its stages, such as ``samples``: all templates' samples times views,
             including missing ones.
         external: Whether another program did the work, with memory outside this process.
     """
 
     estimate: Estimate
     seconds: float
-    figures: Mapping[str, int | float] = field(default_factory=dict)
+    counts: Mapping[str, int | float] = field(default_factory=dict)
     external: bool = False
 
 
@@ -186,8 +186,8 @@ def _run_preset(config: Config, scene: SparseScene, coarse: CoarseMesh) -> Metho
     began = time.perf_counter()
     result = chain(scene)
     seconds = time.perf_counter() - began
-    figures = {key: value for report in result.report for key, value in report.figures.items()}
-    return MethodRun(estimate=estimate_of(result), seconds=seconds, figures=figures)
+    counts = {key: value for report in result.report for key, value in report.figures.items()}
+    return MethodRun(estimate=estimate_of(result), seconds=seconds, counts=counts)
 
 
 def _run_baseline(module: nn.Module, scene: SparseScene, coarse: CoarseMesh) -> MethodRun:

@@ -18,11 +18,11 @@ from pimper_bench.bench.bench_inputs import Inputs
 from pimper_bench.metrics.in_view import Meeting
 from pimper_bench.metrics.surface_distances import bounding_diagonal
 from pimper_bench.truth import Capture
-from pimper_torch.ground.geometry.rigid import rotate
+from pimper_torch.geometry.rigid import rotate
 from pimper_torch.records import Mesh
-from pimper_torch.result.viz.maps import normal_colors, view_maps
-from pimper_torch.result.viz.render import shade
-from pimper_torch.result.viz.tiles import Picture, Tile, array, encoded, sheet
+from pimper_torch.viz.maps import normal_colors, view_maps
+from pimper_torch.viz.render import shade
+from pimper_torch.viz.tiles import Picture, Tile, array, encoded, sheet
 
 _COLORS = "viridis"  # perceptually uniform, and it has no red
 MISSED = (0.88, 0.20, 0.16)

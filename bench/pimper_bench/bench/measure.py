@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from pimper_torch.cli.doctor.findings import total_gb
-from pimper_torch.doors.io.version import installed_version
+from pimper_torch.io.version import installed_version
 from pimper_torch.records import Record
 from pimper_torch.runtime.cores import usable_cores
 

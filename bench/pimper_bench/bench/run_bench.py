@@ -40,8 +40,8 @@ from pimper_bench.metrics.evaluation import Evaluation, evaluate
 from pimper_bench.metrics.in_view import Meeting, ViewFigures, figures_of, meet_truth
 from pimper_bench.metrics.similarity import transfer
 from pimper_bench.truth import Capture
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.doors.result_folder.folders import written_whole
+from pimper_torch.export.result_folder.folders import written_whole
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import PimperError, PimperWarning
 from pimper_torch.runtime.reporting import stage
@@ -249,6 +249,6 @@ def _row_of(
         if seen
         else (),
         peak_memory_mb=memory,
-        **_counted(outcome.figures),
+        **_counted(outcome.counts),
         **_along_rays(view),
     )

@@ -13,7 +13,7 @@ from pimper_bench.bench.bench_table import terminal
 from pimper_bench.bench.run_bench import BENCH_NAMES, run_bench
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.result_folder.folders import prepare_output, require_apart
+from pimper_torch.export.result_folder.folders import prepare_output, require_apart
 from pimper_torch.runtime.user_cache import user_cache
 
 _OUT, _DEFAULT = Path("pimper_bench"), BenchConfig()

@@ -16,10 +16,10 @@ from pimper_bench import datasets
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.export.nerfstudio import thinned
-from pimper_torch.doors.result_folder.folders import prepare_output, require_apart, written_whole
-from pimper_torch.ground.radiometry import FROM_FILES, LINEAR, Encoding
-from pimper_torch.ground.radiometry.encoding import ResponseChoice, SaturationChoice
+from pimper_torch.export.nerfstudio import thinned
+from pimper_torch.export.result_folder.folders import prepare_output, require_apart, written_whole
+from pimper_torch.radiometry import FROM_FILES, LINEAR, Encoding
+from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.reporting import stage
 

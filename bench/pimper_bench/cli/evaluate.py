@@ -27,14 +27,14 @@ from pimper_bench.metrics.surface_distances import true_surface
 from pimper_bench.truth import Capture, DtuProtocol, Truth
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.doors.io.estimates import read_estimate
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.io.version import installed_version
-from pimper_torch.doors.result_folder.files import file_written_whole, prepare_file
+from pimper_torch.export.result_folder.files import file_written_whole, prepare_file
+from pimper_torch.io.estimates import read_estimate
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.io.version import installed_version
 from pimper_torch.records import Estimate, Views
-from pimper_torch.result.report.page import HEAD
 from pimper_torch.runtime.config import to_mapping
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.viz.report.page import HEAD
 
 Layout = Literal["auto", "rendered", "mesh", "dtu-mvs", "diligent-mv"]
 

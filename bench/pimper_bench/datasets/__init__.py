@@ -17,7 +17,7 @@ from pimper_bench.datasets.formats import (
 from pimper_bench.datasets.idr import write_idr
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.datasets.sampling import one_light_per_position
-from pimper_torch.doors.export.nerfstudio import write_transforms
+from pimper_torch.export.nerfstudio import write_transforms
 
 __all__ = [
     "one_light_per_position",

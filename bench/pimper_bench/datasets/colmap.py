@@ -4,12 +4,12 @@ from pathlib import Path
 
 import torch
 
-from pimper_torch.doors.export.picture_files import refuse_skew, write_pictures
-from pimper_torch.ground.geometry.lens_models import pinhole_lenses
-from pimper_torch.ground.shapes import Points
-from pimper_torch.method.sfm.colmap import write_binary
-from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.export.picture_files import refuse_skew, write_pictures
+from pimper_torch.geometry.lens_models import pinhole_lenses
 from pimper_torch.records import Cameras, Views
+from pimper_torch.records.shapes import Points
+from pimper_torch.records.sparse_model import SparseModel
+from pimper_torch.stages.sfm.colmap import write_binary
 
 
 def write_colmap(

@@ -14,9 +14,9 @@ from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_bench.datasets.raster import nearest
 from pimper_bench.datasets.sampling import LightOptions, Shot, read_shots
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import decompose_projections
-from pimper_torch.doors.io.meshes import read_mesh
+from pimper_torch.io.cameras.layout import DataSetPath
+from pimper_torch.io.cameras.posed_camera import decompose_projections
+from pimper_torch.io.meshes import read_mesh
 
 # Photometric stereo's axes are x right, y up, z towards the viewer; this converts them to ours.
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)

@@ -20,15 +20,15 @@ from pimper_bench.datasets.posed import (
     mask_finder,
 )
 from pimper_bench.truth import Capture
-from pimper_torch.doors.camera_files import transforms_json
-from pimper_torch.doors.camera_files.camera_arrays import read_camera_arrays
-from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import PosedCamera
-from pimper_torch.doors.camera_files.read_cameras import FORMATS, read_cameras
-from pimper_torch.doors.io.decode import read_header
-from pimper_torch.doors.io.extras import SUFFIXES
-from pimper_torch.ground.geometry.rigid import invert_rigid
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.geometry.rigid import invert_rigid
+from pimper_torch.io.cameras import transforms_json
+from pimper_torch.io.cameras.camera_arrays import read_camera_arrays
+from pimper_torch.io.cameras.layout import DataSetPath
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.cameras.posed_camera import PosedCamera
+from pimper_torch.io.cameras.read_cameras import FORMATS, read_cameras
+from pimper_torch.io.decode import read_header
+from pimper_torch.io.extras import SUFFIXES
 from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.numpy_files import read_npy
@@ -167,7 +167,7 @@ def read_idr(
     """Read the cameras of ``cameras.npz`` with ``image/`` and, if it exists, ``mask/``.
 
     For their meaning, see
-    :func:`~pimper_torch.doors.camera_files.camera_arrays.read_camera_arrays`. ``scale_mat_i``, from
+    :func:`~pimper_torch.io.cameras.camera_arrays.read_camera_arrays`. ``scale_mat_i``, from
     the unit sphere around the object to the world, is ignored: cameras and truth are in the world's
     units. Arrays and masks correspond to the images sorted by name.
 
@@ -209,7 +209,7 @@ def read_camera_file(
 
     Args:
         folder: The file, or the folder with one by its usual name, see
-            :data:`~pimper_torch.doors.camera_files.read_cameras.FORMATS`.
+            :data:`~pimper_torch.io.cameras.read_cameras.FORMATS`.
         images: Folder of the photographs. They are found by the name in the file, without its
             folders, and if necessary without suffixes. By default ``images`` next to the file, or
             the file's folder.
@@ -239,7 +239,7 @@ def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capt
     """Read the cameras of a ``transforms.json`` and the photographs it names.
 
     For their meaning, see
-    :func:`~pimper_torch.doors.camera_files.transforms_json.read_transforms_cameras`. Lenses are
+    :func:`~pimper_torch.io.cameras.transforms_json.read_transforms_cameras`. Lenses are
     undistorted. The mask is ``mask_path`` if a frame has one, else the image's alpha channel.
     Photographs are named by their files, or by full paths in the file if these are not unique.
 

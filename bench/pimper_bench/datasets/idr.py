@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pimper_torch.doors.export.picture_files import write_mask, write_picture
-from pimper_torch.ground.geometry.pixels import indices_from_pixels
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.export.picture_files import write_mask, write_picture
+from pimper_torch.geometry.pixels import indices_from_pixels
+from pimper_torch.geometry.projection import project
 from pimper_torch.records import Cameras, Views
 from pimper_torch.runtime.errors import InputError
 

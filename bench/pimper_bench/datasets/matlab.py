@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.io.cameras.layout import DataSetPath
 from pimper_torch.runtime.errors import some
 
 # Number types by their code in the file, and array classes of numbers.
@@ -151,7 +151,7 @@ def read_toolbox_projections(
     Returns:
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is
         not corrected: in published files it is not exactly orthogonal, which
-        :func:`~pimper_torch.doors.camera_files.posed_camera.decompose_projections` handles.
+        :func:`~pimper_torch.io.cameras.posed_camera.decompose_projections` handles.
     """
     poses = [name for number in numbers for name in (f"Rc_{number}", f"Tc_{number}")]
     intrinsic = ["KK"] if "KK" in _variables(file) else ["fc", "cc"]

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from pimper_bench.datasets.raster import read_photographs
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.camera_files.posed_camera import PosedCamera
-from pimper_torch.doors.io.extras import SUFFIXES
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.geometry.lens_models import is_pinhole, rescale_lens
-from pimper_torch.ground.radiometry import FROM_FILES, Encoding
-from pimper_torch.method.sfm.existing import resize_fits
-from pimper_torch.method.sfm.undistort import pinhole_for, undistort
+from pimper_torch.geometry.lens_models import is_pinhole, rescale_lens
+from pimper_torch.geometry.undistortion import pinhole_for, undistort
+from pimper_torch.io.cameras.existing import resize_fits
+from pimper_torch.io.cameras.layout import DataSetPath
+from pimper_torch.io.cameras.posed_camera import PosedCamera
+from pimper_torch.io.extras import SUFFIXES
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import CameraModel, Cameras, Views
 from pimper_torch.runtime.errors import InputError, some
 

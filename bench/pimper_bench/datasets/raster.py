@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from pimper_torch.doors.io.decode import read_header
-from pimper_torch.doors.io.photographs import read_mask, shrunk_focals, shrunk_size
-from pimper_torch.doors.io.radiance import read_pictures, resized_mask
-from pimper_torch.doors.io.responses import warn_of_responses
-from pimper_torch.ground.geometry.pixels import pixels_from_indices
-from pimper_torch.ground.radiometry import Encoding
+from pimper_torch.geometry.pixels import pixels_from_indices
+from pimper_torch.io.decode import read_header
+from pimper_torch.io.photographs import read_mask, shrunk_focals, shrunk_size
+from pimper_torch.io.radiance import read_pictures, resized_mask
+from pimper_torch.io.responses import warn_of_responses
+from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError
 

@@ -12,11 +12,11 @@ from pimper_bench.scenes.ray_tracing import MAP_NAMES
 from pimper_bench.scenes.rendered_folder import FORMAT, FORMAT_VERSION, unpack_maps
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.radiometry import Encoding
-from pimper_torch.method.sfm.epipolar import pinholes_of
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.geometry.lens_models import pinholes_of
+from pimper_torch.io.cameras.layout import DataSetPath
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.meshes import read_mesh
+from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Cameras, Views
 from pimper_torch.runtime.config import build
 from pimper_torch.runtime.errors import ConfigError, InputError

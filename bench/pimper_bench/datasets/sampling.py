@@ -11,10 +11,10 @@ from torch import Tensor
 
 from pimper_bench.datasets.raster import intrinsics_from_indices, read_photographs
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.doors.io.decode import read_header
-from pimper_torch.ground.geometry.pixels import scale_intrinsics
-from pimper_torch.ground.radiometry import LINEAR, Encoding
+from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.io.cameras.layout import DataSetPath
+from pimper_torch.io.decode import read_header
+from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Cameras, Record
 from pimper_torch.runtime.errors import some
 

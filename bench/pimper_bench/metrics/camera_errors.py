@@ -11,8 +11,8 @@ from torch.nn.functional import normalize
 from pimper_bench.metrics import similarity
 from pimper_bench.metrics.in_view import angles_deg
 from pimper_bench.metrics.surface_distances import bounding_diagonal
-from pimper_torch.ground.geometry.projection import project, triangulate_rays
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.geometry.projection import project, triangulate_rays
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.records import Cameras, Mesh, Record
 
 

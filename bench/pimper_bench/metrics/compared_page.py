@@ -10,19 +10,19 @@ from torch.nn.functional import normalize
 
 from pimper_bench.metrics.in_view import angles_deg
 from pimper_bench.metrics.similarity import transfer
-from pimper_torch.doors.export.result import read_result
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.ground.geometry.surfaces import unit_face_normals
+from pimper_torch.export.result import read_result
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.surfaces import unit_face_normals
+from pimper_torch.io.assets.mesh_files import MeshFiles
+from pimper_torch.io.assets.write import write_asset
 from pimper_torch.records import Mesh
-from pimper_torch.result.asset.bake import Texture
-from pimper_torch.result.asset.finish import Simplify
-from pimper_torch.result.asset.mesh_files import MeshFiles
-from pimper_torch.result.asset.write import write_asset
-from pimper_torch.result.relighting.held_out import Relight
-from pimper_torch.result.report.page import write_page
-from pimper_torch.result.report.predictions import predictions
-from pimper_torch.result.report.vertex_layers import LengthUnit, length_layer
 from pimper_torch.runtime.config import read_mapping
+from pimper_torch.stages.meshing.finish import Simplify
+from pimper_torch.stages.relighting.held_out import Relight
+from pimper_torch.stages.texturing.bake import Texture
+from pimper_torch.viz.report.page import write_page
+from pimper_torch.viz.report.predictions import predictions
+from pimper_torch.viz.report.vertex_layers import LengthUnit, length_layer
 
 _DISTANCE, _ANGLE = "_DISTANCE_TO_TRUTH", "_NORMAL_ERROR_DEG"
 # Titles and units by the asset's attributes.

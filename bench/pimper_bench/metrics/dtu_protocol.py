@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pimper_bench.truth import DtuProtocol
-from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.errors import InputError
 

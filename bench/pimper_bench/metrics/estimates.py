@@ -2,8 +2,8 @@
 
 import torch
 
-from pimper_torch.doors.io.reports import common_lights
-from pimper_torch.ground.geometry.local_frame import NO_OFFSET, from_local
+from pimper_torch.export.reports import common_lights
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.records import Estimate, Reconstruction
 
 
@@ -11,7 +11,7 @@ def estimate_of(result: Reconstruction) -> Estimate:
     """Return a run's estimate of the object, in the frame of its files.
 
     A view's light is that of all patches that determine it, NaN if none does; see
-    :func:`pimper_torch.doors.io.reports.common_lights`.
+    :func:`pimper_torch.export.reports.common_lights`.
     """
     lights, counts = common_lights(result)
     names, offset = result.scene.views.names, result.scene.offset_world

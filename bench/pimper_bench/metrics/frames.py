@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_bench.metrics.surface_distances import sample_surface
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.ground.geometry.rigid import rigid, transform
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.errors import InputError
 

@@ -9,11 +9,11 @@ from torch.nn.functional import avg_pool2d, normalize
 
 from pimper_bench.metrics.surface_distances import with_surroundings
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.ground.geometry.surfaces import vertex_normals
-from pimper_torch.ground.geometry.visibility import Hits, cast_view
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.visibility import Hits, cast_view
 from pimper_torch.records import Cameras, Mesh, Record
 from pimper_torch.runtime.errors import InputError
 

@@ -1,7 +1,7 @@
 """Similarities from the frame of a result to that of the truth.
 
 They are 4x4 matrices ``truth_from_world`` whose upper left block is scale times rotation;
-:func:`pimper_torch.ground.geometry.rigid.transform` applies them.
+:func:`pimper_torch.geometry.rigid.transform` applies them.
 """
 
 from collections import Counter
@@ -17,9 +17,9 @@ from torch import Tensor
 from pimper_bench.metrics.frames import Frames
 from pimper_bench.metrics.surface_distances import sample_surface, true_surface, with_surroundings
 from pimper_bench.truth import Capture
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.ground.geometry.rigid import rigid, transform
-from pimper_torch.ground.geometry.surfaces import face_normals
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.rigid import rigid, transform
+from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import Cameras, Estimate, Mesh, Record
 from pimper_torch.runtime.errors import InputError, caution
 

@@ -12,10 +12,10 @@ from torch.nn.functional import normalize
 
 from pimper_bench.scenes.procedural_meshes import join
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.ground.geometry.nearest import NearestSurface
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.geometry.nearest import NearestSurface
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Mesh, Record
 from pimper_torch.runtime.errors import InputError
 

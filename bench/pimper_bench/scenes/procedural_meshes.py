@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_bench.scenes.textures import random_waves
-from pimper_torch.ground.geometry.surfaces import face_normals, vertex_normals
-from pimper_torch.ground.geometry.visibility import RayCaster
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh
 
 

@@ -12,9 +12,9 @@ from pimper_bench.scenes.procedural_meshes import join
 from pimper_bench.scenes.scene_lights import Lights, PointLight
 from pimper_bench.scenes.scene_object import SceneObject, normals_at_vertices, reflect
 from pimper_bench.scenes.scene_settings import SensorConfig, expose
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
-from pimper_torch.ground.geometry.visibility import Hits, RayCaster
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.records import Cameras, Record
 
 

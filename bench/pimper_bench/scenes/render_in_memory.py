@@ -21,8 +21,8 @@ from pimper_bench.scenes.scene_lights import Lights, wandering_lights
 from pimper_bench.scenes.scene_object import SceneObject, Texture
 from pimper_bench.scenes.scene_settings import SensorConfig
 from pimper_bench.scenes.textures import random_speckle
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import rays_through
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import rays_through
 from pimper_torch.records import Cameras, Mesh, Record, Views
 
 

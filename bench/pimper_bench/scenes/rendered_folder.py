@@ -33,14 +33,14 @@ from pimper_bench.scenes.ray_tracing import RenderedFrame, TracedObjects, render
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.true_clouds import true_model
 from pimper_bench.scenes.whole_scene import Scene, build_scene
-from pimper_torch.doors.io.decode import write_deep_png
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.doors.io.version import installed_version
-from pimper_torch.doors.result_folder.folders import require_apart, written_whole
-from pimper_torch.ground.radiometry import srgb_from_linear, to_bytes
-from pimper_torch.method.sfm.colmap import write_binary
+from pimper_torch.export.result_folder.folders import require_apart, written_whole
+from pimper_torch.io.decode import write_deep_png
+from pimper_torch.io.meshes import write_ply
+from pimper_torch.io.version import installed_version
+from pimper_torch.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.runtime.config import require, to_mapping
 from pimper_torch.runtime.parallel import side_by_side
+from pimper_torch.stages.sfm.colmap import write_binary
 
 _MASKS = ("foreground", "lit", "highlight")
 

@@ -8,9 +8,9 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.ground.geometry.pixels import homogeneous
-from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.pixels import homogeneous
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Cameras
 
 FRONT, UP = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)

@@ -16,11 +16,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
+from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Mesh
-from pimper_torch.result.relighting.lit_surface import facet_density, masking
 from pimper_torch.runtime.config import require
+from pimper_torch.stages.relighting.lit_surface import facet_density, masking
 
 
 def fresnel(

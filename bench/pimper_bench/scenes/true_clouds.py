@@ -5,13 +5,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_bench.scenes.render_in_memory import RenderedScene
-from pimper_torch.ground.geometry.lens_models import pinhole_lenses
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import project, rays_through, triangulate_rays
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.visibility import RayCaster
-from pimper_torch.method.sfm.model import SparseModel
+from pimper_torch.geometry.lens_models import pinhole_lenses
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, Mesh, SparseScene
+from pimper_torch.records.sparse_model import SparseModel
 
 
 def sparse_scene(

@@ -30,10 +30,10 @@ from pimper_bench.scenes.scene_object import (
 from pimper_bench.scenes.scene_objects import RECIPES, TABLES
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.textures import Uniform, random_speckle
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.ground.geometry.pinholes import look_at, pinholes
-from pimper_torch.ground.geometry.rigid import invert_rigid, rigid, transform
-from pimper_torch.ground.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
+from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Cameras, Mesh
 from pimper_torch.runtime.errors import InputError
 

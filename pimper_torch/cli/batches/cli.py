@@ -17,7 +17,7 @@ from pimper_torch.cli.batches.objects import CSV, HTML
 from pimper_torch.cli.batches.task import Outcome
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.stopping import Stopped, exit_code
-from pimper_torch.doors.result_folder.marker import STAGES
+from pimper_torch.export.result_folder.marker import STAGES
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import ReconstructionError
 

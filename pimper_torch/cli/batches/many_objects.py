@@ -10,8 +10,8 @@ from pimper_torch.cli.batches.objects import Object, read_objects
 from pimper_torch.cli.batches.plan import planned_batch, runs_at_once
 from pimper_torch.cli.batches.table import SIGNS, write_table
 from pimper_torch.cli.batches.task import STOPPED, Outcome, Task, carry_out, lost
-from pimper_torch.doors.result_folder.files import prepare_file
-from pimper_torch.doors.result_folder.stages import locked
+from pimper_torch.export.result_folder.files import prepare_file
+from pimper_torch.export.result_folder.stages import locked
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.cores import usable_cores
 

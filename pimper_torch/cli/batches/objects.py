@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pimper_torch.cli.options import every_option
-from pimper_torch.doors.result_folder.files import require_name
+from pimper_torch.export.result_folder.files import require_name
 from pimper_torch.runtime.errors import ConfigError, InputError, some
 
 # Files of the batch itself in OUT, next to the objects' folders.

@@ -13,7 +13,7 @@ from string import Template
 
 from pimper_torch.cli.batches.objects import CSV, HTML
 from pimper_torch.cli.batches.task import Outcome
-from pimper_torch.doors.result_folder.files import file_written_whole
+from pimper_torch.export.result_folder.files import file_written_whole
 
 _COLUMNS = (
     *("name", "status", "tries", "seconds", "views", "registered", "vertices", "faces"),

@@ -21,8 +21,8 @@ from textwrap import shorten
 from typing import IO, Literal
 
 from pimper_torch.cli.crash_report import what_killed
-from pimper_torch.doors.result_folder.marker import MARKER, STAGES
-from pimper_torch.doors.result_folder.stages import locked
+from pimper_torch.export.result_folder.marker import MARKER, STAGES
+from pimper_torch.export.result_folder.stages import locked
 from pimper_torch.runtime.errors import OutputError
 
 Status = Literal["ended", "failed", "lost", "kept", "waiting"]

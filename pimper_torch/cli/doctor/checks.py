@@ -10,8 +10,8 @@ from pimper_torch.cli.doctor.cost import cost
 from pimper_torch.cli.doctor.findings import Finding, available_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
 from pimper_torch.cli.doctor.photograph import Photograph, of_views
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.radiometry import FROM_FILES, Encoding
+from pimper_torch.io.photographs import load_views
+from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import some
 
@@ -28,7 +28,7 @@ def examine_folder(
         Findings on number, blur, saturation, exposure, overlap and cost.
 
     Raises:
-        InputError: As for :func:`pimper_torch.doors.io.photographs.load_views`.
+        InputError: As for :func:`pimper_torch.io.photographs.load_views`.
     """
     photographs = of_views(load_views(folder, encoding=encoding, max_size_px=max_size_px))
     matches = match_copies([photo.small for photo in photographs])

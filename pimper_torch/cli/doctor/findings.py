@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pimper_torch.doors.io.version import versions
+from pimper_torch.io.version import versions
 from pimper_torch.runtime.cores import usable_cores
 
 Severity = Literal["ok", "note", "warning"]

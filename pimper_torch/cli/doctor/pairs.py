@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from pimper_torch.cli.doctor.findings import Finding
-from pimper_torch.method.sfm.features import SMALLEST_PX, find_features, workspace
-from pimper_torch.method.sfm.matching import VerifiedPair, all_pairs, match_pairs, verified_pairs
-from pimper_torch.method.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import some
+from pimper_torch.stages.sfm.features import SMALLEST_PX, find_features, workspace
+from pimper_torch.stages.sfm.matching import VerifiedPair, all_pairs, match_pairs, verified_pairs
+from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 
 
 def match_copies(copies: Sequence[Float[Tensor, "rows columns"]]) -> list[VerifiedPair]:

@@ -9,10 +9,10 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from pimper_torch.doors.io.radiance import resized_radiance
-from pimper_torch.ground.radiometry import SATURATED
-from pimper_torch.ground.shapes import Map, Mask
+from pimper_torch.io.radiance import resized_radiance
+from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Record, Views
+from pimper_torch.records.shapes import Map, Mask
 from pimper_torch.runtime.parallel import side_by_side
 
 # Smoothing of the two compared gradients, in pixels: above noise, below the blur to detect.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pimper_torch.doors.io.decode import LABELS
+from pimper_torch.io.decode import LABELS
 from pimper_torch.priors.from_maps import Maps, stacked
 from pimper_torch.priors.prior_files.map_file import FORMATS, VARIANCE, Layer, read_layer
 from pimper_torch.records import Views

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from pimper_torch.doors.export.openexr import read_exr
-from pimper_torch.doors.io.decode import LABELS, MAX_PIXELS, decode
+from pimper_torch.io.decode import LABELS, MAX_PIXELS, decode
+from pimper_torch.io.openexr import read_exr
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.numpy_files import read_npy, read_npz
 

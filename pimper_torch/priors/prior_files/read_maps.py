@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from pimper_torch.doors.io.decode import LABELS
+from pimper_torch.io.decode import LABELS
 from pimper_torch.priors import from_maps
 from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
 from pimper_torch.priors.prior_files.folder import read_maps, single_channel

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pimper_torch.doors.scale.given import Mark, number_of, require_inside
 from pimper_torch.priors.from_maps import silhouettes_from, stacked
 from pimper_torch.priors.prior_files.folder import read_maps, single_channel
 from pimper_torch.priors.prior_files.map_file import Layer
 from pimper_torch.records import SilhouettePrior, Views
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.scale.given import Mark, number_of, require_inside
 
 _KINDS = ("mask", "silhouette", "alpha", "inside")  # prefixes of the names of arrays
 

@@ -1,6 +1,6 @@
 """Factorization of any low-rank matrix, and with other orders of light than in the chains.
 
-Problems and solvers are those of :mod:`pimper_torch.method.photometry`.
+Problems and solvers are those of :mod:`pimper_torch.stages.photometry`.
 """
 
 from pimper_torch.runtime.renamed import renamed_names

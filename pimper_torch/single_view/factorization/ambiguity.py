@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Scalars
 from pimper_torch.records import Record
+from pimper_torch.records.shapes import Scalars
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -20,8 +20,8 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Mask, Scalars
 from pimper_torch.records import Record
+from pimper_torch.records.shapes import Mask, Scalars
 from pimper_torch.runtime.errors import InputError
 
 Shading = Float[Tensor, "3 pixel"]

@@ -19,13 +19,13 @@ from jaxtyping import Bool, Float
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from pimper_torch.ground.linalg import robust
-from pimper_torch.ground.radiometry import SATURATED, Gamma, Linear, Response, Srgb
-from pimper_torch.ground.shapes import Mask
-from pimper_torch.method.photometry.variable_projection import solve_variable_projection
+from pimper_torch.linalg import robust
+from pimper_torch.radiometry import SATURATED, Gamma, Linear, Response, Srgb
 from pimper_torch.records import Record, Views
+from pimper_torch.records.shapes import Mask
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization import low_rank
+from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
 Samples = Float[Tensor, "view sample"]
 Seen = Bool[Tensor, "view sample"]
@@ -208,7 +208,7 @@ def gamma_of_photographs(views: Views, *, mask: Mask | None = None, rank: int = 
     """Estimate the gamma of photographs that a fixed camera took under several lights.
 
     Args:
-        views: Loaded with :data:`~pimper_torch.ground.radiometry.LINEAR`; masks are intersected.
+        views: Loaded with :data:`~pimper_torch.radiometry.LINEAR`; masks are intersected.
         mask: True on the object, for all photographs.
     """
     if len(set(map(tuple, views.sizes_px.tolist()))) > 1:

@@ -11,7 +11,7 @@ a distant point light  3     :math:`\rho n`: any vector     an invertible 3 x 3
 first order            4     :math:`\rho (1, n)`            scaled Lorentz
 =====================  ====  =============================  =====================
 
-First order is :class:`pimper_torch.method.photometry.cone.Cone`.
+First order is :class:`pimper_torch.stages.photometry.cone.Cone`.
 
 Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2001.
 """
@@ -23,11 +23,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Scalars
-from pimper_torch.method.photometry.bilinear import Bilinear, Factors
-from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import Record
+from pimper_torch.records.shapes import Scalars
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.stages.photometry.bilinear import Bilinear, Factors
+from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
 Matrices = Float[Tensor, "batch row column"]
 Matrix = Float[Tensor, "row column"]

@@ -24,9 +24,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.ground.shapes import Map
-from pimper_torch.published.integrate import StepsDown, StepsRight, differences
+from pimper_torch.paper.integrate import StepsDown, StepsRight, differences
 from pimper_torch.records import Convergence, Record, StopCause
+from pimper_torch.records.shapes import Map
 from pimper_torch.runtime.progress import report
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 from pimper_torch.single_view.integration.steps import Steps, joined

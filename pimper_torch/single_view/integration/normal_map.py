@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.ground.geometry.pixels import crop_intrinsics
-from pimper_torch.ground.shapes import Map, Mask, Matrix3
+from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Record
+from pimper_torch.records.shapes import Map, Mask, Matrix3
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.integration.discontinuities import (
     ContinuousSteps,

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.ground.geometry.topology import graph_components
-from pimper_torch.ground.linalg.multigrid import Multigrid
-from pimper_torch.ground.linalg.prepared import DEFAULT_TOLERANCE
-from pimper_torch.ground.linalg.sparse import SparseCholesky
-from pimper_torch.ground.shapes import Map
-from pimper_torch.published.integrate import Heights, StepsDown, StepsRight, differences_transposed
+from pimper_torch.geometry.topology import graph_components
+from pimper_torch.linalg.multigrid import Multigrid
+from pimper_torch.linalg.prepared import DEFAULT_TOLERANCE
+from pimper_torch.linalg.sparse import SparseCholesky
+from pimper_torch.paper.integrate import Heights, StepsDown, StepsRight, differences_transposed
+from pimper_torch.records.shapes import Map
 
 # A factorization takes twice as long to compute as a multigrid hierarchy (0.17 s and 0.08 s), and a
 # third as long to apply. Below this size it is as fast in total, and its solutions are exact.

@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import pad
 
-from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
-from pimper_torch.ground.shapes import Mask, Matrix3, Scalars, VectorMap
-from pimper_torch.published.integrate import fill_smoothly
+from pimper_torch.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.paper.integrate import fill_smoothly
 from pimper_torch.records import Record
+from pimper_torch.records.shapes import Mask, Matrix3, Scalars, VectorMap
 
 Changes = Float[Tensor, "line step"]
 Known = Bool[Tensor, "line step"]

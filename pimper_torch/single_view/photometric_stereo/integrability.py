@@ -21,9 +21,9 @@ from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
-from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
-from pimper_torch.ground.shapes import Mask, Matrix3, Vectors
+from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
+from pimper_torch.records.shapes import Mask, Matrix3, Vectors
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import PerPixel, Shading
 

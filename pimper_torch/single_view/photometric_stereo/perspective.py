@@ -21,8 +21,8 @@ from scipy.linalg import eigh
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, pad
 
-from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
-from pimper_torch.ground.shapes import Images, Mask, Matrix3, VectorMap, ViewVectors
+from pimper_torch.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.records.shapes import Images, Mask, Matrix3, VectorMap, ViewVectors
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.bas_relief import Shading
 from pimper_torch.single_view.photometric_stereo.regress_lights import factorize_photographs

@@ -16,13 +16,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
-from pimper_torch.ground.shapes import ViewVectors
-from pimper_torch.method.photometry.quadratics import PackedCholesky, outer, unpacked
-from pimper_torch.method.photometry.variable_projection import solve_variable_projection
+from pimper_torch.linalg.robust import CAUCHY_TUNING, cauchy_weights, robust_deviation
 from pimper_torch.records import Record
+from pimper_torch.records.shapes import ViewVectors
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.low_rank import brightness_guess, low_rank_problem
+from pimper_torch.stages.photometry.quadratics import PackedCholesky, outer, unpacked
+from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
 Samples = Float[Tensor, "view pixel"]
 Lights = Float[Tensor, "view unknown"]

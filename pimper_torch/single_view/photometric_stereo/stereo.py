@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.ground.shapes import Images, Mask, Masks, Matrix3, VectorMap, ViewVectors
 from pimper_torch.records import Record
+from pimper_torch.records.shapes import Images, Mask, Masks, Matrix3, VectorMap, ViewVectors
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization import bas_relief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (

@@ -10,8 +10,8 @@ from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle, random_waves
-from pimper_torch.published.published_config import TriangulateConfig
-from pimper_torch.published.triangulate import Triangulate
+from pimper_torch.paper.paper_config import TriangulateConfig
+from pimper_torch.paper.triangulate import Triangulate
 
 SPHERE = Sphere()
 BUMPS = WavyPlane(

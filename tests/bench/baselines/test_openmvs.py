@@ -6,11 +6,11 @@ from torch.testing import assert_close
 
 from pimper_bench.baselines.missing import MissingProgramError
 from pimper_bench.baselines.openmvs import OpenMvs
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError, ReconstructionError
 

@@ -8,8 +8,8 @@ from scenes import write_ball
 from pimper_bench.bench.bench_inputs import BenchConfig, prepare
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.method.sfm import reconstruct
-from pimper_torch.method.sfm.existing import existing_model
+from pimper_torch.io.cameras.existing import existing_model
+from pimper_torch.stages.sfm import reconstruct
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.doors.io.meshes import read_mesh
-from pimper_torch.doors.result_folder.marker import MARKER
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.export.result_folder.marker import MARKER
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import CoarseMesh, Estimate, Mesh
 from pimper_torch.runtime.errors import ConfigError, PimperWarning, ReconstructionError
 
@@ -81,7 +81,7 @@ def of_radius(radius):
             cameras=scene.cameras,
             reference=scene.views.names[coarse.reference],
         )
-        return MethodRun(estimate=estimate, seconds=6.0, figures=COUNTS)
+        return MethodRun(estimate=estimate, seconds=6.0, counts=COUNTS)
 
     return method
 

@@ -14,8 +14,8 @@ from pimper_bench.cli.convert import ReadOptions, Source, cloud, layouts
 from pimper_bench.datasets import read_colmap, read_idr, read_transforms
 from pimper_bench.truth import Truth
 from pimper_torch.cli.main import main
-from pimper_torch.ground.geometry.rigid import transform
-from pimper_torch.ground.radiometry import LINEAR, Encoding
+from pimper_torch.geometry.rigid import transform
+from pimper_torch.radiometry import LINEAR, Encoding
 from pimper_torch.records import Mesh
 
 READERS = {"colmap": read_colmap, "idr": read_idr, "transforms": read_transforms}

@@ -8,10 +8,10 @@ from PIL import Image
 
 from pimper_bench.datasets import posed
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.doors.io.decode import write_deep_png
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.undistort import undistort
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.undistortion import undistort
+from pimper_torch.io.decode import write_deep_png
 
 
 @pytest.fixture

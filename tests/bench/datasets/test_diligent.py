@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.datasets.diligent import read_diligent_mv
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.projection import project
 from pimper_torch.runtime.errors import InputError
 
 WIDTH, HEIGHT = 20, 16

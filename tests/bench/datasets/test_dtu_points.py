@@ -5,8 +5,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets.dtu_sets import read_dtu_points
-from pimper_torch.doors.io import radiance
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.projection import project
+from pimper_torch.io import radiance
 from pimper_torch.runtime.errors import InputError
 
 

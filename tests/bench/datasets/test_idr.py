@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from pimper_bench.datasets import read_idr
 from pimper_bench.datasets.idr import unit_sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.geometry.rigid import transform
 from pimper_torch.runtime.errors import InputError
 
 # K [R t] of `hand_camera`, K = [[20, 5, 6.5], [0, 30, 4.5], [0, 0, 1]], worked out by hand:

@@ -24,10 +24,10 @@ from pimper_bench.datasets.posed import (
     image_files,
     mask_finder,
 )
-from pimper_torch.doors.camera_files.layout import DataSetPath
-from pimper_torch.ground.geometry.lens_models import distort
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.ground.radiometry import LINEAR
+from pimper_torch.geometry.lens_models import distort
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.cameras.layout import DataSetPath
+from pimper_torch.radiometry import LINEAR
 from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import InputError
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pimper_bench.datasets.sampling import choose_photographs, one_light_per_position
-from pimper_torch.doors.camera_files.layout import DataSetPath
+from pimper_torch.io.cameras.layout import DataSetPath
 from pimper_torch.runtime.errors import InputError
 
 

@@ -8,7 +8,7 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
-from pimper_torch.doors.export.nerfstudio import write_transforms
+from pimper_torch.export.nerfstudio import write_transforms
 from pimper_torch.runtime.errors import InputError
 
 # `hand_camera`: columns are the camera's right, up (its down is the world's z), back, centre.

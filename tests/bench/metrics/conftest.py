@@ -6,7 +6,7 @@ import torch
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.truth import Capture, Truth
-from pimper_torch.ground.geometry.rigid import rigid, transform
+from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.records import Cameras, Mesh, Views
 
 

@@ -6,7 +6,7 @@ import torch
 from pimper_bench.metrics import EvaluateConfig, evaluate, report, rows
 from pimper_bench.metrics.evaluation import chosen_views
 from pimper_bench.truth import Truth
-from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Estimate
 from pimper_torch.runtime.errors import InputError
 

@@ -5,7 +5,7 @@ import torch
 
 from pimper_bench.metrics import EvaluateConfig, evaluate
 from pimper_bench.metrics.frames import Frames
-from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Estimate
 from pimper_torch.runtime.errors import InputError, PimperWarning
 

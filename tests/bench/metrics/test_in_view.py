@@ -7,7 +7,7 @@ from pimper_bench.metrics import (
 )
 from pimper_bench.scenes.procedural_meshes import join
 from pimper_bench.truth import Truth
-from pimper_torch.ground.geometry.visibility import cast_view
+from pimper_torch.geometry.visibility import cast_view
 
 
 def with_maps(make, truth, cameras):

@@ -6,7 +6,7 @@ from pimper_bench.metrics import (
     compare_lights,
     similarity_between_cameras,
 )
-from pimper_torch.ground.geometry.rigid import rigid
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Mesh
 
 IDENTITY = torch.eye(4, dtype=torch.float64)

@@ -8,7 +8,7 @@ from pimper_bench.metrics import (
     similarity_between_points,
 )
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.rigid import rigid, transform
+from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.runtime.errors import InputError
 
 

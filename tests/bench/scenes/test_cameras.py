@@ -2,8 +2,8 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.ground.geometry.pinholes import look_at
-from pimper_torch.ground.geometry.projection import project
+from pimper_torch.geometry.pinholes import look_at
+from pimper_torch.geometry.projection import project
 
 
 def test_look_at_centres_the_target_with_up_upwards():

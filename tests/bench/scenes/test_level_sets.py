@@ -9,8 +9,8 @@ from pimper_bench.scenes.procedural_meshes import (
     smooth_union,
 )
 from pimper_bench.scenes.scene_objects import jar_mesh, mug_mesh
-from pimper_torch.ground.geometry.surfaces import face_normals
-from pimper_torch.ground.geometry.topology import half_edges
+from pimper_torch.geometry.surfaces import face_normals
+from pimper_torch.geometry.topology import half_edges
 
 
 def euler(mesh):

@@ -13,9 +13,9 @@ from pimper_bench.scenes.scene_lights import Lights, wandering_lights
 from pimper_bench.scenes.scene_object import SceneObject
 from pimper_bench.scenes.scene_settings import SensorConfig
 from pimper_bench.scenes.textures import random_speckle
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import project, rays_through
-from pimper_torch.ground.geometry.topology import half_edges
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.topology import half_edges
 
 QUIET = SensorConfig(supersample=1, read_noise=0.0, shot_noise=0.0)
 

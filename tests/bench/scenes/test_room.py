@@ -8,9 +8,9 @@ from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
-from pimper_torch.ground.geometry.projection import project, rays_through
-from pimper_torch.ground.geometry.rigid import transform
+from pimper_torch.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.rigid import transform
 
 
 @pytest.fixture(scope="module")

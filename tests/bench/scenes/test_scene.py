@@ -17,9 +17,9 @@ from pimper_bench.scenes.scene_lights import lights_round
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.textures import marked, painted
 from pimper_bench.scenes.whole_scene import build_scene
-from pimper_torch.doors.io.meshes import write_ply
-from pimper_torch.ground.geometry.pixels import pixel_centers
-from pimper_torch.ground.geometry.projection import project, rays_through
+from pimper_torch.geometry.pixels import pixel_centers
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import ConfigError, InputError
 

@@ -4,7 +4,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.scene_object import reflect
-from pimper_torch.result.relighting.lit_surface import facet_density
+from pimper_torch.stages.relighting.lit_surface import facet_density
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

@@ -6,7 +6,7 @@ from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.textures import random_speckle
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.ground.geometry.projection import project, triangulate_rays
+from pimper_torch.geometry.projection import project, triangulate_rays
 
 
 def exact_cloud(*inputs, **settings):

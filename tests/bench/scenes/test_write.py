@@ -10,9 +10,9 @@ from torch.testing import assert_close
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.scenes.rendered_folder import render_scene, unpack_maps
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.doors.io.photographs import load_views
-from pimper_torch.ground.geometry.projection import project
-from pimper_torch.method.sfm.model_files import read_model
+from pimper_torch.geometry.projection import project
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.photographs import load_views
 from pimper_torch.runtime.errors import ConfigError, OutputError, PimperWarning
 
 SMALL = SceneConfig(num_views=3, width=48, height=36, supersample=1)

@@ -3,8 +3,8 @@ import pytest
 import torch
 from PIL import Image
 
+from pimper_torch.cli.gamma import advice
 from pimper_torch.cli.main import main
-from pimper_torch.single_view.cli.gamma import advice
 from pimper_torch.single_view.factorization import estimate_gamma
 from pimper_torch.single_view.factorization.estimate_gamma import GammaEstimate
 

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.light_field import harmonics
+from pimper_torch.lighting.light_field import harmonics
 from pimper_torch.single_view.factorization.ambiguity import (
     Ambiguity,
     align_factorizations,

@@ -3,7 +3,7 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.radiometry import Srgb
+from pimper_torch.radiometry import Srgb
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.estimate_gamma import (

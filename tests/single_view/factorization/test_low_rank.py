@@ -2,17 +2,17 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.bilinear import equations_of_samples, update_shading
-from pimper_torch.method.photometry.variable_projection import (
-    curvature_of_lights,
-    solve_variable_projection,
-)
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.low_rank import (
     factorize_from_many,
     low_rank_problem,
     random_left,
     singular_left,
+)
+from pimper_torch.stages.photometry.bilinear import equations_of_samples, update_shading
+from pimper_torch.stages.photometry.variable_projection import (
+    curvature_of_lights,
+    solve_variable_projection,
 )
 
 

@@ -3,13 +3,13 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.method.photometry.balm import solve_balm
-from pimper_torch.method.photometry.bilinear import Bilinear
-from pimper_torch.method.photometry.cone import Cone
-from pimper_torch.method.photometry.quadratics import apply_packed
-from pimper_torch.method.photometry.variable_projection import solve_variable_projection
 from pimper_torch.records import StopCause
 from pimper_torch.single_view.factorization.low_rank import FreeManifold
+from pimper_torch.stages.photometry.balm import solve_balm
+from pimper_torch.stages.photometry.bilinear import Bilinear
+from pimper_torch.stages.photometry.cone import Cone
+from pimper_torch.stages.photometry.quadratics import apply_packed
+from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
 MANIFOLDS = pytest.mark.parametrize("manifold", [FreeManifold(), Cone()])
 

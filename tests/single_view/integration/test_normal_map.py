@@ -6,7 +6,7 @@ from slopes import normals_from_slopes
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.integration import raster_system
 from pimper_torch.single_view.integration.normal_map import integrate_normal_map

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from pimper_torch.ground.linalg import hierarchy
-from pimper_torch.ground.linalg.prepared import SingularSystemError
-from pimper_torch.published.integrate import differences, differences_transposed
+from pimper_torch.linalg import hierarchy
+from pimper_torch.linalg.prepared import SingularSystemError
+from pimper_torch.paper.integrate import differences, differences_transposed
 from pimper_torch.single_view.integration.raster_system import RasterSystem
 
 

@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.render_in_memory import Sphere
-from pimper_torch.ground.geometry.pixels import homogeneous, pixel_centers
+from pimper_torch.geometry.pixels import homogeneous, pixel_centers
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.photometric_stereo.perspective import (
     factorize_in_perspective,

@@ -1,1 +1,0 @@
-"""Input and output: photographs, cameras, meshes, result folders, metric scale."""

@@ -1,0 +1,217 @@
+"""Writing of result folders."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from pimper_torch.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.export import reports
+from pimper_torch.export.result_folder.folders import written_whole
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
+from pimper_torch.io.assets.mesh_files import MeshFiles as MeshFiles
+from pimper_torch.io.assets.placement import Placement, standing
+from pimper_torch.io.assets.usd import write_usdz
+from pimper_torch.io.assets.write import write_asset, write_asset_obj
+from pimper_torch.io.estimates import mask_path, read_lights
+from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
+from pimper_torch.io.thumbnails import thumbnails
+from pimper_torch.radiometry import to_bytes
+from pimper_torch.radiometry.base_color import albedo_scale
+from pimper_torch.records import Reconstruction, TexturedMesh
+from pimper_torch.runtime.config import read_mapping, to_yaml
+from pimper_torch.runtime.mapped import each
+from pimper_torch.runtime.progress import part
+from pimper_torch.runtime.reporting import reported
+from pimper_torch.scale.given import MILLIMETRES
+from pimper_torch.stages.sfm.sparse_scene import write_model
+from pimper_torch.viz.maps import normal_colors, view_maps
+from pimper_torch.viz.overview import draw_overview
+from pimper_torch.viz.report.page import asset_within, write_page
+from pimper_torch.viz.report.predictions import predictions
+from pimper_torch.viz.tiles import array
+from pimper_torch.viz.turn import draw_turn, up_world
+
+RESULT_NAMES = (
+    "mesh.ply",
+    "mesh.glb",
+    "mesh.stl",
+    "mesh.obj",
+    "asset.glb",
+    "asset.usdz",
+    "asset.obj",
+    "asset.mtl",
+    "asset_albedo.png",
+    "asset_normal.png",
+    "sparse",
+    "masks",
+    "normals.png",
+    "albedo.png",
+    "depth.npz",
+    "lights.json",
+    "config.yaml",
+    "summary.json",
+    "overview.png",
+    "turn.webp",
+    "report.html",
+)
+"""All files of a result; a table in the manual describes them."""
+_PARTS = 6  # of the progress bar: meshes, asset, maps, overview, turntable, page
+
+
+def write_result(
+    result: Reconstruction,
+    config: object,
+    folder: Path | str,
+    *,
+    overwrite: bool = False,
+    about: Mapping[str, object] | None = None,
+    files: MeshFiles | None = None,
+    report: bool = True,
+) -> None:
+    """Write a result to a folder: the files of :data:`RESULT_NAMES`.
+
+    All files are in the frame of the given cameras; ``summary.json`` has the ``offset_world`` that
+    was added to the frame of the run, zero unless the cameras are far from their origin. If it is
+    not zero, the PLY has doubles, and the mesh's GLB has the offset as translation of its node.
+    Only the asset is upright on the origin; its ``extras`` have the inverse transform.
+
+    The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's
+    spacing of it, its normal within 1.5 degrees, and its colour, confidence and expected error
+    within :func:`~pimper_torch.stages.meshing.finish.written_channels` of the interpolated values
+    (``summary.json`` has the errors). ``files`` selects all vertices, or fewer. The images show the
+    written mesh, except the caps of a watertight mesh, which are not measured. Faces of the PLY and
+    the OBJ, and vertices of the GLB, are marked as measured or not.
+
+    The folder is replaced completely or not at all; see
+    :func:`pimper_torch.export.result_folder.folders.written_whole`.
+
+    Args:
+        config: Dataclass of the settings of the run.
+        folder: New or empty; its parents are created.
+        files: Number of faces and formats of the mesh, for a result without ``finished``; see
+            :meth:`~pimper_torch.chains.chain.Chain.finish`.
+
+    Raises:
+        OutputError: The folder contains other files, or cannot be written.
+    """
+    folder, began = Path(folder), time.perf_counter()
+    files = files or MeshFiles()
+    if result.finished is None:
+        result = CoarseToFine().finish(result, files)
+    with written_whole(folder, "result", overwrite=overwrite) as staging:
+        ready, asset, relighting = result.finished, result.asset, result.relighting
+        assert ready is not None
+        assert asset is not None
+        assert relighting is not None
+        written = result.replace(mesh=ready.mesh)
+        with part(0, _PARTS):
+            mesh, measured = ready.mesh, None
+            if ready.closed is not None:
+                mesh, measured = ready.closed.mesh, ready.closed.measured
+            offset = written.scene.offset_world
+            write_ply(mesh, staging / "mesh.ply", offset, measured)
+            write_glb(mesh, staging / "mesh.glb", offset, measured)
+            if "stl" in files.formats:
+                write_stl(mesh, staging / "mesh.stl", offset)
+            if "obj" in files.formats:
+                write_obj(mesh, staging / "mesh.obj", offset, measured)
+        with part(1, _PARTS):
+            placement = _placement(written, asset, files, folder.absolute().name, about or {})
+            write_asset(asset, staging / "asset.glb", placement, files.texture)
+            if "usdz" in files.formats:
+                write_usdz(asset, staging / "asset.usdz", placement)
+            if "obj" in files.formats:
+                write_asset_obj(asset, staging / "asset.obj", placement)
+        _write_all(written, config, staging)
+        writing = reported("write", time.perf_counter() - began)
+        timed = result.replace(report=(*result.report, writing))
+        summary = {
+            **reports.summary_report(timed, about or {}),
+            **({ready.how: ready.counts} if ready.how else {}),
+            **({"caps": ready.caps} if ready.caps else {}),
+            "asset": asset.summary,
+            "relighting": reports.relighting_report(relighting),
+            "thumbnails": thumbnails(written.scene.views),
+        }
+        reports.write_json(summary, staging / "summary.json")
+        with part(5, _PARTS):
+            if report:
+                write_page(
+                    staging / "report.html",
+                    title=folder.absolute().name,
+                    mesh=ready.mesh,
+                    asset=asset_within(asset, staging / "asset.glb", placement),
+                    surface=asset.mesh,
+                    scene=written.scene,
+                    silhouettes=written.silhouettes,
+                    reference=written.coarse.reference,
+                    predictions=predictions(ready.few, written.scene, relighting),
+                    summary=summary,
+                    settings=read_mapping(staging / "config.yaml"),
+                    lights_world=read_lights(staging / "lights.json", written.scene.views.names),
+                )
+
+
+def _placement(
+    result: Reconstruction,
+    asset: TexturedMesh,
+    files: MeshFiles,
+    name: str,
+    about: Mapping[str, Any],
+) -> Placement:
+    """Return the placement of an asset in its files, in metres if ``about`` has the unit."""
+    cameras, unit = result.cameras, (about.get("scale") or {}).get("unit")
+    metre = None if unit is None else MILLIMETRES["m"] / MILLIMETRES[unit]
+    up, reference = up_world(cameras), result.coarse.reference
+    return Placement(
+        name=name,
+        scene_from_asset=standing(asset.mesh, cameras, reference, up, metre),
+        offset_world=result.scene.offset_world,
+        metric=unit is not None,
+        cameras=(result.scene.views.names, cameras) if files.cameras else None,
+    )
+
+
+def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
+    write_model(result.scene, folder / "sparse")
+    if result.silhouettes.source != "everything":
+        (folder / "masks").mkdir()
+        masks, sizes = each(result.silhouettes.shown), result.cameras.sizes_px.tolist()
+        names = result.scene.views.names
+        for name, (mask,), (width, height) in zip(names, masks, sizes, strict=True):
+            levels = mask[:height, :width].to(torch.uint8) * 255
+            path = mask_path(folder / "masks", name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(levels.numpy()).save(path)
+    with part(2, _PARTS):
+        _write_maps(result, folder)
+    reports.write_json(reports.lights_report(result), folder / "lights.json", indent=None)
+    (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
+    with part(3, _PARTS):
+        draw_overview(result, folder / "overview.png")
+    with part(4, _PARTS):
+        draw_turn(result.mesh, result.cameras, result.coarse.reference, folder / "turn.webp")
+
+
+def _write_maps(result: Reconstruction, folder: Path) -> None:
+    reference, cameras = result.coarse.reference, result.cameras
+    maps = view_maps(result.mesh, cameras, reference)
+    normals = (255 * normal_colors(maps.normals_cam)).round().to(torch.uint8)
+    albedo = to_bytes((maps.albedo * albedo_scale(result.mesh)).nan_to_num(0).clamp(0, 1))
+    for name, picture in (("normals", normals), ("albedo", albedo)):
+        Image.fromarray(picture.detach().squeeze(-1).numpy()).save(folder / f"{name}.png")
+    pose, offset = cameras.cam_from_world[reference], result.scene.offset_world
+    far = offset != NO_OFFSET
+    np.savez_compressed(
+        folder / "depth.npz",
+        **maps.arrays(),
+        intrinsics=array(cameras.intrinsics[reference]),
+        cam_from_world=from_local(pose[None], offset)[0].detach().numpy() if far else array(pose),
+        name=np.array(result.scene.views.names[reference]),
+        allow_pickle=False,
+    )

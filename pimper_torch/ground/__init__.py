@@ -1,1 +1,0 @@
-"""Geometry, linear algebra, radiometry and compiled kernels, independent of the method."""

@@ -1,0 +1,1 @@
+"""Files of textured meshes: glTF, USD, and their placement in the world."""

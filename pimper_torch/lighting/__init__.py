@@ -1,0 +1,1 @@
+"""Models of the light on a surface, and their fit to samples of photographs."""

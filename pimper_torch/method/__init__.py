@@ -1,1 +1,0 @@
-"""The method, step by step, and the chains of its stages."""

@@ -1,0 +1,1 @@
+"""Settings and chains by the name of a preset."""

@@ -1,1 +1,0 @@
-"""Products of a surface: lights and materials, textures, images and pages."""

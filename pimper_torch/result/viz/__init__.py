@@ -1,5 +1,0 @@
-"""Figures of a result."""
-
-from pimper_torch.result.viz.patch_figures import by_facet as by_facet
-from pimper_torch.result.viz.patch_figures import plot_in_view as plot_in_view
-from pimper_torch.result.viz.patch_figures import plot_patch as plot_patch

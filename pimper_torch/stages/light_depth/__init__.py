@@ -1,0 +1,1 @@
+"""Depths by a sweep under the fitted light, where photographs contradict the coarse surface."""

@@ -1,0 +1,443 @@
+"""Given masks, checked against cameras and points.
+
+If masks are correct, rays through the pixels of each mask meet a point that no mask excludes,
+points in one mask are in all of them, and views that observe any other point agree that it is
+outside. Files may show the object dark, be turned or mirrored, or belong to other photographs. Such
+a reading is chosen if it contradicts itself clearly less than the files as they are.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from operator import itemgetter
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from pimper_torch.geometry.mask_polarity import around_and_inside
+from pimper_torch.geometry.opencv import shrunk, signed_distance
+from pimper_torch.geometry.pixels import grid_from_pixels, scale_intrinsics
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.supporting_plane import well_tracked
+from pimper_torch.geometry.visual_hull import bounding_box
+from pimper_torch.records import Cameras, SilhouettePrior, Silhouettes, SparseScene, Views
+from pimper_torch.records.shapes import Maps, Mask, PerView, ViewMask
+from pimper_torch.runtime.errors import InputError, caution
+from pimper_torch.runtime.mapped import by_view, zeros
+from pimper_torch.runtime.parallel import side_by_side
+from pimper_torch.stages.silhouettes.cues import points_at, soft_masks_of
+
+# Longer side of the compared masks, number of points, and samples on each ray through their pixels:
+# choices.
+_SMALL_PX, _POINTS, _PLACES = 320, 4000, 64
+_FEWEST = 50  # pairs of points and views needed as evidence
+# Most contradiction of an alternative reading, relative to that of the files and absolute; and the
+# contradiction below which the files are accepted: docs/decisions.md, "Masks that are turned,
+# inverted or of other photographs".
+_CLEARLY, _MOST, _LEAST = 1 / 3, 0.05, 0.0025
+_REFUSED = 0.5  # of the points in the masks of the median view; a choice
+# Most exchangeable masks, readings whose pixels are compared, and views for that: choices.
+_SUSPECTS, _TRIED, _VIEWS = 4, 4, 40
+
+Raster = Shaped[Tensor, "_ _"]
+Places = Bool[Tensor, "view other pixel place"]
+_TURNS = {
+    2: "mirrored",
+    3: "turned by a half turn",
+    4: "mirrored upside down",
+    5: "mirrored and turned by a quarter turn",
+    6: "turned by a quarter turn anticlockwise",
+    7: "mirrored and turned by a quarter turn",
+    8: "turned by a quarter turn clockwise",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """Interpretation of mask files.
+
+    Attributes:
+        description: Property of the masks; completes the sentence "they are ...".
+        inverted: Whether they show the object dark.
+        turns: EXIF orientation that each photograph's mask lacks; none by default.
+        owners: Photograph whose file contains the mask of each photograph; itself by default.
+    """
+
+    description: str = ""
+    inverted: bool = False
+    turns: Mapping[str, int] = field(default_factory=dict)
+    owners: Mapping[str, str] = field(default_factory=dict)
+
+    def masks(
+        self, maps: Mapping[str, Raster], names: Iterable[str], inverse: Callable[[Raster], Raster]
+    ) -> dict[str, Raster]:
+        """Return the masks of photographs from unpadded maps, by file name."""
+        masks = {}
+        for name in names:
+            if (owner := self.owners.get(name, name)) in maps:
+                mask = _turned(maps[owner], self.turns.get(name, 1))
+                masks[name] = inverse(mask) if self.inverted else mask
+        return masks
+
+    def of(self, views: Views) -> Views:
+        """Return the photographs with masks and soft masks in this reading."""
+
+        def read(
+            names: Sequence[str],
+            sizes_px: Tensor,
+            maps: Tensor,
+            inverse: Callable[[Tensor], Tensor],
+        ) -> tuple[tuple[str, ...], Tensor, Tensor]:
+            files = {
+                name: padded[:high, :wide]
+                for name, padded, (wide, high) in zip(names, maps, sizes_px.tolist(), strict=True)
+            }
+            read_maps = self.masks(files, dict.fromkeys([*names, *views.names]), inverse)
+            shapes = [maps.shape[1:], *(x.shape for x in read_maps.values())]
+            size = [max(sides) for sides in zip(*shapes, strict=True)]
+            stack = zeros((len(read_maps), *size), maps.dtype, maps.device)
+            for into, x in zip(stack, read_maps.values(), strict=True):
+                into[: x.shape[0], : x.shape[1]] = x
+            return tuple(read_maps), stack, sizes_px.new_tensor([x[::-1] for x in shapes[1:]])
+
+        masks, priors = views.masks, list(views.priors)
+        if masks is not None:
+            _, masks, _ = read(views.names, views.sizes_px, masks, torch.logical_not)
+        for index, prior in enumerate(priors):
+            if not isinstance(prior, SilhouettePrior):
+                continue
+            sized = zip(prior.inside, prior.sizes_px.tolist(), strict=True)
+            if not all(points_at(padded[:high, :wide]) for padded, (wide, high) in sized):
+                result = read(prior.names, prior.sizes_px, prior.inside, lambda x: 1 - x)
+                names, inside, sizes = result
+                priors[index] = prior.replace(names=names, inside=inside, sizes_px=sizes)
+        return views.replace(masks=masks, priors=tuple(priors))
+
+
+AS_THEY_ARE = Reading()
+
+
+def _turned(mask: Raster, turn: int) -> Raster:
+    """Return a map turned upright from an EXIF orientation."""
+    mask = mask.mT if turn >= 5 else mask
+    flipped = ((0, (3, 4, 7, 8)), (1, (2, 3, 6, 7)))
+    return mask.flip([axis for axis, turns in flipped if turn in turns])
+
+
+def right_reading(scene: SparseScene, given: Views) -> Reading:
+    """Choose the reading of the masks, or else of the soft masks, of a scene.
+
+    A warning is given if files show something other than their photographs, and if no point of the
+    cloud is in the silhouettes.
+
+    Args:
+        given: The photographs as loaded, including unregistered ones.
+
+    Raises:
+        InputError: Masks contradict the points in every reading.
+    """
+    evidence = _Evidence.of(scene)
+    if evidence is None:
+        return AS_THEY_ARE
+    names = list(evidence.borders)
+    compared = names[:: math.ceil(len(names) / _VIEWS)]
+    pairs, (denied, involved) = evidence.of_points(), evidence.of_pixels(AS_THEY_ARE, compared)
+    share = evidence.share(pairs, AS_THEY_ARE)
+    contradiction = (share + denied) / 2
+    if contradiction < _LEAST:
+        return AS_THEY_ARE
+    by_view = pairs[:, 0] / pairs.sum(dim=1).clamp_min(1)
+    suspects = (by_view + involved).argsort(descending=True)[:_SUSPECTS].tolist()
+    suspect_names = [names[view] for view in suspects]
+    compared = list(dict.fromkeys([*compared, *suspect_names]))
+    most = min(_CLEARLY * contradiction, _MOST)
+    readings = evidence.readings(given, suspect_names, ordered=scene.views.poses is None)
+    rated = [(evidence.share(evidence.of_points(r, compared), r) / 2, r) for r in readings]
+    likely = sorted((pair for pair in rated if pair[0] <= most), key=itemgetter(0))[:_TRIED]
+    totals = [(half + evidence.of_pixels(r, compared)[0] / 2, r) for half, r in likely]
+    best, reading = min(totals, key=itemgetter(0), default=(math.inf, AS_THEY_ARE))
+    if best <= most:
+        caution(
+            f"The masks contradict cameras and points by {contradiction:.1%}, but by {best:.1%} if "
+            f"they are {reading.description}, so they are read like that. Correct the files.",
+            stacklevel=3,
+        )
+        return reading
+    refused = float(by_view.median())
+    if refused > _REFUSED and denied > _IN_CONFLICT:
+        raise InputError(
+            f"The masks contradict {refused:.0%} of the points in the median view, and each other; "
+            f"at most: {_REFUSED:.0%}. Inverting, turning, mirroring or reordering them does not "
+            "help. Check whether they show the same object in all photographs, and whether the "
+            "cameras belong to these photographs; or omit the masks."
+        )
+    if share == 1:
+        caution(
+            "No point of the cloud is in the silhouettes of the masks. This is correct if the "
+            "object has no texture; otherwise check that the masks show it.",
+            stacklevel=3,
+        )
+    return AS_THEY_ARE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Evidence:
+    """Evidence about masks from cameras and points.
+
+    Attributes:
+        borders: Signed distances to the small masks of the files, by photograph name.
+        pixels: Of the points in the small masks.
+        in_frame: Whether a point projects into the frame of a view.
+        observed: Whether the view observes it.
+    """
+
+    borders: Mapping[str, Raster]
+    cameras: Cameras
+    pixels: Int[Tensor, "view point 2"]
+    in_frame: Bool[Tensor, "view point"]
+    observed: Bool[Tensor, "view point"]
+
+    @classmethod
+    def of(cls, scene: SparseScene) -> "_Evidence | None":
+        """Gather the evidence; ``None`` if fewer than three masks contain a pixel."""
+        views, cameras = scene.views, scene.cameras.to("cpu", torch.float32)
+        factor = min(1.0, _SMALL_PX / max(views.images.shape[-2:]))
+        sizes = (factor * cameras.sizes_px).round().long().clamp_min(1)
+        borders = {}
+        if views.masks is not None:
+            sized = zip(views.masks, views.sizes_px.tolist(), sizes.tolist(), strict=True)
+            for name, (mask, (width, height), size) in zip(views.names, sized, strict=True):
+                # Keep masks of a single pixel.
+                small = shrunk(mask[None, :height, :width].cpu().float(), *size)[0] > 0
+                if bool(small.any()):
+                    borders[name] = signed_distance(small)
+        elif soft := soft_masks_of(views, sizes):
+            for view in (soft.given & soft.masks.flatten(1).any(dim=1)).nonzero()[:, 0].tolist():
+                wide, high = sizes[view].tolist()
+                borders[views.names[view]] = signed_distance(soft.masks[view, :high, :wide])
+        if len(borders) < 3:
+            return None
+        chosen, tracked = list(map(views.names.index, borders)), well_tracked(scene).cpu()
+        sampled = tracked.nonzero()[:, 0][:: math.ceil((int(tracked.sum()) + 1) / _POINTS)]
+        intrinsics = scale_intrinsics(cameras.intrinsics, factor, factor)
+        cameras = cameras.replace(intrinsics=intrinsics, sizes_px=sizes).take(chosen)
+        points = scene.points_world.detach().cpu().float()[sampled]
+        pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
+        in_frame = ((pixels > 0) & (pixels < cameras.sizes_px[:, None])).all(dim=-1) & (depth > 0)
+        return cls(
+            borders=borders,
+            cameras=cameras,
+            pixels=torch.where(in_frame[..., None], pixels, 0).long(),
+            in_frame=in_frame,
+            observed=scene.observed.cpu()[sampled].mT[chosen] & in_frame,
+        )
+
+    def readings(self, views: Views, swapped: Sequence[str], *, ordered: bool) -> Iterator[Reading]:
+        """List possible readings of the files other than the photographs' own masks.
+
+        Args:
+            swapped: Photographs, two of which may have each other's masks.
+            ordered: Whether photographs may have masks of other ones.
+        """
+        names = views.names
+        around, inside = around_and_inside(list(self.borders.values()))
+        # An object that fills its photographs covers their middle.
+        if inside < 0.75 < around:
+            yield Reading(description="inverted", inverted=True)
+        same_size = ordered and bool((views.sizes_px == views.sizes_px[0]).all())
+        for first, second in combinations(swapped, 2) if same_size else ():
+            description = f"exchanged between {first} and {second}"
+            yield Reading(description=description, owners={first: second, second: first})
+        square = bool((views.sizes_px[:, 0] == views.sizes_px[:, 1]).all())
+        for turn, description in _TURNS.items():
+            if turn < 5 or square:
+                yield Reading(description=description, turns=dict.fromkeys(names, turn))
+        if views.orientations is not None:
+            exif = zip(names, views.orientations.tolist(), strict=True)
+            turns = {name: turn for name, turn in exif if turn < 5 or square}
+            yield Reading(description="in the stored orientation, not turned by EXIF", turns=turns)
+        for step in range(1, len(names)) if same_size else ():
+            owners = dict(zip(names, (*names[step:], *names[:step]), strict=True))
+            description = f"shifted by {step} in the list ({names[0]} has that of {names[step]})"
+            yield Reading(description=description, owners=owners)
+
+    def read(self, reading: Reading, names: Iterable[str]) -> tuple[list[int], Maps]:
+        """Return the named views that have a mask in the reading, and signed distances to it."""
+        masks = reading.masks(self.borders, names, torch.neg)
+        high, wide = self.cameras.sizes_px.amax(dim=0).flip(0).tolist()
+        maps = torch.full((len(masks), high, wide), -1e3)
+        for into, x in zip(maps, masks.values(), strict=True):
+            into[: x.shape[0], : x.shape[1]] = x
+        all_names = list(self.borders)
+        return [all_names.index(name) for name in masks], maps
+
+    def of_points(
+        self, reading: Reading = AS_THEY_ARE, names: Sequence[str] = ()
+    ) -> Int[Tensor, "view 2"]:
+        """Count, in each view, points that contradict a reading and points that confirm it.
+
+        A point inside most masks of the views that observe it must be inside in all views, any
+        other one outside in all that observe it. The margin allows for masks drawn by hand.
+
+        Args:
+            names: Of the compared views; all by default.
+        """
+        views, maps = self.read(reading, names or self.borders)
+        column, row = self.pixels[views].unbind(dim=-1)
+        value = maps[torch.arange(len(views))[:, None], row, column]
+        seen, framed = self.observed[views], self.in_frame[views]
+        margin = 0.01 * max(maps.shape[1:])
+        inside = 2 * (seen & (value > 0)).sum(dim=0) > seen.sum(dim=0)
+        contradicts = (framed & inside & (value < -margin)) | (seen & ~inside & (value > margin))
+        confirms = framed & inside & (value >= -margin)
+        return torch.stack([contradicts.sum(dim=1), confirms.sum(dim=1)], dim=1)
+
+    def share(self, pairs: Int[Tensor, "view 2"], reading: Reading) -> float:
+        """Return the fraction of contradicting pairs; 1 if hardly any point is in the masks.
+
+        Inverted masks need not contain points, as an object without texture has none. A cloud with
+        hardly any observed point contradicts nothing.
+        """
+        contradicting, total = int(pairs[:, 0].sum()), int(pairs.sum())
+        if int(self.observed.sum()) < _FEWEST:
+            return 0.0
+        if total < _FEWEST:
+            return _MOST if reading.inverted else 1.0
+        return contradicting / total
+
+    def of_pixels(self, reading: Reading, names: Sequence[str]) -> tuple[float, PerView]:
+        """Return the fraction of the masks' pixels in conflict, and each view's involvement.
+
+        Args:
+            names: Of the compared views.
+        """
+        views, maps = self.read(reading, names)
+        involved = torch.zeros(len(self.borders))
+        samples = _denied(maps, self.cameras.take(views), 40)
+        if samples is None:
+            return 1.0, involved
+        conflict, with_others = _in_conflict(*samples, torch.ones(len(views), dtype=torch.bool))
+        involved[views] = conflict + with_others.sum(dim=0)
+        return float(conflict.mean()), involved
+
+
+# Fraction of a silhouette's pixels in conflict, or of the median other's in conflict with it: 0.00
+# for true masks (potatoes and mug along an arc, jar and spot on a turntable, balls by hand, 8 to 12
+# views of 240x180 and 320x240). If those of one or two views are wrong, theirs is 0.30 and more for
+# masks of the full image, 0.56 for inverted ones, 0.86 for a single pixel; masks drawn alternately
+# 5 px too wide and 4 px too narrow have up to 0.22.
+_IN_CONFLICT = 0.25
+
+
+def _in_conflict(
+    denied: Places, seen: Places, chosen: ViewMask
+) -> tuple[PerView, Float[Tensor, "view other"]]:
+    """Compute the fraction of each view's pixels in conflict, and in conflict with each view.
+
+    Args:
+        denied: Samples on the rays of each view's pixels that each view denies; never itself.
+        seen: Samples that each view sees.
+        chosen: Views that take part; the others have no conflicts.
+    """
+    most = chosen.sum() - 1
+
+    def of_view(denied: Tensor, seen: Tensor) -> Tensor:
+        denied, seen = (x & chosen[:, None, None] for x in (denied, seen))
+        count = torch.where(seen.sum(dim=0) >= 0.5 * most, denied.sum(dim=0), len(chosen))
+        fewest = count.amin(dim=-1)
+        valid = fewest < len(chosen)
+        best = (count == fewest[:, None]) & valid[:, None]
+        share = (denied & best).sum(dim=-1) / best.sum(dim=-1).clamp_min(1)
+        total = valid.sum().clamp_min(1)
+        conflict = (valid & (fewest > 0)).sum() / total
+        return torch.cat([conflict[None], share.sum(dim=-1) / total])
+
+    fractions = by_view(of_view, denied, seen) * chosen[:, None]
+    return fractions[:, 0], fractions[:, 1:]
+
+
+def contradictory(scene: SparseScene) -> ViewMask:
+    """Return the views whose masks clearly contradict the others.
+
+    Returns:
+        All views with a mask if fewer than three, or at most half, would agree.
+    """
+    rejected = torch.zeros(scene.views.num_views, dtype=torch.bool)
+    evidence = _Evidence.of(scene)
+    if evidence is None:
+        return rejected
+    _, maps = evidence.read(AS_THEY_ARE, evidence.borders)
+    samples = _denied(maps, evidence.cameras, 100)
+    if samples is None:
+        return rejected
+    views = torch.tensor(list(map(scene.views.names.index, evidence.borders)))
+    kept = torch.ones(len(views), dtype=torch.bool)
+    while kept.sum() >= max(3, len(views) // 2 + 1):
+        conflict, with_others = _in_conflict(*samples, kept)
+        excluded = torch.eye(len(kept), dtype=torch.bool) | ~kept[:, None]
+        typical = with_others.masked_fill(excluded, torch.nan).nanmedian(dim=0).values
+        clear = (torch.maximum(conflict, typical) > _IN_CONFLICT) & kept
+        if not bool(clear.any()):
+            rejected[views[~kept]] = True
+            return rejected
+        involved = (conflict + with_others.sum(dim=0)).masked_fill(~clear, -1)
+        kept[involved.argmax()] = False
+    rejected[views] = True
+    return rejected
+
+
+def _denied(borders: Maps, cameras: Cameras, count: int) -> tuple[Places, Places] | None:
+    """Return which views deny, and which see, samples on rays through pixels of each mask.
+
+    Args:
+        borders: Signed distances to the masks.
+        count: Pixels per mask.
+
+    Returns:
+        ``None`` if a mask is empty.
+    """
+    masks, views = borders > 0, range(len(borders))
+    given = Silhouettes(inside=masks.float(), reliable=masks.flatten(1).any(dim=1), source="masks")
+    box = bounding_box(given, cameras)
+    if box is None or not bool(given.reliable.all()):
+        return None
+
+    def samples_of(view: int) -> tuple[Tensor, Tensor]:
+        positions, step = _places(masks[view], cameras.take([view]), box, count)
+        pixels, depth = project(positions, cameras.cam_from_world, cameras.intrinsics)
+        pixels = pixels.reshape(len(masks), -1, _PLACES, 2)
+        depth = depth.reshape(len(masks), -1, _PLACES)
+        size = cameras.sizes_px[:, None, None]
+        seen = ((pixels > 0) & (pixels < size)).all(dim=-1) & (depth > 0)
+        seen[view] = False
+        height, width = borders.shape[1:]
+        value = grid_sample(
+            borders[:, None], grid_from_pixels(pixels, width, height), align_corners=False
+        )[:, 0]
+        reach = step[:, None] * cameras.intrinsics[:, 0, 0, None, None] / depth
+        # The tolerance allows for masks drawn by hand.
+        return seen & (value < -reach - 0.01 * max(height, width)), seen
+
+    denied, seen = (zeros((len(views), len(views), count, _PLACES), torch.bool) for _ in range(2))
+    for view, samples in enumerate(side_by_side(samples_of, views, tracked=False)):
+        denied[view], seen[view] = samples
+    return denied, seen
+
+
+def _places(
+    mask: Mask, camera: Cameras, box_world: Float[Tensor, "2 3"], count: int
+) -> tuple[Float[Tensor, "place 3"], Float[Tensor, " pixel"]]:
+    """Return samples in the box on rays through a mask's pixels, and half their spacing."""
+    index = mask.nonzero()
+    index = index[torch.linspace(0, len(index) - 1, count).round().long()]
+    rays = rays_through(index.flip(1).float() + 0.5, camera.cam_from_world[0], camera.intrinsics[0])
+    eye = camera.centers_world[0]
+    ends = (box_world[:, None] - eye) / torch.where(rays.abs() > 1e-9, rays, 1e-9)
+    near = ends.amin(dim=0).amax(dim=-1).clamp_min(0)
+    far = torch.maximum(ends.amax(dim=0).amin(dim=-1), near)
+    along = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, _PLACES)
+    half = (far - near) * rays.norm(dim=-1) / (2 * (_PLACES - 1))
+    return (eye + along[..., None] * rays[:, None]).flatten(0, 1), half
