@@ -70,22 +70,26 @@ def everything(like: int) -> Callable[..., Tensor]:
 
 # The replacement of each guard that can be switched off, and the settings that switch it off.
 PATCHES: dict[str, dict[str, object]] = {
-    "sfm.static_background": {"sfm.static_background.StaticBackground.detected": False},
-    "sfm.moved_object": {"sfm.registration.link_sessions": lambda *_: ()},
-    "sfm.weak_views": {"sfm.registration.drop_weak_views": lambda model, _: model},
-    "sfm.misplaced": {"sfm.diagnose._MIN_AGREEMENT": 0.0},
+    "sfm.static_background": {"stages.sfm.static_background.StaticBackground.detected": False},
+    "sfm.moved_object": {"stages.sfm.registration.link_sessions": lambda *_: ()},
+    "sfm.weak_views": {"stages.sfm.registration.drop_weak_views": lambda model, _: model},
+    "sfm.misplaced": {"stages.sfm.diagnose._MIN_AGREEMENT": 0.0},
     "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
-    "silhouettes.empty": {"silhouettes.find._without_empty": lambda silhouettes, _: silhouettes},
-    "silhouettes.shadows": {"silhouettes.cuts._without_shadow": lambda mask, *_: mask},
-    "coarse.seen_through": {"coarse.trim._MIN_BEHIND": 10**9},
-    "remesh.data": {"coarse.remesh._with_data": everything(1)},
-    "fuse.outvoted": {"fusion.blend._agreement": lambda found, *_: torch.ones_like(found.height)},
-    "repair": {"meshing.repair.Repair.forward": lambda _, surface: surface},
-    "extract.spikes": {
-        "meshing.faults.Faults.folded_over": lambda found, *_: nothing(0)(found.faces),
-        "meshing.faults.Faults.stretched": lambda found, *_: nothing(0)(found.faces),
+    "silhouettes.empty": {
+        "stages.silhouettes.find._without_empty": lambda silhouettes, _: silhouettes
     },
-    "extract.borders": {"meshing.extract.protruding": nothing(1)},
+    "silhouettes.shadows": {"stages.silhouettes.cuts._without_shadow": lambda mask, *_: mask},
+    "coarse.seen_through": {"stages.coarse.trim._MIN_BEHIND": 10**9},
+    "remesh.data": {"stages.coarse.remesh._with_data": everything(1)},
+    "fuse.outvoted": {
+        "stages.fusion.blend._agreement": lambda found, *_: torch.ones_like(found.height)
+    },
+    "repair": {"stages.meshing.repair.Repair.forward": lambda _, surface: surface},
+    "extract.spikes": {
+        "stages.meshing.faults.Faults.folded_over": lambda found, *_: nothing(0)(found.faces),
+        "stages.meshing.faults.Faults.stretched": lambda found, *_: nothing(0)(found.faces),
+    },
+    "extract.borders": {"stages.meshing.extract.protruding": nothing(1)},
 }
 CHANGES: dict[str, dict[str, object]] = {
     "photometry.shadows": {"light": {"shadows": False}},
@@ -189,7 +193,7 @@ def run(place: Path, spoilt: list[str], preset: str, without: str) -> dict[str, 
     began = time.perf_counter()
     with ExitStack() as stack:
         for target, replacement in PATCHES.get(without, {}).items():
-            stack.enter_context(patch(f"pimper_torch.method.{target}", replacement))
+            stack.enter_context(patch(f"pimper_torch.{target}", replacement))
         stack.enter_context(listening(heard))
         try:
             result = chain(load_views(place / "photos"))

@@ -12,7 +12,7 @@ import pytest
 import pimper_torch
 
 # Subpackages whose public functions users call; of the optional ones, their exports.
-SUBPACKAGES = ("method.chains", "runtime.config", "doors.io", "records", "result.viz")
+SUBPACKAGES = ("chains", "presets", "runtime.config", "io", "export", "records", "viz")
 EXPORTING = ("baselines", "datasets", "metrics", "scenes")
 
 
@@ -22,7 +22,7 @@ def functions() -> Iterator[typing.Any]:
     for name in EXPORTING:
         subpackage = importlib.import_module(f"pimper_bench.{name}")
         yield from (getattr(subpackage, exported) for exported in subpackage.__all__)
-    inner = (f"pimper_torch.{name}" for name in ("runtime.store.store", *modules()))
+    inner = (f"pimper_torch.{name}" for name in ("store.store", *modules()))
     for name in (*inner, "pimper_bench.bench.run_bench"):
         module = importlib.import_module(name)
         for found in vars(module).values():

@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
@@ -154,15 +154,15 @@ def cache_folder() -> Path:
     import numba
     from numba.core.registry import cpu_target
 
-    sources = Path(pimper_torch.kernels.__path__[0])
+    beside = Path(pimper_torch.kernels.__path__[0], "__pycache__")
     processor = cpu_target.target_context.codegen().magic_tuple()
     compiler = (sys.implementation.cache_tag, numba.__version__, version("llvmlite"), processor)
     code = hashlib.sha256(repr(compiler).encode())
-    for source in sorted(sources.glob("*.py")):
+    for source in sources():
         code.update(source.read_bytes())
     name = f"kernels-{code.hexdigest()[:32]}"
     cache = Path(numba.config.CACHE_DIR or user_cache())
-    for folder in (cache / name, sources / "__pycache__" / name):
+    for folder in (cache / name, beside / name):
         with suppress(OSError):
             folder.mkdir(0o700, parents=True, exist_ok=True)
             if _is_private(folder):
@@ -172,6 +172,19 @@ def cache_folder() -> Path:
     folder.mkdir(0o700)
     atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
     return folder
+
+
+def sources() -> list[Path]:
+    """Return the files of all folders of kernels: this one, and those of stages."""
+    return sorted(Path(pimper_torch.kernels.__path__[0]).parent.rglob("kernels/*.py"))
+
+
+@cache
+def modules() -> Mapping[str, str]:
+    """Return the modules of kernels by the names of their files, which are unique."""
+    package = Path(pimper_torch.__path__[0])
+    inside = [source.relative_to(package.parent).with_suffix("") for source in sources()]
+    return {path.name: ".".join(path.parts) for path in inside}
 
 
 def _is_private(folder: Path) -> bool:
@@ -189,7 +202,7 @@ def load(names: Sequence[str]) -> None:
     for done, name in enumerate(names, start=1):
         while not _is_done(name) and any(child.poll() is None for child in compile_ahead()):
             time.sleep(0.05)
-        import_module(f"{pimper_torch.kernels.__name__}.{name}")
+        import_module(modules().get(name, name))
         report(done, len(names))
 
 
@@ -249,7 +262,7 @@ def _child(row: int) -> None:
             # Never load other processes' code: code depends on the modules compiled before.
             _cache_class().load_overload = lambda *_: None  # type: ignore[attr-defined]
             for name in ROWS[row]:
-                import_module(f"{pimper_torch.kernels.__name__}.{name}")
+                import_module(modules().get(name, name))
                 (folder / f"{name}.done").touch()
     forget_unused(folder.parent)
     os._exit(0)

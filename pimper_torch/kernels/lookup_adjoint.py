@@ -30,7 +30,7 @@ def spread(
 
     Args:
         on_finest: Added to if ``on_pixels``, as is ``on_coarser``.
-        levels: See :func:`~pimper_torch.kernels.resampling.register`.
+        levels: See :func:`~pimper_torch.stages.patches.kernels.resampling.register`.
         area: Of the sample's footprint, pixels of the finest level.
         on_channels: Derivatives by the sample.
 

@@ -55,7 +55,7 @@ def fit_lights(
         iterations: Maximum number if gradients are not required.
         start: Initial lights and albedo; by default those of :meth:`LightModel.initialize`.
     """
-    from pimper_torch.kernels.lights_and_albedo import TILE, fit
+    from pimper_torch.lighting.kernels.lights_and_albedo import TILE, fit
 
     limit, min_gain = _TO_CONVERGENCE if _requires_grad(model, samples) else (iterations, _MIN_GAIN)
     with torch.no_grad():

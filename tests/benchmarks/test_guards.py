@@ -64,7 +64,7 @@ def test_every_guard_and_its_replacement_exists():
     assert names <= set(GUARDS)
     for patches in PATCHES.values():
         for target in patches:
-            assert pkgutil.resolve_name(f"pimper_torch.method.{target}") is not None
+            assert pkgutil.resolve_name(f"pimper_torch.{target}") is not None
     for changes in CHANGES.values():
         load_config("default", changes)
     assert sum(not one.guards for one in SETS.values()) >= 20

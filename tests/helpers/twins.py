@@ -20,6 +20,6 @@ def using(kernels: Literal["numba", "torch"]) -> Iterator[None]:
     with ExitStack() as stack:
         for module in _MODULES if kernels == "torch" else ():
             stack.enter_context(
-                patch(f"pimper_torch.method.{module}.compiled_for", lambda *_: False)
+                patch(f"pimper_torch.stages.{module}.compiled_for", lambda *_: False)
             )
         yield

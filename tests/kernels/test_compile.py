@@ -3,12 +3,10 @@ import re
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 from filelock import FileLock
 
-import pimper_torch.kernels
 from pimper_torch.kernels.compile import (
     COARSE,
     GRADIENTS,
@@ -21,6 +19,7 @@ from pimper_torch.kernels.compile import (
     compiled,
     forget_unused,
     load,
+    sources,
 )
 
 AHEAD = "from pimper_torch.kernels.compile import *; children = compile_ahead(); "
@@ -57,10 +56,9 @@ def test_compile_all_keeps_torch_threads_and_leaves_nothing_to_compile():
 def test_every_kernel_of_a_run_is_compiled():
     listed = [name for row in ROWS for name in row]
     assert sorted(listed) == sorted((*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE))
-    sources = Path(pimper_torch.kernels.__path__[0]).glob("*.py")
     with_types = {
         path.stem
-        for path in sources
+        for path in sources()
         if re.search(r'@compiled\(\s*(f?"|\*|annotated)', path.read_text())
     }
     assert with_types == {*listed, *GRADIENTS, "lookup"}  # lookup is imported by other kernels
@@ -70,7 +68,7 @@ def test_a_run_waits_for_kernels_that_another_process_compiles(fresh):
     code = (
         "from pimper_torch.kernels.compile import cache_folder, load\n"
         "print(cache_folder(), flush=True); input(); load(('line_matches',))\n"
-        "from pimper_torch.kernels.line_matches import most_alike as kernel\n"
+        "from pimper_torch.stages.sfm.kernels.line_matches import most_alike as kernel\n"
         "print(*kernel.stats.cache_hits.values())"
     )
     with started(code) as run:
@@ -106,7 +104,7 @@ def test_the_compiling_process_ends_with_its_parent(fresh, end):
 def test_kernels_are_compiled_after_the_compiling_process_died(fresh):
     code = (
         f"{AHEAD} [each.kill() for each in children]; load(('line_matches',))\n"
-        "from pimper_torch.kernels.line_matches import most_alike as kernel\n"
+        "from pimper_torch.stages.sfm.kernels.line_matches import most_alike as kernel\n"
         "print(dict(kernel.stats.cache_misses))"
     )
     with started(code) as parent:
@@ -121,7 +119,7 @@ def test_a_kernel_is_bitwise_reproducible_from_disk_and_in_any_order(fresh, tmp_
         "import numpy as np\n"
         "from pimper_torch.kernels.compile import load\n"
         "load(('lights_and_albedo',))\n"
-        "from pimper_torch.kernels import lights_and_albedo as lights\n"
+        "from pimper_torch.lighting.kernels import lights_and_albedo as lights\n"
         "random, views, samples = np.random.default_rng(5), 7, 4 * lights.TILE\n"
         "normals = random.normal(size=(3, samples))\n"
         "normals /= np.linalg.norm(normals, axis=0)\n"
@@ -134,7 +132,8 @@ def test_a_kernel_is_bitwise_reproducible_from_disk_and_in_any_order(fresh, tmp_
         "misses = sum(lights.fit.stats.cache_misses.values())\n"
         "print(misses, light.tobytes().hex(), albedo.tobytes().hex())"
     )
-    other = "import pimper_torch.kernels.factorization\n" + code.replace("load((", "print((")
+    factorization = "import pimper_torch.stages.photometry.kernels.factorization\n"
+    other = factorization + code.replace("load((", "print((")
     first, later = (subprocess.check_output([sys.executable, "-c", code]) for _ in range(2))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "another"))
     anew = subprocess.check_output([sys.executable, "-c", other])
@@ -153,9 +152,10 @@ def test_machine_code_is_found_by_the_hash_of_the_kernels(tmp_path, monkeypatch)
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
     found = []
     for place, code in (("one", "pass"), ("two", "pass"), ("two", "pass  # edited")):
-        (tmp_path / place).mkdir(exist_ok=True)
-        (tmp_path / place / "kernel.py").write_text(code)
-        monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path / place)])
+        kernels = tmp_path / place / "stage" / "kernels"
+        kernels.mkdir(exist_ok=True, parents=True)
+        (kernels / "kernel.py").write_text(code)
+        monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path / place / "kernels")])
         found.append(cache_folder.__wrapped__())
     assert found[0] == found[1] != found[2]
     assert {folder.parent for folder in found} == {tmp_path / "cache"}
@@ -164,12 +164,12 @@ def test_machine_code_is_found_by_the_hash_of_the_kernels(tmp_path, monkeypatch)
 @pytest.mark.skipif(sys.platform == "win32", reason="has no such modes")
 def test_machine_code_is_only_read_from_folders_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path)])
+    monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path / "kernels")])
     folder = cache_folder.__wrapped__()
     assert folder.stat().st_mode & 0o777 == 0o700
     folder.chmod(0o770)
     beside = cache_folder.__wrapped__()
-    assert beside == tmp_path / "__pycache__" / folder.name
+    assert beside == tmp_path / "kernels" / "__pycache__" / folder.name
     beside.rmdir()
     beside.symlink_to(tmp_path)
     assert tmp_path not in cache_folder.__wrapped__().parents

@@ -161,7 +161,7 @@ class Matcher:
         The score is the mean correlation of the best sources, 0 where none sees the pixel.
         Computed on the CPU in single precision; not differentiable.
         """
-        from pimper_torch.kernels.window_scores import window_scores
+        from pimper_torch.stages.coarse.kernels.window_scores import window_scores
 
         scores = torch.empty(len(offsets), *field.shape)
         window_scores(

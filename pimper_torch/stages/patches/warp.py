@@ -91,7 +91,7 @@ class _Resampled(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, call: _Call, channels: int, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return the samples, and the mask of valid ones."""
-        from pimper_torch.kernels import resampling
+        from pimper_torch.stages.patches.kernels import resampling
 
         projection, depth = call[3], inputs[-1]
         num_patches, *raster = depth.shape
@@ -107,7 +107,7 @@ class _Resampled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, on_radiance: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return gradients of images and geometry."""
-        from pimper_torch.kernels import resampling_adjoint as adjoint
+        from pimper_torch.stages.patches.kernels import resampling_adjoint as adjoint
 
         valid, *inputs = ctx.saved_tensors
         pictures, _, levels, projection, samples, *_ = ctx.call

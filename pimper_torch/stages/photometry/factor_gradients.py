@@ -51,7 +51,8 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
 
     Checked against the solvers in ``test_factor_gradients.py``. The Hessian is in float64. Where
     the solver is compiled, so are refinement and adjoint
-    (:mod:`~pimper_torch.kernels.factor_adjoint`), and the result is differentiable once.
+    (:mod:`~pimper_torch.stages.photometry.kernels.factor_adjoint`), and the result is
+    differentiable once.
     """
     if problem.has_kernel and compiled_for(problem.radiance.detach()):
         data = problem.radiance, problem.weight, problem.prior_mean, problem.regularization
@@ -84,7 +85,7 @@ class _Compiled(torch.autograd.Function):
         ctx: Any, problem: Bilinear, factors: Factors, *data: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return lights, shading, weights and residuals of the refined solution."""
-        from pimper_torch.kernels import factor_adjoint
+        from pimper_torch.stages.photometry.kernels import factor_adjoint
 
         code, scale, stride = problem.loss.code, problem.loss.scale, problem.stride
         assert code is not None  # has_kernel
@@ -107,7 +108,7 @@ class _Compiled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         """Return gradients of the data."""
-        from pimper_torch.kernels import factor_adjoint
+        from pimper_torch.stages.photometry.kernels import factor_adjoint
 
         lights, shading, *data = ctx.saved_tensors
         code, scale, stride = ctx.loss

@@ -72,8 +72,8 @@ def solve_variable_projection(
         orthonormal, and others keep their initial norm.
 
     Not differentiable. Patches are independent. A compiled kernel solves first-order light in
-    float32 (:mod:`pimper_torch.kernels.factorization`), with the same result up to
-    rounding; there, samples without weight keep their initial values.
+    float32 (:mod:`~pimper_torch.stages.photometry.kernels.factorization`), with the same result
+    up to rounding; there, samples without weight keep their initial values.
     """
     kernel = problem.has_kernel and problem.radiance.dtype == torch.float32
     if kernel and compiled_for(problem.radiance):
@@ -235,7 +235,7 @@ def _solve_by_kernel(
     small_steps: int,
     curvature_samples: int | None,
 ) -> Factors:
-    from pimper_torch.kernels import factorization
+    from pimper_torch.stages.photometry.kernels import factorization
 
     J, code = problem.radiance, problem.loss.code
     assert code is not None  # has_kernel

@@ -206,7 +206,7 @@ def _near(geometry: Any, max_error_px: float) -> Near | None:  # noqa: ANN401 - 
 
 def most_similar(first: Features, second: Features, near: Near) -> tuple[Alike, Alike]:
     """Return the most similar features of two photographs that can show one point."""
-    from pimper_torch.kernels.line_matches import most_alike
+    from pimper_torch.stages.sfm.kernels.line_matches import most_alike
 
     counts = len(first.pixels), len(second.pixels)
     products = [torch.full((count, 2), -1.0) for count in counts]

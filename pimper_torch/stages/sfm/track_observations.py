@@ -250,7 +250,7 @@ def observe_points(
 def _observed(
     pictures: LogPictures, cameras: Cameras, tangents: Tangents, limits: Float[Tensor, " limit"]
 ) -> TrackObservations:
-    from pimper_torch.kernels.patch_alignment import align
+    from pimper_torch.stages.sfm.kernels.patch_alignment import align
 
     window = _Window(like=pictures.log)
     templates = _templates(pictures, cameras, tangents, window)

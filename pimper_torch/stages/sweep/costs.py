@@ -178,7 +178,7 @@ def costs_of(hypotheses: Hypotheses, num_views: int, min_views: int) -> Costs:
 
 
 def _compiled_costs(bucket: Hypotheses, num_views: int, min_views: int) -> Costs:
-    from pimper_torch.kernels import sweep_costs
+    from pimper_torch.stages.sweep.kernels import sweep_costs
 
     templates, photometry, gray = bucket.templates, bucket.photometry, bucket.sources.gray
     to_patches = bucket.cameras, templates.patch_from_world
@@ -222,7 +222,7 @@ class _Compiled(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, call: Any, *inputs: Tensor) -> Costs:
         """Return the costs, and 1 for samples that are swept, else 0."""
-        from pimper_torch.kernels import sweep_costs
+        from pimper_torch.stages.sweep.kernels import sweep_costs
 
         trial = call[-1]
         num_patches, _, *raster = trial.valid.shape
@@ -238,7 +238,7 @@ class _Compiled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, on_cost: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return gradients of images, geometry and light."""
-        from pimper_torch.kernels import sweep_adjoint as adjoint
+        from pimper_torch.stages.sweep.kernels import sweep_adjoint as adjoint
 
         of_images = any(ctx.needs_input_grad[1:3])
 

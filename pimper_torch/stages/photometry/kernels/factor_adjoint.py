@@ -1,10 +1,11 @@
 """Derivatives of factorizations on the cone: twin of ``stages.photometry.factor_gradients``.
 
-One patch at a time is packed as by :mod:`~pimper_torch.kernels.factorization`, in float64.
-Let ``G`` be minus half the gradient of the objective, with a scale of the robust weights that
-depends on the residuals. Then ``dG = -(H - q p^T) dx`` plus the derivative by the data. ``H`` is
-the Hessian, ``q`` the derivative of ``G`` by the residuals' deviation, and ``p`` that of the
-deviation by the unknowns ``x``: lights, and coordinates of samples along their tangents.
+One patch at a time is packed as by
+:mod:`~pimper_torch.stages.photometry.kernels.factorization`, in float64. Let ``G`` be minus half
+the gradient of the objective, with a scale of the robust weights that depends on the residuals.
+Then ``dG = -(H - q p^T) dx`` plus the derivative by the data. ``H`` is the Hessian, ``q`` the
+derivative of ``G`` by the residuals' deviation, and ``p`` that of the deviation by the unknowns
+``x``: lights, and coordinates of samples along their tangents.
 """
 
 import math
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.dense_systems import eliminate
-from pimper_torch.kernels.factorization import overwrite, samples_that_count
 from pimper_torch.kernels.robust_scale import robust_variance
-from pimper_torch.kernels.shading_steps import frame, project
 from pimper_torch.kernels.signatures import Doubles1, Doubles2, Doubles3
 from pimper_torch.kernels.twin_constants import CAUCHY, GEMAN_MCCLURE, MIN_DEVIATION, SQUARES
+from pimper_torch.stages.photometry.kernels.factorization import overwrite, samples_that_count
+from pimper_torch.stages.photometry.kernels.shading_steps import frame, project
 
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.dense_systems import solve_damped
 from pimper_torch.kernels.robust_scale import robust_variance
-from pimper_torch.kernels.shading_steps import TILE, update_shading, whitening
 from pimper_torch.kernels.signatures import Floats1, Floats2, Floats3, Integers1
 from pimper_torch.kernels.twin_constants import (
     CAUCHY,
@@ -28,6 +27,7 @@ from pimper_torch.kernels.twin_constants import (
     SQUARES,
     ZERO_ROUNDINGS,
 )
+from pimper_torch.stages.photometry.kernels.shading_steps import TILE, update_shading, whitening
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Adjoint of :mod:`pimper_torch.kernels.sweep_costs`."""
+"""Adjoint of :mod:`pimper_torch.stages.sweep.kernels.sweep_costs`."""
 
 import math
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ from pimper_torch.kernels import signatures
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import shrinkage
 from pimper_torch.kernels.lookup_adjoint import spread
-from pimper_torch.kernels.sweep_costs import (
+from pimper_torch.stages.sweep.kernels.sweep_costs import (
     FLOOR,
     Shading,
     Trial,

@@ -1,6 +1,6 @@
 """Costs of all height hypotheses of a bucket's samples: twin of ``stages.sweep.sweep``.
 
-Arguments are documented there; pyramids are stored as in ``kernels.resampling``.
+Arguments are documented there; pyramids are stored as in ``patches.kernels.resampling``.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Adjoint of ``kernels.resampling``: gradients of pictures and geometry."""
+"""Adjoint of ``resampling``: gradients of pictures and geometry."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from pimper_torch.kernels import signatures
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import shrinkage
 from pimper_torch.kernels.lookup_adjoint import spread
-from pimper_torch.kernels.resampling import neighbours, project
+from pimper_torch.stages.patches.kernels.resampling import neighbours, project
 
 
 class ViewGradients(NamedTuple):
@@ -37,7 +37,7 @@ def pull_back(
     """Compute derivatives by pictures and geometry from those by the samples.
 
     Args:
-        valid: Valid samples, from ``register`` of :mod:`pimper_torch.kernels.resampling`.
+        valid: Valid samples, from :func:`pimper_torch.stages.patches.kernels.resampling.register`.
         on_pixels: Whether derivatives by pictures are needed, 1 or 0.
         gradients: Added to.
     """
