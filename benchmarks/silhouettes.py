@@ -23,6 +23,7 @@ from torch.nn.functional import interpolate
 
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.chains.prepare import locate
 from pimper_torch.io.photographs import load_views
 from pimper_torch.priors.prior_files.read_silhouettes import read_silhouettes
 from pimper_torch.radiometry import srgb_from_linear
@@ -50,7 +51,7 @@ def main() -> None:
         views, raw = load_views(photos, max_size_px=options.max_size_px), "| |"
         if soft:
             views = views.replace(priors=(read_silhouettes(soft, views),))
-        scene = chain.placed(chain.running(), views, None)
+        scene = locate(chain, chain.running(), views)[0]
         known = known_masks(masks, scene)
         if soft:
             alone = overlaps(soft_masks(scene), known)

@@ -21,7 +21,7 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
 from pimper_bench.scenes.textures import random_speckle
 from pimper_bench.scenes.true_clouds import sparse_scene
-from pimper_torch.chains.coarse_to_fine import split_held_out
+from pimper_torch.chains.prepare import locate, split_held_out
 from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.paper.paper_config import TriangulateConfig
@@ -344,10 +344,10 @@ def test_a_custom_structure_from_motion_gives_poses_and_optionally_points(recons
     scene, points = reconstruction.scene, reconstruction.scene.points_world
     for mine, added in ((Mine(scene), 0), (MineWithPoints(scene), 1)):
         chain = pt.load_chain(preset, reconstruct=mine)
-        placed = chain.placed(chain.running(), scene.views, "model")
+        placed = locate(chain, chain.running(), scene.views, "model")[0]
         assert mine.asked == [(scene.views.names, "model")]
         assert torch.equal(placed.points_world, points)
         # A scene has cameras: only points may be requested.
-        given = chain.placed(chain.running(), scene, None)
+        given = locate(chain, chain.running(), scene)[0]
         assert torch.equal(given.points_world, points + added)
         assert len(mine.asked) == 1

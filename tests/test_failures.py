@@ -204,7 +204,7 @@ def streamed(given):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PimperWarning)  # patches with too little light
         light = FitLight()(Warp()(*given))
-        return Photometric(Warp(), Factorize(), Sweep())(*given, light)
+        return Photometric()((Warp(), Factorize(), Sweep()), *given, light)
 
 
 @pytest.fixture(scope="module")

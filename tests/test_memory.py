@@ -28,7 +28,7 @@ def test_memory_decides_between_whole_blockwise_and_no_fusion(monkeypatch):
     patches = Decompose()(coarse, scene.cameras)
     assert largest_problem(float("inf"), patches, 0.5, 1.0) == float("inf")
     assert largest_problem(resident_bytes() + 1e9, patches, 0.5, 1.0) == float("inf")
-    monkeypatch.setattr("pimper_torch.runtime.memory.resident_bytes", lambda: 1e5)
+    monkeypatch.setattr("pimper_torch.chains.fusion_memory.resident_bytes", lambda: 1e5)
     with pytest.raises(
         ReconstructionError, match=r"by blocks.*in total.*by a factor of 0\.\d+ per side"
     ):

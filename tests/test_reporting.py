@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from pimper_torch.chains.running import called
 from pimper_torch.records import Mesh, StageReport
 from pimper_torch.runtime import journal, reporting
 from pimper_torch.runtime.journal import aside, current
@@ -13,8 +14,6 @@ from pimper_torch.runtime.progress import report
 from pimper_torch.runtime.reporting import (
     SilentObserver,
     accounted,
-    called,
-    figures,
     gathered,
     recorded,
     seconds_of,
@@ -52,7 +51,7 @@ def test_stages_are_reported_in_order_with_their_figures():
         called("second", tetrahedron)
         called("first", tetrahedron)
     assert [entry.name for entry in reports] == ["second", "first", "between stages"]
-    assert reports[0].figures == {"vertices": 4, "faces": 4, "openings": 0}
+    assert reports[0].figures == {"vertices": 4, "faces": 4}
     assert all(entry.seconds >= 0 and entry.peak_memory_mb > 10 for entry in reports)
     assert listener.heard[:3] == ["started second", "1/1", "finished second"]
 
@@ -142,5 +141,7 @@ print(before, risen, peak_memory_mb())
     assert after == pytest.approx(risen, abs=8)
 
 
-def test_a_record_without_figures_reports_none():
-    assert figures("nothing of ours") == {}
+def test_a_value_other_than_a_record_reports_no_figures():
+    with recorded(SilentObserver()) as reports:
+        called("stage", lambda: "nothing of ours")
+    assert reports[0].figures == {}

@@ -34,7 +34,7 @@ def given():
 def streamed(given):
     views, cameras, patches = given
     light = FitLight()(Warp()(views, cameras, thinned(patches)))
-    return Photometric(Warp(), Factorize(), Sweep())(*given, light, prepare(views))
+    return Photometric()((Warp(), Factorize(), Sweep()), *given, light, prepare(views))
 
 
 def values(swept):

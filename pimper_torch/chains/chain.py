@@ -1,4 +1,4 @@
-"""Base class of both chains: a run is a sequence of steps and the mesh of the last one."""
+"""Base class of both chains: a preparation, a sequence of steps, and the mesh of the last one."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
+from pimper_torch.chains.prepare import Prepared, prepare
 from pimper_torch.chains.running import ChainRun
+from pimper_torch.geometry.contours import Contours
 from pimper_torch.io.assets.mesh_files import MeshFiles
 from pimper_torch.kernels.compile import compile_ahead
-from pimper_torch.priors.undistort import with_undistorted_priors
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
@@ -39,15 +40,9 @@ from pimper_torch.runtime.failures import collecting, distinct, warn_of
 from pimper_torch.runtime.file_names import view_named
 from pimper_torch.runtime.ledger import left_out_of
 from pimper_torch.runtime.reporting import Observer, SilentObserver, gathered, recorded, stage
-from pimper_torch.stages.coarse.depth_points import depth_points
-from pimper_torch.stages.coarse.given_mesh import prepared
-from pimper_torch.stages.coarse.mesh_frame import refuse_other_axes
+from pimper_torch.stages.coarse.depth_points import DepthPoints
 from pimper_torch.stages.meshing.finish import Simplify
-from pimper_torch.stages.relighting.held_out import Relight, judge_textures
-from pimper_torch.stages.sfm.poses import with_poses
-from pimper_torch.stages.sfm.sparse_scene import sound
-from pimper_torch.stages.sfm.triangulation import FEW_OBSERVED, lacks_points
-from pimper_torch.stages.silhouettes.given import AS_THEY_ARE, right_reading
+from pimper_torch.stages.relighting.held_out import JudgeTextures, Relight
 from pimper_torch.stages.stage import Stage, check_handed
 from pimper_torch.stages.texturing.bake import Texture
 from pimper_torch.store import Store
@@ -60,8 +55,7 @@ class Step(Record):
     Attributes:
         scale: Scale of the photographs that templates were sampled for; 1 is full size.
         last: Whether this step's surface is the result.
-        scene: Cameras, undistorted photographs and the point cloud.
-        held_out: Photographs used only to estimate cameras; None without any.
+        prepared: The scene, and all else that was determined before the first pass.
         heights: Depth maps of all patches, with their normals, albedo and lights.
         surface: Joined over all facets, on the subdivided coarse mesh.
         reports: Report of each stage that ran for this step, in order.
@@ -71,14 +65,22 @@ class Step(Record):
 
     scale: float
     last: bool
-    scene: SparseScene
-    silhouettes: Silhouettes
+    prepared: Prepared
     heights: DepthPatches | SweptPatches
     surface: Surface
     reports: tuple[StageReport, ...] = ()
     failures: tuple[Failure, ...] = ()
     left_out: tuple[Removal, ...] = ()
-    held_out: SparseScene | None = None
+
+    @property
+    def scene(self) -> SparseScene:
+        """Cameras, undistorted photographs and the point cloud."""
+        return self.prepared.scene
+
+    @property
+    def silhouettes(self) -> Silhouettes:
+        """Of the object, in the photographs of the scene."""
+        return self.prepared.silhouettes
 
     @property
     def photometric(self) -> PhotometricPatches:
@@ -113,6 +115,7 @@ class Chain(Stage):
 
     reconstruct: Callable[[Views, Path | str | None], SparseScene]
     silhouettes: Callable[[SparseScene], Silhouettes]
+    hold_out: int = 0
     decompose: Callable[[CoarseMesh, Cameras, Surface | None, float], PatchSet]
     extract: Callable[[Surface], Mesh]
 
@@ -122,22 +125,28 @@ class Chain(Stage):
         super().__init__()
         self.on_failure: OnFailure = on_failure
         self.observer = observer or SilentObserver()
+        self.depth_points: Callable[[SparseScene], SparseScene] = DepthPoints()
         self.simplify: Callable[[Mesh, MeshFiles], FinishedMesh] = Simplify()
         self.relight: Callable[..., Relighting] = Relight()
         self.texture: Callable[[Mesh, Mesh, Relighting], TexturedMesh] = Texture()
+        self.judge_textures: Callable[..., Relighting] = JudgeTextures()
         self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
         self.watch: Callable[[SparseScene | Step], None] | None = None
         self.needed: tuple[str, ...] = ()
         self.store = store
 
     @abstractmethod
-    def passes(
-        self,
-        run: ChainRun,
-        views: Views | SparseScene,
-        sparse_model: Path | str | None,
-        mesh: Mesh | None,
-    ) -> Iterator[Step]:
+    def first_surface(
+        self, run: ChainRun, scene: SparseScene, silhouettes: Silhouettes, mesh: Mesh | None
+    ) -> tuple[Contours, CoarseMesh]:
+        """Return contours and coarse surface of one photograph per pose.
+
+        Args:
+            mesh: A given surface in the scene's frame, used instead of a reconstructed one.
+        """
+
+    @abstractmethod
+    def passes(self, run: ChainRun, prepared: Prepared) -> Iterator[Step]:
         """Run the stages up to the surface; yield the records of each pass, without reports."""
 
     def running(self) -> ChainRun:
@@ -152,51 +161,8 @@ class Chain(Stage):
             if isinstance(name, str) and name:
                 yield name
 
-    def placed(
-        self,
-        run: ChainRun,
-        views: Views | SparseScene,
-        sparse_model: Path | str | None,
-        mesh: Mesh | None = None,
-        *,
-        checked: bool = False,
-    ) -> SparseScene:
-        """Return photographs with their cameras, given or estimated.
-
-        Unusable views are removed, and priors are undistorted. Unless a mesh is given, points are
-        added to a scene without observed ones, by the method ``with_points`` of ``reconstruct`` if
-        it has one. Masks of other photographs, or rotated or inverted ones, are corrected according
-        to cameras and points, and cameras are estimated again, unless masks are ``checked``.
-        """
-        original = views
-        if isinstance(views, Views):
-            views = run(self.reconstruct, views, sparse_model)
-        elif sparse_model is not None:
-            raise InputError(
-                f"{type(self).__name__}: cameras are given twice, with the scene and as the model "
-                f"in {sparse_model}; needed: one of the two."
-            )
-        elif mesh is not None:
-            refuse_other_axes(mesh, views)
-        elif with_points := getattr(self.reconstruct, "with_points", None):
-            observed: SparseScene = with_points(views)
-            views = observed
-        bare = mesh is None and views.cameras.num_views >= 3 and lacks_points(views, FEW_OBSERVED)
-        scene = with_poses(sound(run(depth_points, views) if bare else views))
-        scene = with_undistorted_priors(scene)
-        config = getattr(self.silhouettes, "config", None)
-        if not checked and getattr(config, "object", "auto") != "everything":
-            photographs = original if isinstance(original, Views) else original.views
-            reading = right_reading(scene, photographs)
-            if reading is not AS_THEY_ARE:
-                views = reading.of(photographs)
-                if isinstance(original, SparseScene):
-                    views = original.replace(views=views)
-                return self.placed(run, views, sparse_model, mesh, checked=True)
-        self._notify(scene)
-        return scene
-
-    def _notify(self, record: "SparseScene | Step") -> None:
+    def notify(self, record: "SparseScene | Step") -> None:
+        """Call ``watch`` with the scene or a step, if it is set."""
         if self.watch is not None:
             with stage("view"):
                 self.watch(record)
@@ -207,62 +173,73 @@ class Chain(Stage):
             with stage("preview"):
                 self.preview(scene, coarse)
 
-    def given_mesh(
-        self,
-        mesh: Mesh | None,
-        views: Views | SparseScene,
-        scene: SparseScene,
-        silhouettes: Silhouettes,
-    ) -> Mesh | None:
-        """Return the given mesh in the scene's frame, prepared by :func:`prepared`.
-
-        Args:
-            mesh: None is returned unchanged. Given with photographs, in the frame of their cameras'
-                model; given with a scene, in its frame.
-
-        Raises:
-            InputError: The mesh is not a surface, or is in a different frame.
-        """
-        if mesh is None:
-            return None
-        if isinstance(views, Views):
-            vertices = mesh.vertices_world.double()
-            mesh = mesh.replace(vertices_world=vertices - vertices.new_tensor(scene.offset_world))
-        with stage("given_mesh") as report:
-            mesh, figures = prepared(mesh, scene, silhouettes)
-            report |= figures
-        return mesh
-
-    def steps(
+    def prepare(
         self,
         views: Views | SparseScene,
         sparse_model: Path | str | None = None,
         mesh: Mesh | None = None,
-    ) -> Iterator[Step]:
-        """Run the stages up to the surface, pass by pass. Arguments are those of :meth:`forward`.
+    ) -> Prepared:
+        """Determine cameras, silhouettes, contours and coarse surface, once for many calls.
 
-        Yields:
-            The records of each finished pass. The next pass runs when it is requested.
+        :meth:`steps` continues from the result, also from one with other photographs of the same
+        sizes: ``prepared.replace(scene=scene.replace(views=views))``. Arguments are those of
+        :meth:`forward`.
         """
         check_handed(self, (views, sparse_model, mesh), {})
         names = (views if isinstance(views, Views) else views.views).names
         for reference in self.references():
             view_named(reference, names)  # an unknown name fails before structure from motion
-        passes = self.passes(self.running(), views, sparse_model, mesh)
         compile_ahead()
-        entries: list[object] = []
+        with collecting(self.on_failure) as entries, recorded(self.observer) as reports:
+            prepared = prepare(self, self.running(), views, sparse_model, mesh)
+            self.show(prepared.scene, prepared.coarse)
+        return prepared.replace(
+            reports=tuple(reports), failures=distinct(entries), left_out=left_out_of(entries)
+        )
+
+    def steps(
+        self,
+        views: Views | SparseScene | Prepared,
+        sparse_model: Path | str | None = None,
+        mesh: Mesh | None = None,
+    ) -> Iterator[Step]:
+        """Run the stages up to the surface, pass by pass.
+
+        Args:
+            views: As for :meth:`forward`; or the result of :meth:`prepare`, without the others.
+
+        Yields:
+            The records of each finished pass. The next pass runs when it is requested. Reports of
+            the preparation are those of the first pass, too.
+        """
+        if not isinstance(views, Prepared):
+            prepared = self.prepare(views, sparse_model, mesh)
+        elif sparse_model is None and mesh is None:
+            prepared = views
+            prepared.check(f"{type(self).__name__}: prepared")
+        else:
+            raise InputError(
+                f"{type(self).__name__}: cameras or a mesh are given with what was prepared; "
+                "needed: give them to `prepare`."
+            )
+        passes = self.passes(self.running(), prepared)
+        entries: list[object] = [*prepared.failures, *prepared.left_out]
+        before = prepared.reports
         while True:
             with collecting(self.on_failure, entries), recorded(self.observer) as reports:
                 step = next(passes, None)
                 if step is not None:
-                    self._notify(step)
+                    self.notify(step)
             if step is None:
                 return
             if step.last:
                 warn_of(entries)
             yield step.replace(
-                reports=tuple(reports), failures=distinct(entries), left_out=left_out_of(entries)
+                reports=gathered([*before, *reports]),
+                failures=distinct(entries),
+                left_out=left_out_of(entries),
             )
+            before = ()
 
     def forward(
         self,
@@ -296,7 +273,7 @@ class Chain(Stage):
         return Reconstruction(
             mesh=extracted,
             scene=step.scene,
-            held_out=step.held_out,
+            held_out=step.prepared.held_out,
             silhouettes=step.silhouettes,
             coarse=step.coarse,
             patches=step.heights,
@@ -320,7 +297,7 @@ class Chain(Stage):
             asset = run(self.texture, result.mesh, finished.few, relighting)
             # Against the same photographs as the mesh.
             references = (scene, silhouettes) if held_out is None else (held_out, None)
-            relighting = run(judge_textures, relighting, asset, *references)
+            relighting = run(self.judge_textures, relighting, asset, *references)
             warn_of(entries)
         return result.replace(
             finished=finished,

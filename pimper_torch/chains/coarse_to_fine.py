@@ -1,37 +1,36 @@
 """The coarse-to-fine chain: all facets together, each pass on the surface of the previous one."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import torch
 from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.chains.fusion_memory import largest_problem
 from pimper_torch.chains.photometric import Factorizing, Photometric, SweepStage, WarpStage
+from pimper_torch.chains.prepare import Prepared
 from pimper_torch.chains.running import ChainRun
 from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.geometry.pyramids import Sources, prepare
 from pimper_torch.lighting.lights import thinned
-from pimper_torch.priors.conventions import resolve_prior_conventions
 from pimper_torch.records import (
     Cameras,
     CoarseMesh,
     Mesh,
     OrientedPoints,
+    PatchSet,
     PatchViews,
     PhotometricPatches,
+    SilhouetteCoverage,
     Silhouettes,
     SparseScene,
     Surface,
     SweptPatches,
-    Views,
 )
-from pimper_torch.records.scene import with_views
-from pimper_torch.runtime.config import bytes_of, require
-from pimper_torch.runtime.reporting import Observer
+from pimper_torch.runtime.config import bytes_of
+from pimper_torch.runtime.reporting import Observer, stage
 from pimper_torch.stages.coarse.remesh import Remesh
 from pimper_torch.stages.coarse.surface import CoarseSurface
 from pimper_torch.stages.fusion.fuse import Fuse
@@ -43,44 +42,12 @@ from pimper_torch.stages.patches.warp import Warp
 from pimper_torch.stages.photometry.factorize import Factorize
 from pimper_torch.stages.photometry.fit_light import FitLight, Illumination
 from pimper_torch.stages.photometry.gauge import FixGauge
-from pimper_torch.stages.sfm.poses import one_view_per_pose
 from pimper_torch.stages.sfm.reconstruct import Reconstruct
-from pimper_torch.stages.silhouettes.explain import explain
-from pimper_torch.stages.silhouettes.find import FindSilhouettes, masked, of_all_photographs
+from pimper_torch.stages.silhouettes.explain import Explain
+from pimper_torch.stages.silhouettes.find import FindSilhouettes
 from pimper_torch.stages.silhouettes.trace import TraceContours
 from pimper_torch.stages.sweep.sweep import Sweep
 from pimper_torch.store import Store, opened
-
-# The smallest number from which a surface is reconstructed.
-_MIN_VIEWS = 3
-
-
-def split_held_out(
-    scene: SparseScene, every: int, needed: Iterable[str] = ()
-) -> tuple[SparseScene, SparseScene | None]:
-    """Split a scene into used views and held-out views, which are every n-th in order of names.
-
-    Args:
-        needed: Names, with or without suffix, of views that are never held out.
-
-    Returns:
-        Scenes with the complete cloud. Without held-out views, the scene itself and None.
-    """
-    names, stay = scene.views.names, set(needed)
-    ordered = sorted(range(len(names)), key=names.__getitem__)
-    chosen = ordered[every - 1 :: every] if every else []
-    held = [view for view in chosen if not stay & {names[view], names[view].rsplit(".", 1)[0]}]
-    if not held:
-        return scene, None
-    left = len(names) - len(held)
-    needs = f"a number that leaves at least {_MIN_VIEWS} views; it leaves {left}"
-    require(left >= _MIN_VIEWS, "hold_out", every, needs)
-    out = torch.zeros(len(names), dtype=torch.bool)
-    out[held] = True
-    return (
-        with_views(scene, ~out).replace(unregistered=scene.unregistered),
-        with_views(scene, out).replace(unregistered=()),
-    )
 
 
 class CoarseToFine(Chain):
@@ -96,6 +63,7 @@ class CoarseToFine(Chain):
         self.config = config = config or CoarseToFineConfig()
         store = opened(cache)
         super().__init__(observer, store, config.on_failure)
+        self.hold_out = config.hold_out
         self.reconstruct = Reconstruct(config.reconstruct, store)
         self.silhouettes = FindSilhouettes(config.silhouettes)
         self.contours: Callable[[Silhouettes, Cameras], Contours] = TraceContours()
@@ -106,73 +74,72 @@ class CoarseToFine(Chain):
         self.depth_from_light: Callable[..., OrientedPoints] = DepthFromLight()
         self.factorize: Factorizing = Factorize(config.factorize)
         self.sweep: SweepStage = Sweep(config.sweep)
+        self.photometry: Callable[..., SweptPatches] = Photometric()
         self.gauge: Callable[[PhotometricPatches], PhotometricPatches] = FixGauge(config.factorize)
         self.fuse: Callable[..., Surface] = Fuse(config.fuse)
         self.repair: Callable[[Surface], Surface] = Repair()
         self.remesh: Callable[[SweptPatches, Surface, Contours], CoarseMesh] = Remesh(config.remesh)
+        self.explain: Callable[..., SilhouetteCoverage] = Explain()
         self.extract = Extract(config.extract)
         self._swap(stages)
 
-    def passes(
-        self,
-        run: ChainRun,
-        views: Views | SparseScene,
-        sparse_model: Path | str | None,
-        mesh: Mesh | None,
-    ) -> Iterator[Step]:
+    def first_surface(
+        self, run: ChainRun, scene: SparseScene, silhouettes: Silhouettes, mesh: Mesh | None
+    ) -> tuple[Contours, CoarseMesh]:
+        """Trace the contours and make the coarse surface; see :meth:`Chain.first_surface`."""
+        contours = run(self.contours, silhouettes, scene.cameras)
+        coarse = run(self.coarse_surface, scene, contours, mesh)
+        run(self.explain, coarse.mesh, contours)
+        return contours, coarse
+
+    def passes(self, run: ChainRun, prepared: Prepared) -> Iterator[Step]:
         """Run the stages after the coarse mesh once for each scale; see :meth:`Chain.passes`."""
-        complete = self.placed(run, views, sparse_model, mesh)
-        needed = (*self.references(), *self.needed)
-        placed, held_out = split_held_out(complete, self.config.hold_out, needed)
-        selected = one_view_per_pose(placed, needed)
-        outlines = run(self.silhouettes, selected.scene)
-        mesh = self.given_mesh(mesh, views, selected.scene, outlines)
-        scene, silhouettes = of_all_photographs(placed, selected, outlines)
-        scene = resolve_prior_conventions(scene, silhouettes)
-        per_pose = scene if selected.scene is placed else masked(selected.scene, outlines)
-        contours = run(self.contours, outlines, per_pose.cameras)
-        coarse = run(self.coarse_surface, per_pose, contours, mesh)
-        if per_pose is not scene:
-            coarse = coarse.replace(reference=int(selected.chosen[coarse.reference]))
-        self.show(scene, coarse)
-        run(explain, coarse.mesh, contours)
+        scene, contours, coarse = prepared.scene, prepared.contours, prepared.coarse
         cameras, surface = scene.cameras, None
-        sources = run(prepare, scene.views, self.config.warp.saturation_level)
-        photometric = Photometric(self.warp, self.factorize, self.sweep)
-        by_blocks: tuple[float, ...] = ()
+        with stage("pyramids"):
+            sources = prepare(scene.views, self.config.warp.saturation_level)
         for scale, last in run.passes(self.config.scales):
             patches = run(self.decompose, coarse, cameras, surface, scale)
-            seen = run(self.warp, scene.views, cameras, thinned(patches), sources)
-            light = run(self.light, seen)
-            del seen
-            if surface is None and mesh is None and per_pose is scene:
-                points = run(self.depth_from_light, scene, contours, coarse.mesh, light.field)
-                if len(points.points_world):
+            light = self._light(run, scene, patches, sources)
+            if surface is None:
+                points = self._swept_points(run, prepared, light)
+                if points is not None:
                     coarse = run(self.coarse_surface, scene, contours, None, points)
                     self.show(scene, coarse)
                     patches = run(self.decompose, coarse, cameras, surface, scale)
-                    seen = run(self.warp, scene.views, cameras, thinned(patches), sources)
-                    light = run(self.light, seen)
-                    del seen
-            if surface is None:
-                limit, scales = bytes_of(self.config.max_memory), self.config.scales
-                size = largest_problem(limit, patches, scales[0], scales[-1])
-                by_blocks = () if math.isinf(size) else (size,)  # vertices per linear system
-            heights = run(photometric, scene.views, cameras, patches, light, sources)
+                    light = self._light(run, scene, patches, sources)
+                by_blocks = self._by_blocks(patches)
+            each = self.warp, self.factorize, self.sweep
+            heights = run(self.photometry, each, scene.views, cameras, patches, light, sources)
             heights = heights.replace(photometric=run(self.gauge, heights.photometric))
             if last:
                 del sources  # takes as much memory as the photographs
             surface = run(self.fuse, heights, contours, last, *by_blocks)
             surface = run(self.repair, surface)
-            run(explain, surface, contours, per_pose.views.names if mesh is None else ())
-            yield Step(
-                scale=scale,
-                last=last,
-                scene=scene,
-                held_out=held_out,
-                silhouettes=silhouettes,
-                heights=heights,
-                surface=surface,
-            )
+            run(self.explain, surface, contours, prepared.per_pose if prepared.mesh is None else ())
+            yield Step(scale=scale, last=last, prepared=prepared, heights=heights, surface=surface)
             if not last:
                 coarse = run(self.remesh, heights, surface, contours)
+
+    def _light(
+        self, run: ChainRun, scene: SparseScene, patches: PatchSet, sources: Sources
+    ) -> Illumination:
+        """Return the light of every view, from few samples of all patches."""
+        seen = run(self.warp, scene.views, scene.cameras, thinned(patches), sources)
+        return run(self.light, seen)
+
+    def _swept_points(
+        self, run: ChainRun, prepared: Prepared, light: Illumination
+    ) -> OrientedPoints | None:
+        """Return points where photographs contradict the coarse surface; None if they do not."""
+        if prepared.mesh is not None or prepared.scene.views.poses is not None:
+            return None
+        contours, mesh = prepared.contours, prepared.coarse.mesh
+        points = run(self.depth_from_light, prepared.scene, contours, mesh, light.field)
+        return points if len(points.points_world) else None
+
+    def _by_blocks(self, patches: PatchSet) -> tuple[float, ...]:
+        """Return the number of vertices per linear system of the fusion; empty if all fit."""
+        limit, scales = bytes_of(self.config.max_memory), self.config.scales
+        size = largest_problem(limit, patches, scales[0], scales[-1])
+        return () if math.isinf(size) else (size,)

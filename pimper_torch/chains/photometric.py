@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
 
 from pimper_torch.geometry.pyramids import Sources
+from pimper_torch.kernels.compile import SWEEP
 from pimper_torch.records import (
     Cameras,
     PatchSet,
@@ -56,14 +57,12 @@ class Photometric(Stage):
     processed in parallel, because those of all patches do not fit into memory.
     """
 
-    name = "photometry"
-
-    def __init__(self, warp: WarpStage, factorize: Factorizing, sweep: SweepStage) -> None:
-        super().__init__()
-        self.warp, self.factorize, self.sweep = warp, factorize, sweep
+    kept_as = SweptPatches
+    kernels = SWEEP
 
     def forward(
         self,
+        stages: tuple[WarpStage, Factorizing, SweepStage],
         views: Views,
         cameras: Cameras,
         patches: PatchSet,
@@ -73,18 +72,20 @@ class Photometric(Stage):
         """Return the swept heights of all patches, with their normals, albedo and lights.
 
         Args:
+            stages: Warp, factorization and sweep of a bucket.
             sources: Image pyramids of the photographs, for warp and sweep.
         """
+        warp, factorize, sweep = stages
 
         def of_bucket(templates: Templates) -> SweptPatches:
             bucket = patches.replace(buckets=(templates,))
             with part("warp"):
-                seen = self.warp(views, cameras, bucket, sources)  # samples J
+                seen = warp(views, cameras, bucket, sources)  # samples J
             add_counts(seen.figures())
             with part("factorize"):
-                photometric = self.factorize(seen, light)  # J = L N: lights, albedo and normals
+                photometric = factorize(seen, light)  # J = L N: lights, albedo and normals
             with part("sweep"):
-                return self.sweep(views, cameras, seen, photometric, sources)
+                return sweep(views, cameras, seen, photometric, sources)
 
         results = list(side_by_side(of_bucket, patches.buckets))
         lit = tuple(bucket for result in results for bucket in result.photometric.buckets)

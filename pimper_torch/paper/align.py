@@ -113,6 +113,8 @@ class Align(Stage):
     Source: Sabzevari, Del Bue, Murino: PiMPeR, 2015, for the system and k, not anchors and rounds.
     """
 
+    kept_as = DepthPatches
+
     def __init__(self, config: AlignConfig | None = None) -> None:
         super().__init__()
         self.config = config or AlignConfig()

@@ -7,6 +7,7 @@ from torch import nn
 
 from pimper_torch.chains.chain import Chain, Step
 from pimper_torch.chains.photometric import Factorizing, WarpStage
+from pimper_torch.chains.prepare import Prepared
 from pimper_torch.chains.running import ChainRun
 from pimper_torch.geometry.contours import Contours
 from pimper_torch.paper.align import Align
@@ -14,16 +15,15 @@ from pimper_torch.paper.integrate import Integrate
 from pimper_torch.paper.paper_config import PublishedConfig
 from pimper_torch.paper.refine import Refine
 from pimper_torch.paper.triangulate import Triangulate
-from pimper_torch.priors.conventions import resolve_prior_conventions
 from pimper_torch.records import (
     CoarseMesh,
     DepthPatches,
     Mesh,
     PatchViews,
     PhotometricPatches,
+    Silhouettes,
     SparseScene,
     Surface,
-    Views,
 )
 from pimper_torch.runtime.reporting import Observer
 from pimper_torch.stages.coarse.surface import CoarseSurface
@@ -33,9 +33,8 @@ from pimper_torch.stages.patches.warp import Warp
 from pimper_torch.stages.photometry.factorize import Factorize
 from pimper_torch.stages.photometry.fit_light import FitLight, Illumination
 from pimper_torch.stages.photometry.gauge import FixGauge
-from pimper_torch.stages.sfm.poses import one_view_per_pose
 from pimper_torch.stages.sfm.reconstruct import Reconstruct
-from pimper_torch.stages.silhouettes.find import FindSilhouettes, masked, of_all_photographs
+from pimper_torch.stages.silhouettes.find import FindSilhouettes
 from pimper_torch.store import Store, opened
 
 
@@ -73,39 +72,21 @@ class Published(Chain):
         self.extract = Extract(config.extract)
         self._swap(stages)
 
-    def passes(
-        self,
-        run: ChainRun,
-        views: Views | SparseScene,
-        sparse_model: Path | str | None,
-        mesh: Mesh | None,
-    ) -> Iterator[Step]:
-        """Run the stages once; see :meth:`Chain.passes`."""
-        placed = self.placed(run, views, sparse_model, mesh)
-        selected = one_view_per_pose(placed, tuple(self.references()))
-        outlines = run(self.silhouettes, selected.scene)
-        mesh = self.given_mesh(mesh, views, selected.scene, outlines)
-        scene, silhouettes = of_all_photographs(placed, selected, outlines)
-        scene = resolve_prior_conventions(scene, silhouettes)
-        per_pose = scene if selected.scene is placed else masked(selected.scene, outlines)
+    def first_surface(
+        self, run: ChainRun, scene: SparseScene, silhouettes: Silhouettes, mesh: Mesh | None
+    ) -> tuple[Contours, CoarseMesh]:
+        """Triangulate points of the cloud; see :meth:`Chain.first_surface`."""
+        contours = Contours.none(silhouettes, scene.cameras)
         if mesh is None:
-            coarse = run(self.triangulate, per_pose)
-        else:
-            contours = Contours.none(outlines, per_pose.cameras)
-            coarse = run(self.coarse_surface, per_pose, contours, mesh)
-        if per_pose is not scene:
-            coarse = coarse.replace(reference=int(selected.chosen[coarse.reference]))
-        self.show(scene, coarse)
-        patches = run(self.decompose, coarse, scene.cameras, None, 1.0)
+            return contours, run(self.triangulate, scene)
+        return contours, run(self.coarse_surface, scene, contours, mesh)
+
+    def passes(self, run: ChainRun, prepared: Prepared) -> Iterator[Step]:
+        """Run the stages once; see :meth:`Chain.passes`."""
+        scene = prepared.scene
+        patches = run(self.decompose, prepared.coarse, scene.cameras, None, 1.0)
         seen = run(self.warp, scene.views, scene.cameras, patches)
         photometric = run(self.gauge, run(self.factorize, seen, run(self.light, seen)))
         heights = run(self.align, run(self.integrate, photometric))
         surface = run(self.refine, heights)
-        yield Step(
-            scale=1.0,
-            last=True,
-            scene=scene,
-            silhouettes=silhouettes,
-            heights=heights,
-            surface=surface,
-        )
+        yield Step(scale=1.0, last=True, prepared=prepared, heights=heights, surface=surface)

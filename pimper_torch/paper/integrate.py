@@ -105,6 +105,8 @@ class Integrate(Stage):
     algorithms, PAMI 10(4), 1988.
     """
 
+    kept_as = DepthPatches
+
     def forward(self, photometric: PhotometricPatches) -> DepthPatches:
         """Return the height fields, ``valid`` inside enlarged triangles with data."""
         # A normal beyond the warp's limit is at a contour or wrong, and can bend its whole patch.

@@ -47,6 +47,8 @@ class Refine(Stage):
     the templates are constants.
     """
 
+    kept_as = Surface
+
     def __init__(self, config: RefineConfig | None = None) -> None:
         super().__init__()
         self.config = config or RefineConfig()

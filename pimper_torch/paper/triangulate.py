@@ -36,6 +36,8 @@ _MIN_ALTITUDE, _MIN_TIP_DEG, _MIN_COVERAGE = 0.08, 45.0, 0.6
 class Triangulate(Stage):
     """Triangulate reliable points of the cloud. Not differentiable."""
 
+    kept_as = CoarseMesh
+
     def __init__(self, config: TriangulateConfig | None = None) -> None:
         super().__init__()
         self.config = config or TriangulateConfig()

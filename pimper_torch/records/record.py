@@ -15,6 +15,7 @@ from torch.utils import _pytree as pytree
 
 from pimper_torch.records.value_checks import Faults
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.events import Event
 from pimper_torch.runtime.mapped import take_rows
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
@@ -295,7 +296,7 @@ def _summary(value: object) -> str:
     if isinstance(value, Record):
         axes = ", ".join(f"{axis} {size:,}" for axis, size in value.lengths().items())
         return f"{type(value).__name__}({axes})"
-    if isinstance(value, tuple) and value and isinstance(value[0], Record):
+    if isinstance(value, tuple) and value and isinstance(value[0], Record | Event):
         return f"{len(value)} {type(value[0]).__name__}"
     return _brief(value)
 

@@ -10,6 +10,7 @@ import pimper_torch.records as records
 from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Record
 from pimper_torch.runtime.config import require
+from pimper_torch.runtime.events import Event
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
@@ -71,7 +72,9 @@ def scaled(record: AnyRecord, factor: float) -> AnyRecord:
 
 def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: ANN401 - of any field
     """Scale the value of a field; each object is copied once."""
-    if isinstance(value, tuple) and any(isinstance(item, Record) for item in value):
+    if isinstance(value, records.StageReport):
+        return _scaled_report(value, factor)
+    if isinstance(value, tuple) and any(isinstance(item, Record | Event) for item in value):
         return tuple(_copy(item, factor, copies) for item in value)
     if not isinstance(value, Record):
         return value
@@ -92,10 +95,11 @@ def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: AN
             changes[field.name] = new
     if isinstance(record, records.SparseScene):
         changes["offset_world"] = tuple(factor * length for length in record.offset_world)
-    if isinstance(record, records.StageReport) and set(_FIGURES) & record.figures.keys():
-        figures = record.figures
-        changes["figures"] = {
-            name: factor * figure if name in _FIGURES else figure
-            for name, figure in figures.items()
-        }
     return copies.setdefault(id(record), record.replace(**changes) if changes else record)
+
+
+def _scaled_report(report: records.StageReport, factor: float) -> records.StageReport:
+    """Scale the figures of a report that are lengths."""
+    figures = report.figures
+    scaled = {name: factor * figures[name] for name in _FIGURES if name in figures}
+    return report.replace(figures=figures | scaled) if scaled else report

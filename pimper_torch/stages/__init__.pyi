@@ -1,5 +1,6 @@
 # Public names, imported on first use (`__init__.py`).
 __all__: list[str]
+from .coarse.depth_points import DepthPoints as DepthPoints
 from .coarse.remesh import Remesh as Remesh
 from .coarse.surface import CoarseSurface as CoarseSurface
 from .coarse.surface import facets_of as facets_of
@@ -16,8 +17,10 @@ from .photometry.fit_light import Illumination as Illumination
 from .photometry.gauge import FixGauge as FixGauge
 from .photometry.photometry_config import FactorizeConfig as FactorizeConfig
 from .photometry.photometry_config import FitLightConfig as FitLightConfig
+from .relighting.held_out import JudgeTextures as JudgeTextures
 from .relighting.held_out import Relight as Relight
 from .sfm.reconstruct import Reconstruct as Reconstruct
+from .silhouettes.explain import Explain as Explain
 from .silhouettes.find import FindSilhouettes as FindSilhouettes
 from .silhouettes.trace import TraceContours as TraceContours
 from .stage import Given as Given

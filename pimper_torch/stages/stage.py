@@ -33,7 +33,15 @@ class Stage(nn.Module):
 
     It computes on the device and in the dtype of these records: ``stage(views.to("cuda"))``.
     ``to`` and similar methods move parameters, as of a network, and warn if a stage has none.
+
+    Attributes:
+        kept_as: Class of the record, if a chain's store keeps it for later runs; ``None`` for
+            records that are computed faster than they are read.
+        kernels: Modules of compiled kernels that the stage waits for.
     """
+
+    kept_as: type[Record] | None = None
+    kernels: Sequence[str] = ()
 
     if TYPE_CHECKING:
 
@@ -81,16 +89,20 @@ class Given(Stage, Generic[T]):
 class Then(Stage):
     """Sequence of stages, each of which receives the record of the one before.
 
-    ``load_chain("default", warp=Then(Warp(), Mine()))`` inserts a stage after the warp.
+    ``load_chain("default", warp=Then(Warp(), Mine()))`` inserts a stage after the warp. The record
+    of the sequence is kept as that of its last stage.
     """
 
     def __init__(self, stage: nn.Module, *others: nn.Module) -> None:
         super().__init__()
         self.stage, self.others = stage, nn.ModuleList(others)
+        parts = [part for part in (stage, *others) if isinstance(part, Stage)]
+        self.kept_as = getattr((stage, *others)[-1], "kept_as", None)
+        self.kernels = tuple(name for part in parts for name in part.kernels)
 
-    def forward(self, *given: object) -> object:
+    def forward(self, *given: object, **named: object) -> object:
         """Return the record of the last stage."""
-        record = self.stage(*given)
+        record = self.stage(*given, **named)
         for other in self.others:
             record = other(record)
         return record

@@ -56,8 +56,8 @@ def digest(*values: object) -> str | None:
     memory layout does not, nor do fields excluded from comparison, such as paths of files.
 
     Args:
-        values: Records and other dataclasses, tensors, modules, functions, tuples, lists, mappings,
-            enums, paths, numbers, texts, bytes or ``None``.
+        values: Records and other dataclasses, tensors, modules, functions, classes, tuples, lists,
+            mappings, enums, paths, numbers, texts, bytes or ``None``.
 
     Returns:
         Hexadecimal; ``None`` for values such as code of other packages, or with gradients.
@@ -82,10 +82,10 @@ def _described(value: object) -> object:
         return [kind, _tensor(value)]
     if isinstance(value, float | complex | bytes | Path | Enum):
         return [kind, repr(value)]
-    if isinstance(value, types.FunctionType | nn.Module):
+    if isinstance(value, types.FunctionType | nn.Module | type):
         if not is_known(value.__module__):
             raise _UnknownError
-        if isinstance(value, types.FunctionType):
+        if not isinstance(value, nn.Module):
             return [kind, code(), _named(value)]
         public = {
             name: attribute

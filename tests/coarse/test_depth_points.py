@@ -9,7 +9,7 @@ from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.tensors import scene_of
 from pimper_torch.records import SparseScene
 from pimper_torch.runtime.errors import PimperWarning
-from pimper_torch.stages.coarse.depth_points import depth_points
+from pimper_torch.stages.coarse.depth_points import DepthPoints
 from pimper_torch.stages.sfm.triangulation import FEW_OBSERVED, lacks_points
 from tests.sfm.ball import cameras_on_an_arc, photographs
 
@@ -29,7 +29,7 @@ def test_depth_points_on_the_surface_are_added_to_existing_ones(scene):
     )
     assert lacks_points(given)
     with pytest.warns(PimperWarning, match="points come from depth maps"):
-        found = depth_points(given)
+        found = DepthPoints()(given)
     assert not lacks_points(found, FEW_OBSERVED)
     assert torch.equal(found.points_world[:2], own)
     assert bool(found.observed[:2].all())
@@ -48,7 +48,7 @@ def test_depth_points_are_inside_the_masks(scene):
     column = torch.arange(width).expand(height, width)
     masks = (column > 0.4 * width).expand(scene.cameras.num_views, -1, -1)
     with pytest.warns(PimperWarning, match="points come"):
-        found = depth_points(scene.replace(views=scene.views.replace(masks=masks)))
+        found = DepthPoints()(scene.replace(views=scene.views.replace(masks=masks)))
     assert float(found.observation_pixels[:, 0].min()) > 0.39 * width
 
 
@@ -57,4 +57,4 @@ def test_cameras_of_other_photographs_give_no_points(scene):
     cameras = scene.cameras.replace(cam_from_world=scene.cameras.cam_from_world[order])
     wrong = scene.replace(cameras=cameras)
     with pytest.warns(PimperWarning, match="No points: features do not match"):
-        assert depth_points(wrong) is wrong
+        assert DepthPoints()(wrong) is wrong

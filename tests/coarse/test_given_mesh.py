@@ -6,12 +6,12 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
+from pimper_torch.chains.prepare import in_scene
 from pimper_torch.geometry.local_frame import to_local
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import boundary_loops, face_components
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.records import Mesh, Silhouettes
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from pimper_torch.stages.coarse.given_mesh import oriented_outward, prepared
@@ -213,16 +213,15 @@ def test_background_points_do_not_count_against_a_mesh(scene, unknown, true_mesh
 
 def test_a_mesh_is_transformed_with_cameras_far_from_the_origin(scene, unknown, true_mesh):
     """Given photographs, it is in the frame of their model; given a scene, in that of the scene."""
-    chain = load_chain("default")
     far = scene.replace(offset_world=AWAY)
     brought = true_mesh.replace(
         vertices_world=true_mesh.vertices_world + torch.tensor(AWAY, dtype=torch.float64)
     )
-    plain = chain.given_mesh(true_mesh, scene, scene, unknown)
+    plain = in_scene(true_mesh, scene, scene, unknown)
     assert torch.equal(plain.vertices_world, true_mesh.vertices_world.float())
     for mesh, source in ((brought, scene.views), (true_mesh, far)):
-        found = chain.given_mesh(mesh, source, far, unknown)
+        found = in_scene(mesh, source, far, unknown)
         assert_close(found.vertices_world, plain.vertices_world, rtol=0, atol=1e-6)
-    assert chain.given_mesh(None, scene.views, far, unknown) is None
+    assert in_scene(None, scene.views, far, unknown) is None
     with pytest.warns(PimperWarning, match=r"deviates .*rays to 0 of \d+ "):
-        chain.given_mesh(exchanged(brought, 0, 2, 1), scene.views, far, unknown)
+        in_scene(exchanged(brought, 0, 2, 1), scene.views, far, unknown)

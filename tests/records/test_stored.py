@@ -18,6 +18,7 @@ from pimper_torch.chains.chain import Step
 from pimper_torch.records import Record, stored
 from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.runtime.errors import InputError, OutputError
+from pimper_torch.runtime.events import Event
 
 # Lengths of axes shared by fields; all different, so that exchanged axes are detected.
 AXES = {"patch": 2, "view": 3, "height": 4, "width": 5, "channel": 1, "vertex": 6, "face": 7}
@@ -46,7 +47,9 @@ def example(hint, generator, full=True):
     choices = [one for one in typing.get_args(hint) if one is not type(None)]
     if typing.get_origin(hint) in (tuple, dict):
         if typing.get_origin(hint) is dict:
-            return {"whole": 3, "half": 0.5, "open": math.inf}
+            texts = {"one": "é\ud800", "other": ""}
+            numbers = {"whole": 3, "half": 0.5, "open": math.inf}
+            return texts if typing.get_args(hint)[1] is str else numbers
         whole = typing.get_args(hint)
         items = choices[:1] * 2 if whole[-1] is Ellipsis else whole
         return tuple(example(item, generator, full) for item in items)
@@ -55,7 +58,7 @@ def example(hint, generator, full=True):
     if choices:
         empty = not full and type(None) in typing.get_args(hint)
         return None if empty else example(choices[-1 if full else 0], generator, full)
-    if isinstance(hint, type) and issubclass(hint, Record):
+    if isinstance(hint, type) and issubclass(hint, Record | Event):
         hints = typing.get_type_hints(hint)
         fields = [
             one for one in dataclasses.fields(hint) if full or one.default is dataclasses.MISSING

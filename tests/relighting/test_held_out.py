@@ -3,12 +3,12 @@ import math
 import pytest
 import torch
 
-from pimper_torch.chains.coarse_to_fine import split_held_out
+from pimper_torch.chains.prepare import split_held_out
 from pimper_torch.export.reports import relighting_report
 from pimper_torch.geometry.poisson import reduced
 from pimper_torch.records import Silhouettes
 from pimper_torch.runtime.errors import ConfigError
-from pimper_torch.stages.relighting.held_out import Relight, judge_textures
+from pimper_torch.stages.relighting.held_out import JudgeTextures, Relight
 from pimper_torch.stages.texturing.bake import textured
 from tests.relighting.ball import ball_mesh, photographed
 
@@ -77,7 +77,7 @@ def test_textures_predict_photographs_better_than_vertices_of_few_faces(scene):
     few = reduced(full, 1200)
     found = Relight()(few, scene, None)
     asset = textured(full, few, found.materials.at_vertices())
-    errors = judge_textures(found, asset, scene, None)
+    errors = JudgeTextures()(found, asset, scene, None)
     coarse, fine = found.errors.psnr_db.mean(), errors.textured.psnr_db.mean()
     assert fine > coarse + 1
     assert fine > 45  # eight bits per texel

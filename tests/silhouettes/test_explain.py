@@ -4,10 +4,11 @@ import torch
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import PimperWarning
-from pimper_torch.stages.silhouettes.explain import explain
+from pimper_torch.stages.silhouettes.explain import Explain
 from pimper_torch.stages.silhouettes.trace import TraceContours
 from tests.silhouettes.shapes import ball, silhouettes_of
 
+explain = Explain()
 NAMES = [f"{number:02}.png" for number in range(20)]
 
 

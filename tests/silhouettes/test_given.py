@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
+from pimper_torch.chains.prepare import locate
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.decode import rotated
 from pimper_torch.records import CameraModel, SilhouettePrior, Views
@@ -236,12 +237,12 @@ def test_a_chain_recomputes_cameras_with_the_corrected_masks(scene, truth):
     stage, views = Placed(scene), hard(scene.views, truth.flip(1, 2))
     chain = CoarseToFine(reconstruct=stage)
     with pytest.warns(PimperWarning, match="half turn"):
-        placed = chain.placed(chain.running(), views, None)
+        placed = locate(chain, chain.running(), views)[0]
     assert torch.equal(stage.asked[0].masks, views.masks)
     assert torch.equal(stage.asked[1].masks, truth)
     assert torch.equal(placed.views.masks, truth)
     with pytest.warns(PimperWarning, match="half turn"):
-        given = chain.placed(chain.running(), scene.replace(views=views), None)
+        given = locate(chain, chain.running(), scene.replace(views=views))[0]
     assert torch.equal(given.views.masks, truth)
     assert len(stage.asked) == 2
 
@@ -251,5 +252,5 @@ def test_a_chain_without_silhouettes_ignores_masks(scene, truth):
     chain, views = CoarseToFine(config), hard(scene.views, ~truth)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        placed = chain.placed(chain.running(), scene.replace(views=views), None)
+        placed = locate(chain, chain.running(), scene.replace(views=views))[0]
     assert torch.equal(placed.views.masks, ~truth)

@@ -3,11 +3,12 @@
 import pytest
 import torch
 
+from pimper_torch.chains.running import called
 from pimper_torch.records import Cameras, Failure, StageReport
 from pimper_torch.runtime.errors import PimperWarning, caution
 from pimper_torch.runtime.failures import collecting, skipped
 from pimper_torch.runtime.ledger import leave_out
-from pimper_torch.runtime.reporting import SilentObserver, called, recorded
+from pimper_torch.runtime.reporting import SilentObserver, recorded
 from pimper_torch.store import Store, digest, kept
 
 

@@ -22,6 +22,7 @@ from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.stages.coarse.densify import DepthMaps, count_agreeing, depth_maps, nearest_pixels
 from pimper_torch.stages.coarse.window_matching import Matcher, pair
+from pimper_torch.stages.stage import Stage
 
 # Candidate points that fill space, and steps of inverse depth along each ray. Choices: more take
 # memory, because each candidate is compared with all views.
@@ -42,31 +43,34 @@ _MIN_CONFIRMED = 0.5
 _LEVELS = 4
 
 
-@torch.no_grad()
-def depth_points(scene: SparseScene) -> SparseScene:
-    """Add to a scene the points of depth maps that at least three views see.
+class DepthPoints(Stage):
+    """Add to a scene the points of depth maps that at least three views see."""
 
-    Returns:
-        The scene with more points and the same cameras. Not differentiable. A
-        :class:`~pimper_torch.runtime.errors.PimperWarning` gives the number of points.
-    """
-    candidates = _candidates(scene)
-    index = torch.arange(len(candidates.points_world), device=candidates.points_world.device)
-    if len(index) == 0:
-        _warn(scene, 0)
-        return scene
-    maps = depth_maps(candidates, index, _LEVELS)[-1]
-    once, twice = (int((maps.agreed >= count).sum()) for count in (1, 2))
-    confirmed = twice >= _MIN_CONFIRMED * max(once, 1)
-    leave_out("depth_points.disagreement", not confirmed)
-    if not confirmed:
-        _warn(scene, 0)
-        return scene
-    per_view = [_tracks_of(scene, maps, view) for view in range(scene.cameras.num_views)]
-    pixels, seen = (torch.cat(tracks) for tracks in zip(*per_view, strict=True))
-    result = _with_tracks(scene, pixels, seen)
-    _warn(result, len(result.points_world) - len(scene.points_world))
-    return result
+    kept_as = SparseScene
+
+    @torch.no_grad()
+    def forward(self, scene: SparseScene) -> SparseScene:
+        """Return the scene with more points and the same cameras. Not differentiable.
+
+        A :class:`~pimper_torch.runtime.errors.PimperWarning` gives the number of points.
+        """
+        candidates = _candidates(scene)
+        index = torch.arange(len(candidates.points_world), device=candidates.points_world.device)
+        if len(index) == 0:
+            _warn(scene, 0)
+            return scene
+        maps = depth_maps(candidates, index, _LEVELS)[-1]
+        once, twice = (int((maps.agreed >= count).sum()) for count in (1, 2))
+        confirmed = twice >= _MIN_CONFIRMED * max(once, 1)
+        leave_out("depth_points.disagreement", not confirmed)
+        if not confirmed:
+            _warn(scene, 0)
+            return scene
+        per_view = [_tracks_of(scene, maps, view) for view in range(scene.cameras.num_views)]
+        pixels, seen = (torch.cat(tracks) for tracks in zip(*per_view, strict=True))
+        result = _with_tracks(scene, pixels, seen)
+        _warn(result, len(result.points_world) - len(scene.points_world))
+        return result
 
 
 def _warn(scene: SparseScene, count: int) -> None:

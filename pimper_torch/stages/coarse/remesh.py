@@ -30,6 +30,8 @@ _MIN_AREA, _MAX_STRETCH = 0.05, 4.0
 class Remesh(Stage):
     """Fit the coarse mesh to a surface; see :func:`remesh`."""
 
+    kept_as = CoarseMesh
+
     def __init__(self, config: RemeshConfig | None = None) -> None:
         super().__init__()
         self.config = config or RemeshConfig()

@@ -42,6 +42,8 @@ _MIN_TRACK, _MAX_ERROR_PX, _MIN_ANGLE_DEG = 3, 1.5, 4.0
 class CoarseSurface(Stage):
     """Compute the coarse mesh of the object, a few thousand facets. Not differentiable."""
 
+    kept_as = CoarseMesh
+
     def __init__(self, config: CoarseSurfaceConfig | None = None) -> None:
         super().__init__()
         self.config = config or CoarseSurfaceConfig()

@@ -18,6 +18,7 @@ from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.subdivision import Subdivision, transferred
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.kernels.compile import SURFACE
 from pimper_torch.linalg.continuation import about_mean, enclosed
 from pimper_torch.linalg.sums import average
 from pimper_torch.records import Convergence, Record, StopCause, Surface, SweptPatches
@@ -89,6 +90,9 @@ class Fuse(Stage):
     the cloud, through every solve. Constant: positions of vertices on facets, and the selection of
     patches, samples, edges and faces.
     """
+
+    kept_as = Surface
+    kernels = SURFACE
 
     def __init__(
         self, config: FuseConfig | None = None, terms: Sequence[nn.Module] | None = None

@@ -157,6 +157,8 @@ class _Swept(Record):
 class DepthFromLight(Stage):
     """Estimate points of the surface inside the visual hull from shading. Not differentiable."""
 
+    kept_as = OrientedPoints
+
     @torch.no_grad()
     def forward(
         self, scene: SparseScene, contours: Contours, mesh: Mesh, field: LightField

@@ -36,6 +36,8 @@ class Extract(Stage):
     Differentiable in vertices, normals, albedo and confidence; the selection of faces is constant.
     """
 
+    kept_as = Mesh
+
     def __init__(self, config: ExtractConfig | None = None) -> None:
         super().__init__()
         self.config = config or ExtractConfig()

@@ -25,6 +25,8 @@ _MAX_LEVELS, _MAX_CONFIDENCE, _MAX_RATIO = 8.0, 0.1, 0.1
 class Simplify(Stage):
     """Simplify a surface to the vertices that its shape needs, and cap its borders if requested."""
 
+    kept_as = FinishedMesh
+
     def forward(self, mesh: Mesh, files: MeshFiles) -> FinishedMesh:
         """Prepare a surface for writing."""
         how, moved = "", dict[str, int | float]()

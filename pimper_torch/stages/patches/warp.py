@@ -24,6 +24,7 @@ from pimper_torch.geometry.pyramids import (
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.kernels.arrays import as_array, pulled_back
+from pimper_torch.kernels.compile import PHOTOMETRY
 from pimper_torch.kernels.signatures import FractionRows, PictureRows, Projection, Samples
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.records import (
@@ -165,6 +166,8 @@ class Warp(Stage):
 
     Differentiable in the images and in the templates' depth; the mask of valid samples is constant.
     """
+
+    kernels = PHOTOMETRY
 
     def __init__(self, config: WarpConfig | None = None) -> None:
         super().__init__()

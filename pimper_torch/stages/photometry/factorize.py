@@ -115,6 +115,8 @@ class Factorize(Stage):
     and a room's harmonics over its ambient light.
     """
 
+    kept_as = PhotometricPatches
+
     def __init__(
         self, config: FactorizeConfig | None = None, priors: Sequence[nn.Module] | None = None
     ) -> None:

@@ -60,6 +60,8 @@ class FitLight(Stage):
     colours and exposures of views, and a room's harmonics over its ambient light, are constant.
     """
 
+    kept_as = Illumination
+
     def __init__(self, config: FitLightConfig | None = None) -> None:
         super().__init__()
         self.config = config or FitLightConfig()

@@ -66,6 +66,8 @@ def psnr(predicted: Radiance, radiance: Radiance) -> float:
 class Relight(Stage):
     """Fit lights and materials to photographs, and predict these or others with them."""
 
+    kept_as = Relighting
+
     def forward(
         self,
         mesh: Mesh,
@@ -100,16 +102,25 @@ class Relight(Stage):
         )
 
 
-def judge_textures(
-    relighting: Relighting, asset: TexturedMesh, scene: SparseScene, silhouettes: Silhouettes | None
-) -> Relighting:
+class JudgeTextures(Stage):
     """Add the errors of the textured surface under the same lights."""
-    surface = TexturedSurface(asset)
-    observed = observe_all(surface, scene, silhouettes)
-    errors, materials = relighting.errors, relighting.materials
-    copied = materials.replace(cluster=materials.cluster[asset.vertex])
-    textured = view_errors(surface, observed, errors.names, errors.lights, copied)
-    return relighting.replace(textured=textured)
+
+    kept_as = Relighting
+
+    def forward(
+        self,
+        relighting: Relighting,
+        asset: TexturedMesh,
+        scene: SparseScene,
+        silhouettes: Silhouettes | None,
+    ) -> Relighting:
+        """Return the lights and materials, with the errors of the asset in the same views."""
+        surface = TexturedSurface(asset)
+        observed = observe_all(surface, scene, silhouettes)
+        errors, materials = relighting.errors, relighting.materials
+        copied = materials.replace(cluster=materials.cluster[asset.vertex])
+        textured = view_errors(surface, observed, errors.names, errors.lights, copied)
+        return relighting.replace(textured=textured)
 
 
 def view_errors(

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.supporting_plane import PLANE_TOLERANCE
 from pimper_torch.geometry.visual_hull import bounding_box, margins, visual_hull
+from pimper_torch.kernels.compile import COARSE
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.records.scene import ViewPerPose, with_views
 from pimper_torch.records.shapes import ViewMask
@@ -38,6 +39,9 @@ _BY_HULL = "The hull of the other masks replaces them, and they do not constrain
 
 class FindSilhouettes(Stage):
     """Find the object's silhouette in every view. Not differentiable."""
+
+    kept_as = Silhouettes
+    kernels = COARSE
 
     def __init__(self, config: SilhouetteConfig | None = None) -> None:
         super().__init__()

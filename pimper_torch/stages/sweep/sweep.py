@@ -55,6 +55,8 @@ class Sweep(Stage):
     cost. The selected views and heights are constant.
     """
 
+    kept_as = SweptPatches
+
     def __init__(self, config: SweepConfig | None = None) -> None:
         super().__init__()
         self.config = config or SweepConfig()

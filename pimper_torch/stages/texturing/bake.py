@@ -27,6 +27,8 @@ _TEXELS_PER_SIDE = 1.5
 class Texture(Stage):
     """Bake a surface and its materials onto a simplified mesh, see :func:`textured`."""
 
+    kept_as = TexturedMesh
+
     def forward(self, full: Mesh, few: Mesh, relighting: Relighting) -> TexturedMesh:
         """Bake the textures.
 
