@@ -17,10 +17,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from coarse_cut import cut_surface
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.metrics import pair_views, similarity_between_cameras, transfer
@@ -29,10 +27,9 @@ from pimper_bench.metrics.surface_distances import TrueSurface
 from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.poisson import reduced
 from pimper_torch.geometry.rigid import transform
-from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.undistortion import undistorted
 from pimper_torch.io.photographs import load_views
-from pimper_torch.records import ContourPoints, Mesh, Silhouettes, SparseScene
+from pimper_torch.records import Mesh, Silhouettes, SparseScene
 from pimper_torch.runtime.errors import PimperWarning
 from pimper_torch.stages.coarse.fine_surface import (
     REACH_PX,
@@ -41,12 +38,11 @@ from pimper_torch.stages.coarse.fine_surface import (
     cropped,
     poisson,
 )
-from pimper_torch.stages.coarse.oriented import OrientedPoints, matched_cloud
+from pimper_torch.stages.coarse.oriented import matched_cloud
 from pimper_torch.stages.coarse.reference import reference_view
 from pimper_torch.stages.coarse.surface import CoarseSurface, reliable_points
 from pimper_torch.stages.coarse.trim import (
     CELL_PX,
-    point_distances,
     seen_surface,
     supports,
     view_counts,
@@ -55,9 +51,6 @@ from pimper_torch.stages.sfm.reconstruct import Reconstruct
 from pimper_torch.stages.silhouettes.trace import TraceContours
 
 Surface = tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
-
-# Facets of the cut count if they are this many pixels from all points and contours.
-_UNKNOWN_PX = 8.0
 
 
 def main() -> None:
@@ -106,7 +99,6 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
     away, cell = TOLERANCE_PX * pixel, CELL_PX * pixel
     cloud = cloud.take(hull.depth_of(cloud.points_world) > -away)
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
-    joined = OrientedPoints.cat([cloud, _oriented(contour)])
 
     def given(masked: bool) -> Surface:
         some = scene.replace(views=scene.views.replace(masks=silhouettes.masks if masked else None))
@@ -127,35 +119,12 @@ def ways(scene: SparseScene, silhouettes: Silhouettes) -> dict[str, Callable[[],
         few = reduced(mesh, builder.config.num_facets)
         return few.vertices_world, few.faces
 
-    def both() -> Surface:
-        corners, cells = cut_surface(cloud, maps, hull, contour)
-        centre, normals = corners[cells].mean(dim=1), face_normals(corners, cells)
-        unknown = point_distances(centre, joined.points_world) > _UNKNOWN_PX * pixel
-        unknown &= hull.depth_of(centre) > hull.spacing
-        filled = OrientedPoints(
-            points_world=centre[unknown],
-            normals_world=normalize(normals[unknown], dim=1),
-            noise=torch.zeros(int(unknown.sum())),
-        )
-        return poisson(OrientedPoints.cat([joined, filled]), cell)
-
     return {
         "no silhouettes": lambda: given(False),
         "no silhouettes, photographs masked": lambda: given(True),
         "Poisson of points": lambda: facets(poisson(cloud, cell)),
-        "min-cut of points": lambda: facets(cut_surface(cloud, maps, hull)),
-        "min-cut of points and contours": lambda: facets(cut_surface(cloud, maps, hull, contour)),
-        "Poisson of points, contours, and the cut between": lambda: facets(both()),
         "Poisson of points and contours": lambda: facets((vertices, faces)),
     }
-
-
-def _oriented(contour: ContourPoints) -> OrientedPoints:
-    return OrientedPoints(
-        points_world=contour.points_world,
-        normals_world=contour.normals_world,
-        noise=contour.variance.sqrt(),
-    )
 
 
 class Judge:

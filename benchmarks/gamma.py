@@ -1,27 +1,18 @@
-"""Gamma from the factorization's residual: matrices with known gamma, and photographs.
+"""Gamma from the factorization's residual, of matrices with known gamma.
 
-    python benchmarks/gamma.py FOLDER
-
-FOLDER contains `uw_ps/images` (the UW photometric stereo set) and
-`yale_b02/photometrics_images/yaleB02` (a face of the Yale database B).
+python benchmarks/gamma.py [--seeds 4]
 """
 
 import argparse
 import time
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from one_viewpoint import read_uw_ps, read_yale_b
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.radiometry import Gamma, Linear, Srgb
-from pimper_torch.single_view.factorization.estimate_gamma import (
-    GammaEstimate,
-    estimate_gamma,
-    gamma_of_photographs,
-)
+from pimper_torch.single_view.factorization.estimate_gamma import estimate_gamma
 
 CURVES = {
     "linear": Linear(),
@@ -30,8 +21,6 @@ CURVES = {
     "sRGB": Srgb(),
 }
 NOISE = (0.0, 0.005, 0.01)
-SEEDS = 4
-OBJECTS = ("gray", "cat", "horse", "buddha")
 
 
 def radiance(ambient: float, generator: torch.Generator) -> Float[Tensor, "16 400"]:
@@ -48,10 +37,10 @@ def radiance(ambient: float, generator: torch.Generator) -> Float[Tensor, "16 40
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder
+    parser.add_argument("--seeds", type=int, default=4)
+    seeds = parser.parse_args().seeds
     torch.set_num_threads(1)
     print("| curve | ambient | rank | noise, % | gamma | spread | standard error | CPU s |")  # noqa: T201
     print("|---|--:|--:|--:|--:|--:|--:|--:|")  # noqa: T201
@@ -59,13 +48,13 @@ def main() -> None:
         for name, curve in CURVES.items():
             for noise in NOISE:
                 began, found = time.process_time(), []
-                for seed in range(SEEDS):
+                for seed in range(seeds):
                     generator = torch.Generator().manual_seed(seed)
                     clean = curve.encoded_from_linear(radiance(ambient, generator))
                     drawn = torch.randn(clean.shape, generator=generator, dtype=clean.dtype)
                     values = (clean + noise * drawn).clamp(0, 1)
                     found.append(estimate_gamma(values, values >= 0, rank=rank))
-                seconds = (time.process_time() - began) / SEEDS
+                seconds = (time.process_time() - began) / seeds
                 gammas = torch.tensor([one.gamma for one in found])
                 errors = torch.tensor([one.standard_error for one in found])
                 print(  # noqa: T201
@@ -73,24 +62,6 @@ def main() -> None:
                     f"| {gammas.std():.3f} | {errors.mean():.3f} | {seconds:.1f} |",
                     flush=True,
                 )
-    print()  # noqa: T201
-    print("| photographs | rank | gamma | residual, % | if linear | if sRGB | told |")  # noqa: T201
-    print("|---|--:|--:|--:|--:|--:|---|")  # noqa: T201
-    captures = {name: read_uw_ps(folder / "uw_ps" / "images", name) for name in OBJECTS}
-    face = folder / "yale_b02" / "photometrics_images" / "yaleB02"
-    captures["yaleB02"] = read_yale_b(face, subtract_ambient=False)
-    for name, capture in captures.items():
-        for rank in (3, 4):
-            print(row(name, rank, gamma_of_photographs(capture.views, rank=rank)), flush=True)  # noqa: T201
-
-
-def row(name: str, rank: int, found: GammaEstimate) -> str:
-    """Write an estimate as a row."""
-    return (
-        f"| {name} | {rank} | {found.gamma:.2f} ± {found.standard_error:.2f} "
-        f"| {100 * found.residual:.2f} | {100 * found.residual_linear:.2f} "
-        f"| {100 * found.residual_srgb:.2f} | {'yes' if found.determined else 'no'} |"
-    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Time and memory of gradients, for each stage and for the whole chain.
 
-    python benchmarks/gradient_cost.py SCENE [--scales 0.25 0.5] [--only factorize chain]
+    PYTHONPATH=tests/helpers python benchmarks/gradient_cost.py SCENE [--only factorize chain]
 
 SCENE is a folder of `pimper render`; cameras and masks are true. Each stage gets the inputs of the
 chain's last pass. It runs first without gradients, then with gradients of all results (the sum of

@@ -1,8 +1,10 @@
 """Compare the gradients of every stage and of the whole chain with finite differences.
 
-Run as ``python benchmarks/gradients.py``; prints a Markdown table. On a small closed-form scene in
-float64, or on ``--scene``, a folder of `pimper render`: the derivative of a random sum of each
-output along random directions of each input, the ratio of autograd to central differences.
+    PYTHONPATH=tests/helpers python benchmarks/gradients.py
+
+Prints a Markdown table. On a small closed-form scene in float64, or on ``--scene``, a folder of
+`pimper render`: the derivative of a random sum of each output along random directions of each
+input, the ratio of autograd to central differences.
 ``--config`` and ``--scales`` choose the chain, ``--only`` the stages.
 """
 

@@ -14,16 +14,22 @@ survive.
 import argparse
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
 import matplotlib as mpl
+import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from matplotlib import pyplot as plt
-from one_viewpoint import NormalMap, read_normal_map
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from pimper_bench.datasets.diligent import facing_us
+from pimper_bench.datasets.raster import intrinsics_from_indices
+from pimper_torch.io.decode import decode
+from pimper_torch.io.photographs import read_mask
 from pimper_torch.paper.integrate import differences
 from pimper_torch.single_view.integration.normal_map import IntegratedMap, integrate_normal_map
 from pimper_torch.single_view.integration.raster_system import RasterSystem
@@ -86,6 +92,45 @@ def row(name: str, errors: Mapping[str, float], seconds: str) -> None:
         f"{error:.3f}" for error in (*errors.values(), fmean(errors.values()), fmean(determined))
     )
     print(f"| {name} | {cells} | {seconds} |", flush=True)  # noqa: T201
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NormalMap:
+    """A normal map to integrate, with the known data of its surface.
+
+    Attributes:
+        normals: Unit, facing the viewer (``n_z < 0``), camera frame; zero off the mask.
+        mask: True on the object.
+        intrinsics: ``K`` in our pixels; ``None`` for an orthographic map.
+        depth: True depth along the camera's z, millimetres; infinite where unknown.
+    """
+
+    normals: Float[Tensor, "height width 3"]
+    mask: Bool[Tensor, "height width"]
+    intrinsics: Float[Tensor, "3 3"] | None
+    depth: Float[Tensor, "height width"] | None
+
+
+def read_normal_map(folder: Path) -> NormalMap:
+    """Read a normal map as the bilateral-integration set distributes it.
+
+    ``normal_map.png`` holds ``(n + 1) / 2`` with y up and z towards the viewer; ``K.txt``, which
+    counts pixel centres from 0, and ``depth_gt.npz`` are optional. On the five DiLiGenT objects the
+    turned normals agree with those of the true depth to 0.8 to 3.9 degrees in the mean, and with no
+    other choice of signs to better than 38.
+    """
+    mask = read_mask(folder / "mask.png")
+    normals = facing_us(decode(folder / "normal_map.png").samples.movedim(0, -1) * 2 - 1)
+    K, depth = folder / "K.txt", None
+    if (folder / "depth_gt.npz").is_file():
+        known = torch.from_numpy(np.load(folder / "depth_gt.npz")["depth_gt"].astype(np.float32))
+        depth = torch.where(known.isfinite() & (known > 0), known, torch.inf)
+    return NormalMap(
+        normals=torch.where(mask[..., None], normals, 0),
+        mask=mask,
+        intrinsics=intrinsics_from_indices(torch.from_numpy(np.loadtxt(K))) if K.exists() else None,
+        depth=depth,
+    )
 
 
 def integrate(one: NormalMap, method: str) -> IntegratedMap:

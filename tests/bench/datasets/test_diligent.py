@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import scipy.io
 import torch
-from one_viewpoint import read_normal_map, read_uw_ps, read_yale_b
 from PIL import Image
 from torch.nn.functional import normalize
 from torch.testing import assert_close
@@ -123,72 +122,3 @@ def test_a_different_layout_is_refused_with_expected_and_found_files(turntable, 
     break_it(turntable)
     with pytest.raises(InputError, match=message):
         read_diligent_mv(turntable)
-
-
-def test_a_normal_map_has_its_depth_and_pinhole(tmp_path, paint_deep):
-    levels = [round((component + 1) / 2 * 65535) for component in (0.6, 0.0, 0.8)]
-    paint_deep(tmp_path / "normal_map.png", levels, WIDTH, HEIGHT)
-    mask = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    mask[2:5] = 255
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    found = read_normal_map(tmp_path)
-    assert found.intrinsics is None
-    assert found.depth is None
-    np.savetxt(tmp_path / "K.txt", [[900.0, 0, 9.5], [0, 890, 7.5], [0, 0, 1]])
-    depth = np.full((HEIGHT, WIDTH), np.nan)
-    depth[2:5] = 1500
-    np.savez(tmp_path / "depth_gt.npz", depth_gt=depth)
-    found = read_normal_map(tmp_path)
-    assert found.intrinsics.tolist() == [[900, 0, 10], [0, 890, 8], [0, 0, 1]]  # the very centre
-    assert_close(found.normals[3, 4], torch.tensor([0.6, 0, -0.8]), atol=1e-4, rtol=0)
-    assert found.normals[8].abs().sum() == 0
-    assert found.depth[3, 4] == 1500
-    assert found.depth[8, 4].isposinf()
-
-
-def test_a_depth_file_with_pickled_objects_is_refused(tmp_path, paint_deep):
-    paint_deep(tmp_path / "normal_map.png", (65535, 32768, 32768), WIDTH, HEIGHT)
-    Image.fromarray(np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)).save(tmp_path / "mask.png")
-    np.savez(tmp_path / "depth_gt.npz", depth_gt=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match=r"depth_gt\.npz: cannot be read"):
-        read_normal_map(tmp_path)
-
-
-def test_the_uw_set_is_read_by_its_lists(tmp_path, paint):
-    for number in range(3):
-        paint(tmp_path / "cat" / f"cat.{number}.png", 40 * number + 10)
-    paint(tmp_path / "cat" / "cat.mask.png", 235)
-    names = "\n".join([*(f"cat.{number}.png" for number in range(3)), "cat.mask.png"])
-    (tmp_path / "cat" / "cat.txt").write_text(f"3\n{names}\n")
-    rows = "\n".join(" ".join(str(x) for x in row) for row in DIRECTIONS)
-    (tmp_path / "lights.txt").write_text(f"Header: ../images/chrome/chrome.txt\n3\n{rows}\n")
-    capture = read_uw_ps(tmp_path, "cat")
-    assert capture.views.names == ("cat.0.png", "cat.1.png", "cat.2.png")
-    assert_close(
-        capture.truth.lights_world[:, 1:],
-        torch.tensor([[0.6, 0, -0.8], [0, -0.6, -0.8], [0, 0, -1]]),
-    )
-    with pytest.raises(InputError, match=r"dog/dog\.txt.*Found: cat, lights\.txt"):
-        read_uw_ps(tmp_path, "dog")
-    (tmp_path / "cat" / "cat.txt").write_text("4\n" + names)
-    with pytest.raises(InputError, match=r"'4' and 4 names"):
-        read_uw_ps(tmp_path, "cat")
-
-
-def test_lights_of_a_yale_face_are_read_from_file_names(tmp_path, paint):
-    paint(tmp_path / "yaleB02_P00A+090E+00.pgm", 100, mode="L")
-    paint(tmp_path / "yaleB02_P00A-000E+90.pgm", 60, mode="L")
-    paint(tmp_path / "yaleB02_P00_Ambient.pgm", 10, mode="L")
-    capture = read_yale_b(tmp_path)
-    # Positive azimuth is the left of the image, positive elevation above.
-    assert_close(
-        capture.truth.lights_world[:, 1:],
-        torch.tensor([[-1.0, 0, 0], [0, -1, 0]]),
-        atol=1e-6,
-        rtol=0,
-    )
-    assert_close(capture.views.images[:, 0, -1, -1], torch.tensor([90.0, 50.0]) / 255)
-    kept = read_yale_b(tmp_path, subtract_ambient=False)
-    assert_close(kept.views.images[:, 0, -1, -1], torch.tensor([100.0, 60.0]) / 255)
-    with pytest.raises(InputError, match=r"yaleB02_P00A\+035E-20\.pgm"):
-        read_yale_b(tmp_path / "..")

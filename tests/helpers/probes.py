@@ -380,7 +380,7 @@ def _probe(paths: _Paths, function: Callable[..., Any], arguments: tuple[Any, ..
     return Probe(function=moved, inputs=inputs, scales=scales)
 
 
-def _tensors(value: Any, path: str) -> list[Tensor]:  # noqa: ANN401 - records and tuples of them
+def _tensors(value: Any, path: str) -> list[Tensor]:
     """Return the tensors at a path; none where it ends in ``None``."""
     found = [value]
     for name in path.split("."):
@@ -394,7 +394,7 @@ def _tensors(value: Any, path: str) -> list[Tensor]:  # noqa: ANN401 - records a
     return [one for one in found if one is not None]
 
 
-def _replaced(value: Any, path: list[str], tensors: Iterator[Tensor]) -> Any:  # noqa: ANN401
+def _replaced(value: Any, path: list[str], tensors: Iterator[Tensor]) -> Any:
     """Replace the tensors that :func:`_tensors` gives, in their order."""
     if not path:
         return next(tensors)
