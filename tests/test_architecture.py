@@ -41,7 +41,7 @@ SOLE_IMPORTERS = {
     "numba": {"kernels/compile.py"},
     "yaml": {"runtime/config.py"},
     "tyro": {"cli/", "pimper_bench/cli/"},
-    "matplotlib": {"viz/", "pimper_bench/bench/contact_sheet.py"},
+    "matplotlib": {"viz/", "pimper_bench/table/contact_sheet.py"},
     "viser": {"viewer/"},
     "pxr": {"io/assets/usd.py"},
     "onnxruntime": {"priors/network.py"},
@@ -136,7 +136,7 @@ def project(folder: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("package", [PACKAGE, BENCH], ids=lambda package: package.name)
 def test_every_imported_package_is_declared(package):
-    declaring = project(ROOT if package == PACKAGE else ROOT / "bench")
+    declaring = project(ROOT if package == PACKAGE else ROOT / "benchmarks")
     extras = declaring.get("optional-dependencies", {})
     needed = [entry for name in extras for entry in extras[name] if name not in ("test", "docs")]
     needed += declaring["dependencies"]
@@ -152,12 +152,12 @@ def test_distributions_changelog_and_citation_have_one_version():
     headings = re.findall(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
     assert next(one for one in headings if one != "Unreleased").startswith(f"[{version}] - ")
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
-    assert project(ROOT / "bench")["version"] == version
-    assert f"pimper_torch=={version}" in project(ROOT / "bench")["dependencies"]
+    assert project(ROOT / "benchmarks")["version"] == version
+    assert f"pimper_torch=={version}" in project(ROOT / "benchmarks")["dependencies"]
 
 
 def test_commands_without_installation_match_the_installed_ones():
-    assert project(ROOT / "bench")["entry-points"]["pimper.commands"] == OF_BENCH
+    assert project(ROOT / "benchmarks")["entry-points"]["pimper.commands"] == OF_BENCH
 
 
 def loaded_by(statement: str) -> set[str]:

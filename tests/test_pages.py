@@ -19,12 +19,12 @@ DOCS = ROOT / "docs"
 PACKAGES = [Path(package.__file__).parent for package in (pimper_torch, pimper_bench)]
 PAGES = (
     *sorted(DOCS.glob("*.md")),
-    *(ROOT / folder / "README.md" for folder in ("", "bench", "benchmarks")),
+    *(ROOT / folder / "README.md" for folder in ("", "benchmarks")),
 )
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#{1,4} (.+)$", flags=re.MULTILINE)
 MODULE = re.compile(r"^\.\. automodule:: (\S+)$", flags=re.MULTILINE)
-SCRIPT = re.compile(r"^    .*?python (benchmarks/\w+\.py)(.*)$", flags=re.MULTILINE)
+SCRIPT = re.compile(r"^    .*?python (benchmarks/studies/\w+\.py)(.*)$", flags=re.MULTILINE)
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 
 # The site gets these pages from other places.

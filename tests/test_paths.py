@@ -23,7 +23,7 @@ def functions() -> Iterator[typing.Any]:
         subpackage = importlib.import_module(f"pimper_bench.{name}")
         yield from (getattr(subpackage, exported) for exported in subpackage.__all__)
     inner = (f"pimper_torch.{name}" for name in ("store.store", *modules()))
-    for name in (*inner, "pimper_bench.bench.run_bench"):
+    for name in (*inner, "pimper_bench.table.run_bench"):
         module = importlib.import_module(name)
         for found in vars(module).values():
             if getattr(found, "__module__", None) == module.__name__:

@@ -26,7 +26,7 @@ DOCUMENTS = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs").rglob("*.rst")),
-    *(ROOT / folder / "README.md" for folder in ("bench", "benchmarks")),
+    ROOT / "benchmarks" / "README.md",
     *sorted((ROOT / "notebooks").glob("*.ipynb")),
 ]
 CODE = re.compile(r"`(?:--|pip|pimper |pt\.|\w+[./(]|--)|:\w+:`|>>>")
@@ -116,13 +116,13 @@ def file(text: str) -> None:
 
 @functools.cache
 def every_file() -> list[Path]:
-    kept = ("bench", "benchmarks", "configs", "docs", "notebooks", "pimper_torch", "tests", ".ci")
+    kept = ("benchmarks", "configs", "docs", "notebooks", "pimper_torch", "tests", ".ci")
     return [path for folder in kept for path in (ROOT / folder).rglob("*.*")]
 
 
 @functools.cache
 def options_of_benchmarks() -> set[str]:
-    scripts = (ROOT / "benchmarks").glob("*.py")
+    scripts = (ROOT / "benchmarks" / "studies").glob("*.py")
     return {x for path in scripts for x in re.findall(r'"(--[a-z-]+)"', path.read_text("utf-8"))}
 
 

@@ -9,7 +9,7 @@ from pimper_torch.runtime.memory import resident_bytes
 
 # Bytes per vertex of the fusion in the last pass, in addition to the memory of the process at the
 # start of the first pass: 0.8 kB in the demo and for a jar of 0.7 million vertices, 1.2 kB for one
-# of 3.0 million (benchmarks/speed.py).
+# of 3.0 million (benchmarks/studies/speed.py).
 _BYTES_PER_VERTEX = 1200
 
 # Bytes of the fusion by blocks: per vertex for the coarser mesh, which is solved in one piece; per

@@ -178,7 +178,7 @@ def _no_command(name: str) -> str:
     if name in OF_BENCH:
         return (
             f"`pimper {name}` comes with pimper-bench, which is not installed. Run `pip install "
-            "./bench` in a clone of the repository."
+            "./benchmarks` in a clone of the repository."
         )
     near = difflib.get_close_matches(name, commands(), n=1)
     hint = f" Did you mean `{near[0]}`?" if near else ""

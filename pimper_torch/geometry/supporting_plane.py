@@ -13,7 +13,7 @@ from pimper_torch.records.shapes import Points, Scalar, Scalars, Vectors
 
 # Maximum distance of a point on the plane, as a fraction of the cameras' distance; minimum fraction
 # of points on it, and maximum fraction below. Chosen on the four rendered scenes and the skull
-# (benchmarks/silhouettes.py).
+# (benchmarks/studies/silhouettes.py).
 PLANE_TOLERANCE = 0.004
 _MIN_ON, _MAX_BELOW = 0.08, 0.05
 

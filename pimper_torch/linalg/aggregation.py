@@ -17,7 +17,7 @@ between two cuts they are pieces of the strip; a hole has none.
 Source: Vanek, Mandel & Brezina, Computing 56, 1996, for smoothed aggregation; Bell, Dalton &
 Olson, SIAM J. Sci. Comput. 34(4), 2012, for parallel aggregation; Brezina, Falgout, MacLachlan,
 Manteuffel, McCormick & Ruge, SIAM J. Sci. Comput. 25(6), 2004, for the adaptive near-kernel. The
-assignment of light unknowns is ours, measured in ``benchmarks/linear_systems.py``.
+assignment of light unknowns is ours (docs/decisions.md, "Solvers of sparse systems").
 """
 
 import numpy as np

@@ -9,7 +9,7 @@ from pimper_torch.linalg.conjugate_gradients import compressed_gradients
 from pimper_torch.linalg.hierarchy import Hierarchy, with_product
 from pimper_torch.linalg.prepared import WORST_RESIDUAL, PreparedMatrix, SingularSystemError
 
-# Iteration limit, a choice: the hardest systems of `benchmarks/linear_systems.py` take 25.
+# Iteration limit, a choice: the hardest systems of docs/decisions.md take 25.
 _MAX_CYCLES = 300
 
 

@@ -29,7 +29,7 @@ def test_a_missing_distribution_is_named(name, capsys, monkeypatch):
     assert main([name, "mug"]) == 2
     message = capsys.readouterr().err
     assert message.startswith(f"error: `pimper {name}` comes with pimper-bench")
-    assert "`pip install ./bench`" in message
+    assert "`pip install ./benchmarks`" in message
     assert message.count("\n") == 1
     assert name not in helped(capsys)
 

@@ -11,7 +11,7 @@ root="$(cd "$(dirname "$0")/../.." && pwd)"
 # shellcheck disable=SC1091
 source "$folder/venv/bin/activate"
 pip install --constraint "$folder/constraints.txt" "torch==2.13.0"
-pip install --constraint "$folder/constraints.txt" "$root" "$root/bench"
+pip install --constraint "$folder/constraints.txt" "$root" "$root/benchmarks"
 
 cd "$folder"  # the installed package, not the working tree
 pimper --version

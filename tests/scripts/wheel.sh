@@ -7,7 +7,7 @@ cd "$(dirname "$0")/../.."
 folder="$1"
 
 export PIMPER_BENCH=""
-for distribution in . bench; do
+for distribution in . benchmarks; do
     python -m build --no-isolation --outdir "$folder/dist" "$distribution" > /dev/null
 done
 if tar -xzOf "$folder"/dist/pimper_torch-*.tar.gz --wildcards "*/PKG-INFO" \

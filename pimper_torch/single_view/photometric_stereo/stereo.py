@@ -29,7 +29,7 @@ from pimper_torch.single_view.photometric_stereo.regress_lights import (
 )
 
 # Methods with the resolvers of their bas-relief ambiguity; "rounded" is a convention. The default
-# is entropy, closest to true lights on rendered objects (benchmarks/photometric_stereo.py).
+# is entropy, closest to true lights on rendered objects (docs/decisions.md).
 METHODS: dict[str, tuple[str, ...]] = {
     "calibrated": (),
     "integrability": ("albedo_entropy", "rounded", "equal_strength"),

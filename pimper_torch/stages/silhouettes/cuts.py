@@ -35,7 +35,7 @@ from pimper_torch.runtime.mapped import by_view
 from pimper_torch.stages.silhouettes.cues import FEW, MIN_POINTS, Cues, keep_seeded_components
 from pimper_torch.stages.silhouettes.parallax import DISPUTED, of_views
 
-# Chosen on the four rendered scenes and the skull (benchmarks/silhouettes.py).
+# Chosen on the four rendered scenes and the skull (benchmarks/studies/silhouettes.py).
 _ITERATIONS = 2  # of cutting and voting after the first cut
 NUM_VOXELS = 500_000  # of the hull
 _DISAGREEING = 0.05  # fraction of the views that may exclude a voxel of the hull

@@ -13,7 +13,7 @@ from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.stages.silhouettes.cuts import MISS_OFF_PLANE, Cuts, is_deep, miss_probability
 
 # Least fraction of a reliable silhouette that the hull's projection covers. Chosen, as the next
-# two, on the four rendered scenes and the skull (benchmarks/silhouettes.py).
+# two, on the four rendered scenes and the skull (benchmarks/studies/silhouettes.py).
 _MIN_COVERED = 0.9
 
 # Most of it that may certainly show a background: the supporting plane or a static background. True
