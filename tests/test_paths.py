@@ -12,7 +12,10 @@ import pytest
 import pimper_torch
 
 # Subpackages whose public functions users call; of the optional ones, their exports.
-SUBPACKAGES = ("chains", "presets", "runtime.config", "io", "export", "records", "viz")
+SUBPACKAGES = (
+    *("chains", "presets", "runtime.config", "io", "export.results", "export.reports"),
+    *("records", "viz"),
+)
 EXPORTING = ("baselines", "datasets", "metrics", "scenes")
 
 
