@@ -65,7 +65,7 @@ STAGES = [
     (stages.FindSilhouettes, given, "scene"),
     (stages.TraceContours, all_round, "outlines ring.cameras"),
     (stages.CoarseSurface, all_round, "ring rays mesh"),
-    (stages.Triangulate, given, "scene"),
+    (pt.Triangulate, given, "scene"),
     (stages.Decompose, given, "coarse scene.cameras"),
     (stages.Warp, given, "scene.views scene.cameras patches"),
     (stages.FitLight, given, "few"),

@@ -114,10 +114,7 @@ PHOTOGRAPHS = ["p1/a.jpg", "p1/b.jpg", "p2/a.jpg", "p2/b.jpg"]
         (["x/p2/mean.png", "x/p1/mean.png"], [1, 1, 0, 0]),
         (["p1/b.jpg", "p1.png", "p1/a.jpg"], [2, 0, None, None]),  # its own file takes precedence
         (["p1/b.jpg", "p1.png"], [0, 0, None, None]),
-        (
-            ["p1/c.jpg", "p1/d.jpg", "P2.JPG"],
-            [None, None, 2, 2],
-        ),  # two files of one pose
+        (["p1/c.jpg", "p1/d.jpg", "P2.JPG"], [None, None, 2, 2]),  # two files of one pose
         (["p2/a.jpg"], [None, None, 0, 0]),
         (["p3/a.jpg", "p1/a.jpg", "p3/b.jpg"], [1, 1, None, None]),
     ],

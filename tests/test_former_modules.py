@@ -8,10 +8,8 @@ from pimper_torch.runtime.former_modules import _FORMER
 
 @pytest.mark.parametrize("former", [path for path, present in _FORMER.items() if present])
 def test_a_former_path_is_the_present_module_and_warns(former):
-    name, present = (
-        f"pimper_torch.{former}",
-        importlib.import_module(f"pimper_torch.{_FORMER[former]}"),
-    )
+    name = f"pimper_torch.{former}"
+    present = importlib.import_module(f"pimper_torch.{_FORMER[former]}")
     spec = present.__spec__
     sys.modules.pop(name, None)
     with pytest.warns(DeprecationWarning, match=f"`{name}` is now `{present.__name__}`"):

@@ -31,11 +31,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.Pim
 FEW = {"seed": 36, "num_views": 5, "width": 32, "num_points": 11}
 
 
-@pytest.fixture(scope="module")
-def tiny():
-    return small_scene(num_views=5, width=40, num_points=16)
-
-
 def chain_of(preset, **changes):
     return pt.load_chain(preset, changes)
 
@@ -52,9 +47,9 @@ def in_iterations(**changes):
 
 
 @pytest.fixture(scope="module")
-def iterations(tiny):
+def iterations():
     """Probes of the stages of the second pass, which starts from a surface."""
-    return probes(in_iterations(), *tiny)
+    return probes(in_iterations(), *small_scene(num_views=5, width=40, num_points=16))
 
 
 @pytest.fixture(scope="module")

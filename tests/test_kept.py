@@ -5,11 +5,8 @@ import torch
 from probes import small_scene
 
 import pimper_torch as pt
-from pimper_torch.records import Mesh, Surface
-from pimper_torch.runtime.errors import PimperWarning, caution
+from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.reporting import SilentObserver
-from pimper_torch.stages.meshing.extract import Extract
-from pimper_torch.stages.stage import Given
 from pimper_torch.store import digest
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
@@ -44,7 +41,7 @@ def chain_of(given, store, **changes):
     listener = Listener()
     settings = {"scales": [0.25, 0.5], "silhouettes": {"object": "everything"}, **changes}
     scene, coarse = given
-    stages = {"reconstruct": Given(scene), "coarse_surface": Given(coarse)}
+    stages = {"reconstruct": pt.Given(scene), "coarse_surface": pt.Given(coarse)}
     return pt.load_chain("default", settings, listener, store, **stages), listener
 
 
@@ -109,10 +106,10 @@ def test_different_photographs_rerun_everything(given, whole):
     assert "photometry" not in listener.kept
 
 
-class Subclassed(Extract):
+class Subclassed(pt.Extract):
     """The package's stage, subclassed in a different module."""
 
-    def forward(self, surface: Surface) -> Mesh:
+    def forward(self, surface: pt.Surface) -> pt.Mesh:
         caution("doubtful")
         return super().forward(surface)
 
@@ -122,13 +119,13 @@ def test_a_custom_stage_is_called_every_time(given, whole):
     chain, listener = chain_of(given, folder)
     chain.extract = Subclassed()
     for _ in range(2):
-        with pytest.warns(PimperWarning, match="doubtful"):
+        with pytest.warns(pt.PimperWarning, match="doubtful"):
             chain(given[0].views)
     assert listener.done.count("extract") == 2
 
 
 def test_an_unwritable_store_does_not_end_a_run(given, whole, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.warns(PimperWarning, match=r"cannot be kept there.*Free space"):
+    with pytest.warns(pt.PimperWarning, match=r"cannot be kept there.*Free space"):
         result, _ = run(given, tmp_path / "file" / "folder")
     assert bits(result) == bits(whole[0])

@@ -6,18 +6,11 @@ from twins import using
 
 import pimper_torch as pt
 from pimper_torch.chains.photometric import Photometric
-from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.pyramids import prepare
 from pimper_torch.lighting.lights import thinned
-from pimper_torch.records import Silhouettes, SparseScene, StageReport
+from pimper_torch.records import StageReport
 from pimper_torch.runtime.reporting import SilentObserver
-from pimper_torch.stages.patches.decompose import Decompose
 from pimper_torch.stages.patches.patches_config import DecomposeConfig
-from pimper_torch.stages.patches.warp import Warp
-from pimper_torch.stages.photometry.factorize import Factorize
-from pimper_torch.stages.photometry.fit_light import FitLight
-from pimper_torch.stages.stage import Given
-from pimper_torch.stages.sweep.sweep import Sweep
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
@@ -26,15 +19,15 @@ pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.Pim
 def given():
     """Photographs of a sphere, cameras, and facets in buckets of a few patches each."""
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=96))
-    patches = Decompose(DecomposeConfig(bucket_entries=12_000))(coarse, scene.cameras)
+    patches = pt.Decompose(DecomposeConfig(bucket_entries=12_000))(coarse, scene.cameras)
     assert len(patches.buckets) > 3
     return scene.views, scene.cameras, patches
 
 
 def streamed(given):
     views, cameras, patches = given
-    light = FitLight()(Warp()(views, cameras, thinned(patches)))
-    return Photometric()((Warp(), Factorize(), Sweep()), *given, light, prepare(views))
+    light = pt.FitLight()(pt.Warp()(views, cameras, thinned(patches)))
+    return Photometric()((pt.Warp(), pt.Factorize(), pt.Sweep()), *given, light, prepare(views))
 
 
 def values(swept):
@@ -45,10 +38,10 @@ def values(swept):
 
 def test_streamed_buckets_give_the_result_of_all_patches(given):
     views, cameras, patches = given
-    light = FitLight()(Warp()(views, cameras, thinned(patches)))
-    seen = Warp()(views, cameras, patches)
-    photometric = Factorize()(seen, light)
-    expected = Sweep()(views, cameras, seen, photometric)
+    light = pt.FitLight()(pt.Warp()(views, cameras, thinned(patches)))
+    seen = pt.Warp()(views, cameras, patches)
+    photometric = pt.Factorize()(seen, light)
+    expected = pt.Sweep()(views, cameras, seen, photometric)
     found = streamed(given)
     assert found.averaged == expected.averaged
     for one, other in zip(values(found), values(expected), strict=True):
@@ -75,9 +68,9 @@ class Listener(SilentObserver):
 def in_iterations(listener, **changes):
     chain = pt.load_chain("default", {"scales": [0.5, 1.0], **changes}, listener)
     scene, coarse = (each.to(torch.float32) for each in small_scene(num_views=6, width=64))
-    chain.reconstruct = Given(scene)
-    chain.silhouettes = Given(Silhouettes.everything(scene.views))
-    chain.coarse_surface = Given(coarse)
+    chain.reconstruct = pt.Given(scene)
+    chain.silhouettes = pt.Given(pt.Silhouettes.everything(scene.views))
+    chain.coarse_surface = pt.Given(coarse)
     return chain, scene
 
 
@@ -96,7 +89,7 @@ def test_steps_have_the_records_of_every_pass_and_end_with_the_result():
     assert torch.equal(chain.extract(steps[-1].surface).vertices_world, result.mesh.vertices_world)
     # The second pass uses facets remeshed on the surface of the first.
     assert steps[0].coarse is chain.coarse_surface.record
-    contours = Contours.none(steps[0].silhouettes, scene.cameras)
+    contours = pt.Contours.none(steps[0].silhouettes, scene.cameras)
     remeshed = chain.remesh(steps[0].heights, steps[0].surface, contours)
     assert torch.equal(steps[1].coarse.mesh.faces, remeshed.mesh.faces)
 
@@ -107,7 +100,7 @@ def test_an_observer_receives_cameras_and_every_pass_and_changes_nothing():
     seen = []
     chain.watch = seen.append
     found = chain(scene.views)
-    assert [type(one) for one in seen] == [SparseScene, pt.Step, pt.Step]
+    assert [type(one) for one in seen] == [pt.SparseScene, pt.Step, pt.Step]
     assert seen[0].views.names == scene.views.names
     assert [one.scale for one in seen[1:]] == [0.5, 1.0]
     assert [report.name for report in found.report].count("view") == 3
@@ -128,7 +121,7 @@ def test_a_pass_reports_photometry_once_with_the_time_of_each_part():
     patches = result.patches.patches
     samples = 6 * sum(int(bucket.inside.sum()) for bucket in patches.buckets)
     assert reports[1].figures["samples"] == samples
-    seen = Warp()(scene.views, scene.cameras, patches)
+    seen = pt.Warp()(scene.views, scene.cameras, patches)
     valid = sum(int(bucket.valid.sum()) for bucket in seen.buckets)
     assert reports[1].figures["missing_samples"] == pytest.approx(samples - valid, rel=0.05)
     count = len(patches.buckets)
@@ -151,13 +144,7 @@ def with_others(given):
     views, cameras, patches = given
     order = torch.tensor([0, 0, 1, 2, 5, 3, 4, 3, 5, 2])
     own = torch.tensor([1, 0, 1, 1, 0, 1, 1, 0, 1, 0]) > 0
-    more = views.replace(
-        images=views.images[order],
-        names=tuple(f"{row}.png" for row in range(len(order))),
-        sizes_px=views.sizes_px[order],
-        focals_px=views.focals_px[order],
-        masks=None if views.masks is None else views.masks[order],
-    )
+    more = views.take(order).replace(names=tuple(f"{row}.png" for row in range(len(order))))
     buckets = tuple(bucket.replace(views=own) for bucket in patches.buckets)
     return (more, cameras.take(order), patches.replace(buckets=buckets)), own
 
@@ -166,9 +153,9 @@ def with_others(given):
 def test_photographs_that_do_not_see_a_bucket_change_no_bit_of_it(given, kernels):
     (views, cameras, patches), own = with_others(given)
     with using(kernels):
-        seen = Warp()(*given)
-        among = Warp()(views, cameras, patches)
-        light = FitLight()(seen)
+        seen = pt.Warp()(*given)
+        among = pt.Warp()(views, cameras, patches)
+        light = pt.FitLight()(seen)
         field = light.field
         spread = {
             name: torch.zeros(len(own), *value.shape[1:]).index_copy(0, own.nonzero()[:, 0], value)
@@ -178,8 +165,8 @@ def test_photographs_that_do_not_see_a_bucket_change_no_bit_of_it(given, kernels
         of_all = light.replace(field=field.replace(**spread))
         found = []
         for one, shown, lit in ((given, seen, light), ((views, cameras), among, of_all)):
-            solved = Factorize()(shown, lit)
-            found.append(list(values(Sweep()(one[0], one[1], shown, solved))))
+            solved = pt.Factorize()(shown, lit)
+            found.append(list(values(pt.Sweep()(one[0], one[1], shown, solved))))
     for one, other in zip(*found, strict=True):
         assert torch.equal(one, other)
 
@@ -188,7 +175,7 @@ def test_light_is_fitted_as_if_unused_photographs_were_missing(given):
     views, cameras, patches = given
     masks = torch.tensor([[1, 1, 1, 1, 1, 0], [0, 1, 1, 1, 1, 1]]) > 0
     own = [masks[number % 2] for number in range(len(patches.buckets))]
-    every = Warp()(*given)
+    every = pt.Warp()(*given)
     missing = every.replace(
         buckets=tuple(
             bucket.replace(
@@ -201,8 +188,8 @@ def test_light_is_fitted_as_if_unused_photographs_were_missing(given):
     buckets = tuple(
         bucket.replace(views=mask) for bucket, mask in zip(patches.buckets, own, strict=True)
     )
-    found = FitLight()(Warp()(views, cameras, patches.replace(buckets=buckets))).field
-    expected = FitLight()(missing).field
+    found = pt.FitLight()(pt.Warp()(views, cameras, patches.replace(buckets=buckets))).field
+    expected = pt.FitLight()(missing).field
     for name in ("soft", "point_light", "inverse_distance", "gain", "exposure", "origin"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
 
@@ -212,7 +199,7 @@ def test_gradients_reach_only_the_photographs_that_see_a_bucket(given):
 
     def gradient(views, cameras, patches):
         images = views.images.clone().requires_grad_()
-        seen = Warp()(views.replace(images=images), cameras, patches)
+        seen = pt.Warp()(views.replace(images=images), cameras, patches)
         sum((bucket.radiance**2).sum() for bucket in seen.buckets).backward()
         return images.grad
 

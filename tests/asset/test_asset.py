@@ -16,7 +16,7 @@ from torch.nn.functional import grid_sample, normalize
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.geometry.pinholes import look_at
+from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.tangents import tangents
 from pimper_torch.geometry.visibility import RayCaster
@@ -204,16 +204,21 @@ def tree_of(path: Path) -> dict:
     return json.loads(raw[20 : 20 + int.from_bytes(raw[12:16], "little")])
 
 
+def picture_in(path: Path, image: int) -> np.ndarray:
+    """Return a picture of a GLB."""
+    raw, tree = path.read_bytes(), tree_of(path)
+    view = tree["bufferViews"][tree["images"][image]["bufferView"]]
+    start = 28 + int.from_bytes(raw[12:16], "little") + view["byteOffset"]
+    with Image.open(io.BytesIO(raw[start : start + view["byteLength"]])) as picture:
+        return np.array(picture)
+
+
 @pytest.fixture
 def two_cameras(full) -> Cameras:
     """Two cameras that look at the ball, horizontally and from above; z is up."""
     up = torch.tensor([[0.0, 0, 1], [1.0, 0, 0]])
     poses = look_at(torch.tensor([[0.0, 9, 0], [0.0, 0, 9]]), torch.zeros(3), up)
-    return Cameras(
-        intrinsics=torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]).expand(2, 3, 3),
-        cam_from_world=poses,
-        sizes_px=torch.tensor([[640, 480]] * 2),
-    )
+    return pinholes(poses, 500.0, 640, 480)
 
 
 @pytest.fixture
@@ -333,14 +338,9 @@ def test_the_mask_of_unreliable_albedo_is_a_texture_of_the_glb(full, few, asset,
         assert validated(tmp_path / f"{name}.glb") == []
     assert "extras" not in tree_of(tmp_path / "sure.glb")["materials"][0]
     tree = tree_of(tmp_path / "doubtful.glb")
-    source = tree["textures"][tree["materials"][0]["extras"]["albedo_uncertainty"]["index"]][
-        "source"
-    ]
-    view = tree["bufferViews"][tree["images"][source]["bufferView"]]
-    raw = (tmp_path / "doubtful.glb").read_bytes()
-    start = 28 + int.from_bytes(raw[12:16], "little") + view["byteOffset"]
-    with Image.open(io.BytesIO(raw[start : start + view["byteLength"]])) as mask:
-        assert np.array_equal(np.asarray(mask), doubtful.uncertainty)
+    texture = tree["materials"][0]["extras"]["albedo_uncertainty"]["index"]
+    mask = picture_in(tmp_path / "doubtful.glb", tree["textures"][texture]["source"])
+    assert np.array_equal(mask, doubtful.uncertainty)
 
 
 def test_a_usdz_is_complete_and_in_metres(asset, placement, tmp_path):
@@ -383,7 +383,7 @@ def test_materials_are_factors_or_textures(full, few, tmp_path, clusters):
     asset = textured(full, few, reflectance)
     path = tmp_path / "asset.glb"
     write_asset(asset, path)
-    raw, tree = path.read_bytes(), tree_of(path)
+    tree = tree_of(path)
     (material,) = tree["materials"]
     surface, gloss = material["pbrMetallicRoughness"], material["extensions"]
     gloss = gloss["KHR_materials_specular"]
@@ -393,13 +393,7 @@ def test_materials_are_factors_or_textures(full, few, tmp_path, clusters):
         assert gloss == {"specularFactor": pytest.approx(0.5), "specularColorFactor": [1.0] * 3}
         assert len(tree["images"]) == 2
     else:
-        view = [tree["bufferViews"][tree["images"][image]["bufferView"]] for image in (2, 3)]
-        start = 28 + int.from_bytes(raw[12:16], "little")
-        pictures = []
-        for one in view:
-            at = start + one["byteOffset"]
-            (tmp_path / "a.png").write_bytes(raw[at : at + one["byteLength"]])
-            pictures.append(torch.from_numpy(np.array(Image.open(tmp_path / "a.png"))).float())
+        pictures = [torch.from_numpy(picture_in(path, image)).float() for image in (2, 3)]
         corners = asset.uv[asset.mesh.faces]
         centre, x = corners.mean(dim=1), asset.mesh.vertices_world[asset.mesh.faces][..., 0]
         rough, gloss_texture = (sampled(picture, centre) / 255 for picture in pictures)

@@ -12,24 +12,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_line import run
 from PIL import Image
 
-from pimper_torch.chains.chain_config import CoarseToFineConfig
-from pimper_torch.cli.main import main
+import pimper_torch as pt
 from pimper_torch.cli.output import Output
 from pimper_torch.export.result_folder.marker import MARKER
-from pimper_torch.export.results import RESULT_NAMES, write_result
+from pimper_torch.export.results import RESULT_NAMES
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.version import installed_version
-from pimper_torch.presets.load_config import load_config
-from pimper_torch.records import Mesh, Removal, Silhouettes
-from pimper_torch.runtime.errors import PimperWarning, ReconstructionError
-from pimper_torch.stages.silhouettes.find import FindSilhouettes
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
-
+from pimper_torch.records import Removal
 
 ASKED_FOR = {  # optional files, not requested here
     *("masks", "mesh.stl", "mesh.obj", "asset.usdz"),
@@ -51,7 +43,7 @@ def test_a_run_writes_the_result_and_prints_its_path(reconstruct, chain, tmp_pat
     assert reconstruct() == 0
     assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
     config, views, sparse = chain.given
-    assert config == CoarseToFineConfig() == load_config("default")
+    assert config == pt.CoarseToFineConfig() == pt.load_config("default")
     assert views.names == ("0.png", "1.png", "2.png", "3.png")
     assert sparse is None
     printed = capsys.readouterr()
@@ -91,9 +83,9 @@ def test_masks_of_a_result_can_be_given_and_are_trusted(reconstruction, chain, t
     scene = reconstruction.scene
     inside = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(4))
     reliable = torch.tensor([True, True, False])
-    found = Silhouettes(inside=inside, reliable=reliable, source="found")
-    write_result(
-        reconstruction.replace(silhouettes=found), CoarseToFineConfig(), tmp_path / "first"
+    found = pt.Silhouettes(inside=inside, reliable=reliable, source="found")
+    pt.write_result(
+        reconstruction.replace(silhouettes=found), pt.CoarseToFineConfig(), tmp_path / "first"
     )
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -105,7 +97,7 @@ def test_masks_of_a_result_can_be_given_and_are_trusted(reconstruction, chain, t
     assert run("reconstruct", photos, "-o", tmp_path / "second", "--masks", masks, *few) == 0
     views = chain.given[1]
     assert views.names == scene.views.names
-    silhouettes = FindSilhouettes()(scene.replace(views=views))
+    silhouettes = pt.FindSilhouettes()(scene.replace(views=views))
     assert silhouettes.source == "masks"
     assert torch.equal(silhouettes.masks, found.masks)
     assert silhouettes.reliable.all()  # including views whose silhouette was unreliable
@@ -169,7 +161,7 @@ def test_a_missing_gpu_is_reported_before_the_run(reconstruct, chain, capsys, mo
 
 
 def fail():
-    raise ReconstructionError("reconstruct: only 2 of 3 photographs [1, 2] registered.")
+    raise pt.ReconstructionError("reconstruct: only 2 of 3 photographs [1, 2] registered.")
 
 
 def interrupt():
@@ -316,7 +308,7 @@ def test_the_debug_log_level_shows_tracebacks(reconstruct, chain, capsys):
 
 
 def warn(_):
-    warnings.warn("light hardly varies.", PimperWarning, stacklevel=1)
+    warnings.warn("light hardly varies.", pt.PimperWarning, stacklevel=1)
 
 
 @pytest.mark.parametrize(("given", "warned"), [(["-q"], True), (["--log-level", "error"], False)])
@@ -413,7 +405,7 @@ def test_the_coarse_surface_is_a_preview_until_the_run_ends(
     def show_and_fail(self):
         show(self)
         assert {path: path.stat().st_mtime_ns for path in former} == former
-        raise ReconstructionError("no surface.")
+        raise pt.ReconstructionError("no surface.")
 
     chain.work = show_and_fail
     assert reconstruct("--json", "--overwrite") == 2
@@ -445,7 +437,7 @@ def test_unwritable_output_gives_a_message(capsys, monkeypatch):
 
 def test_a_given_mesh_reaches_the_chain(reconstruct, photos, chain, tmp_path):
     square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    mesh = Mesh(vertices_world=square, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    mesh = pt.Mesh(vertices_world=square, faces=torch.tensor([[0, 1, 2], [0, 2, 3]]))
     write_ply(mesh, tmp_path / "rough.ply")
     out = tmp_path / "out"
     assert reconstruct("--mesh", tmp_path / "rough.ply") == 0

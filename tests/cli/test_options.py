@@ -10,18 +10,14 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import pytest
+from scenes import write_ball
 from stand_ins import CHILD, children_stand_in, write_slurm
 
-from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.chains.chain_config import CoarseToFineConfig
+import pimper_torch as pt
 from pimper_torch.cli.batches import task
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
-from pimper_torch.io.meshes import read_mesh, write_ply
-from pimper_torch.paper.paper_config import PublishedConfig
-from pimper_torch.presets.load_config import load_config
-from pimper_torch.records import Mesh
-from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.io.meshes import write_ply
 from pimper_torch.store import Store
 from tests.video.clips import written
 
@@ -109,13 +105,12 @@ PRESET = "scales: [0.5]\nsweep: {min_views: 2, num_views: 4}\nextract: {max_expe
 def world(tmp_path_factory, dtu):
     """A ball and its photographs, as written by `pimper render`."""
     folder = tmp_path_factory.mktemp("world")
-    vertices, faces = icosphere(2)
-    write_ply(Mesh(vertices_world=vertices, faces=faces), folder / "ball.ply")
+    write_ball(folder / "ball.ply", level=2)
     (folder / "preset.yaml").write_text(PRESET)
     scene = folder / "scene"
     small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1"
     assert main(["render", str(folder / "ball.ply"), "-o", str(scene), *small.split()]) == 0
-    true_mesh = read_mesh(scene / "truth" / "mesh.ply")
+    true_mesh = pt.read_mesh(scene / "truth" / "mesh.ply")
     told = true_mesh.replace(expected_error=0.01 + 0.01 * true_mesh.vertices_world[:, 2])
     write_ply(told, folder / "told.ply")
     result = folder / "result"
@@ -247,7 +242,7 @@ def test_every_option_has_a_test_run(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     names = listed(command, capsys)
     if command in ("reconstruct", "demo"):
-        settings = {name for field in leaves(CoarseToFineConfig()) for name in spelt(field)}
+        settings = {name for field in leaves(pt.CoarseToFineConfig()) for name in spelt(field)}
         assert settings <= names  # those of the other chain need its presets
         # Settings of stages are tested below; those of the run are ordinary options.
         names -= {name for name in settings if "." in name}
@@ -296,7 +291,7 @@ def effects(preset, capsys):
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_settings_are_80_at_most_and_all_are_documented(preset, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
-    settings = list(leaves(load_config(preset)))
+    settings = list(leaves(pt.load_config(preset)))
     assert 30 < len(settings) <= 80
     said = effects(preset, capsys)
     silent = [leaf.path for leaf in settings if len(said[spelt(leaf)[0]].split()) < 3]
@@ -339,7 +334,7 @@ def words(leaf, value):
     return [spelt(leaf)[0], text]
 
 
-@pytest.mark.parametrize("chain", [CoarseToFineConfig, PublishedConfig])
+@pytest.mark.parametrize("chain", [pt.CoarseToFineConfig, pt.PublishedConfig])
 def test_every_setting_of_every_stage_reaches_the_configuration(chain, tmp_path):
     preset = tmp_path / "defaults.yaml"
     preset.write_text(f"chain: {chain().chain}\n")
@@ -350,7 +345,7 @@ def test_every_setting_of_every_stage_reaches_the_configuration(chain, tmp_path)
             for value in other_values(leaf):
                 try:
                     config = changed(config, leaf.path, value)
-                except ConfigError:
+                except pt.ConfigError:
                     continue
                 line += words(leaf, value)
                 break

@@ -3,20 +3,10 @@
 import threading
 
 import pytest
+from command_line import contents, run
+from scenes import write_ball
 
-from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.cli.main import main
 from pimper_torch.export.result_folder.folders import held_output
-from pimper_torch.io.meshes import write_ply
-from pimper_torch.records import Mesh
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
-
-
-def contents(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.*")}
 
 
 @pytest.fixture
@@ -48,8 +38,7 @@ def test_an_input_in_the_results_folder_is_refused(
 
 
 def test_user_files_in_a_scene_folder_are_not_overwritten(tmp_path, capsys):
-    vertices, faces = icosphere(1)
-    write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "ball.ply")
+    write_ball(tmp_path / "ball.ply", level=1)
     small = ["--num-views", "2", "--width", "32", "--height", "24", "--processes", "1"]
     assert run("render", tmp_path / "ball.ply", "-o", tmp_path / "out", *small) == 0
     for part in ("photos", "masks"):

@@ -8,15 +8,12 @@ import pytest
 import torch
 from PIL import Image
 
+import pimper_torch as pt
 from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.cli.run import bars_in_files, scale_message
 from pimper_torch.io.cameras.model_files import read_model
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.io.photographs import load_views
-from pimper_torch.scale.given import Mark
 from pimper_torch.scale.marks import place_of
-from pimper_torch.scale.scale import Scale
 
 # The surface of the small result has a random confidence.
 UNSURE = "ignore:.*hardly determine the surface:pimper_torch.runtime.errors.PimperWarning"
@@ -50,12 +47,12 @@ def test_marks_in_files_agree_with_marks_in_views(orientation, reconstruction, t
     photos = saved(tmp_path / "photos", orientation)
     more = ["--max-size-px", "60", "--scale-bar", "a,55,40", "c.png,66,50+b,60,45", "80"]
     job = parse("reconstruct", [str(photos), "-o", "out", *more])
-    views = load_views(photos, max_size_px=60)
+    views = pt.load_views(photos, max_size_px=60)
     assert views.sizes_px[0].tolist() == [60, 40]
     (bar,) = bars_in_files(job, views)
     assert bar.first.pointers[0].size_px == (120, 80)
     assert (str(bar.first), str(bar.second)) == ("a,55,40", "c.png,66,50+b,60,45")
-    wanted = place_of(Mark.read("a,27.5,20"), reconstruction)
+    wanted = place_of(pt.Mark.read("a,27.5,20"), reconstruction)
     torch.testing.assert_close(place_of(bar.first, reconstruction), wanted)
 
 
@@ -67,7 +64,7 @@ def test_a_result_is_written_in_the_unit_of_its_scale_bar(photos, reconstruction
     assert main(line(photos, out, *bar)) == 0
     message = json.loads((out / "summary.json").read_text())["scale"]
     job = parse("reconstruct", line(photos, out, *bar)[1:])
-    (loaded,) = bars_in_files(job, load_views(photos, max_size_px=60))
+    (loaded,) = bars_in_files(job, pt.load_views(photos, max_size_px=60))
     ends = [place_of(mark, reconstruction) for mark in loaded.ends]
     factor = 120 / float((ends[0] - ends[1]).norm())
     assert message == {
@@ -77,7 +74,7 @@ def test_a_result_is_written_in_the_unit_of_its_scale_bar(photos, reconstruction
         "residual": None,
         "count": 1,
     }
-    mesh = read_mesh(out / "mesh.ply")
+    mesh = pt.read_mesh(out / "mesh.ply")
     wanted = factor * reconstruction.mesh.vertices_world
     torch.testing.assert_close(mesh.vertices_world, wanted.double(), rtol=1e-5, atol=1e-4)
     model = read_model(out / "sparse")
@@ -128,7 +125,7 @@ def test_invalid_lengths_are_refused(more, message, photos, tmp_path, capsys):
     ],
 )
 def test_the_source_of_the_scale_is_reported(count, message):
-    scale = Scale(factor=2.0, unit="m", source="camera distances", residual=0.0012, count=count)
+    scale = pt.Scale(factor=2.0, unit="m", source="camera distances", residual=0.0012, count=count)
     assert scale_message(scale) == message
 
 

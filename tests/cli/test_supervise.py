@@ -9,13 +9,12 @@ import time
 from pathlib import Path
 
 import pytest
+from scenes import ball
 
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli import supervise
 from pimper_torch.cli.options import bundled_photographs
 from pimper_torch.cli.stopping import stoppable
 from pimper_torch.io.meshes import write_ply
-from pimper_torch.records import Mesh
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="one process alone")
 
@@ -146,10 +145,9 @@ def test_a_run_that_ignores_a_signal_is_killed_within_five_seconds(tmp_path, mon
 @pytest.mark.parametrize(("command", "after"), [("evaluate", 8), ("reconstruct", 20)])
 def test_a_library_call_ends_within_five_seconds_of_a_signal(tmp_path, command, after):
     """Ten million samples keep one library call busy for longer, as feature detection may."""
-    vertices, faces = icosphere(7)
-    mesh, cloud = tmp_path / "mesh.ply", tmp_path / "cloud.ply"
-    write_ply(Mesh(vertices_world=vertices, faces=faces), mesh)
-    write_ply(Mesh(vertices_world=vertices, faces=faces[:0]), cloud)
+    mesh, cloud, whole = tmp_path / "mesh.ply", tmp_path / "cloud.ply", ball(level=7)
+    write_ply(whole, mesh)
+    write_ply(whole.replace(faces=whole.faces[:0]), cloud)
     given = {
         "evaluate": [mesh, cloud, "--samples", "10000000"],
         "reconstruct": [bundled_photographs(), "-o", tmp_path / "out"],

@@ -1,6 +1,7 @@
 """A ball under lights that change from view to view."""
 
 import torch
+from scenes import trusted
 from torch.nn.functional import normalize
 
 from pimper_bench.scenes.render_in_memory import Sphere, render_shape
@@ -8,7 +9,6 @@ from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
-from pimper_torch.records import Silhouettes
 from pimper_torch.stages.coarse.coarse_config import CoarseSurfaceConfig
 
 SETTINGS = CoarseSurfaceConfig(num_facets=600, levels=1)
@@ -57,8 +57,4 @@ def silhouettes_of(cameras):
     pixels = pixel_centers(width, height, like=cameras.intrinsics).reshape(-1, 2)
     rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)
     met = Sphere().intersect(cameras.centers_world[:, None], rays).isfinite()
-    return Silhouettes(
-        inside=met.float().reshape(-1, height, width),
-        reliable=torch.ones(len(met), dtype=torch.bool),
-        source="masks",
-    )
+    return trusted(met.float().reshape(-1, height, width))

@@ -19,6 +19,12 @@ from pimper_torch.stages.silhouettes.trace import TraceContours
 from tests.coarse.ball import SETTINGS, mottled, photographed, silhouettes_of
 
 
+def counted(faces, behind=0):
+    """Return counts of three views that see each face, and of those that see through it."""
+    seen = torch.full((faces,), 3)
+    return ViewCounts(seen=seen, lit=seen, behind=behind + 0 * seen)
+
+
 @pytest.fixture
 def small_holes(monkeypatch):
     """Close holes up to an area of 0.3 with pixels of 1."""
@@ -93,9 +99,8 @@ def test_surface_that_views_see_through_is_dropped_except_small_dents(small_hole
     vertices, faces = icosphere(3)
     centre = vertices[faces].mean(dim=1)
     cover, speck = centre[:, 2] > 0.8, centre[:, 2] < -0.97
-    count = torch.full((len(faces),), 3)
-    counts = ViewCounts(seen=count, lit=count, behind=torch.where(cover | speck, 2, 0))
-    support = torch.full_like(count, Support.LIGHT)
+    counts = counted(len(faces), behind=torch.where(cover | speck, 2, 0))
+    support = torch.full_like(counts.seen, Support.LIGHT)
     support[centre[:, 0] > 0.9] = Support.CONTOUR
     everywhere = torch.ones_like(cover)
     kept = seen_surface(vertices, faces, support, counts, everywhere, 1.0, 0.01)
@@ -131,8 +136,7 @@ def test_components_without_points_and_contours_are_dropped():
     vertices, faces = icosphere(2)
     two = torch.cat([vertices, 0.3 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
     first = torch.arange(len(two[1])) < len(faces)
-    count = torch.full((len(two[1]),), 3)
-    counts = ViewCounts(seen=count, lit=count, behind=0 * count)
+    counts = counted(len(two[1]))
     support = torch.where(first, Support.POINTS, Support.LIGHT)
     kept = seen_surface(*two, support, counts, torch.ones_like(first), 1.0, 0.01)
     assert bool((kept == first).all())
@@ -148,11 +152,10 @@ def test_a_floating_component_is_dropped_if_views_see_through_enough(small_holes
     two = torch.cat([vertices, 0.9 * vertices + 3]), torch.cat([faces, faces + len(vertices)])
     index = torch.arange(len(two[1]))
     first, through = index < len(faces), index >= (2 - share) * len(faces)
-    count = torch.full((len(two[1]),), 3)
     support = torch.where(first, Support.POINTS, Support.CONTOUR)
 
     def kept(behind):
-        counts = ViewCounts(seen=count, lit=count, behind=2 * behind.long())
+        counts = counted(len(index), behind=2 * behind.long())
         return seen_surface(*two, support, counts, torch.ones_like(first), 1.0, 0.01)
 
     assert bool((kept(through) == (first | (~through & stays))).all())
@@ -163,16 +166,11 @@ def test_cropped_views_show_the_same_pixels_at_projected_points(round_about):
     silhouettes = silhouettes_of(round_about.cameras)
     part = cropped(round_about, silhouettes)
     assert part.views.images.shape[-1] < round_about.views.images.shape[-1]
+    points = round_about.points_world
     for view in (0, 5):
-        before, _ = project(
-            round_about.points_world,
-            round_about.cameras.cam_from_world[view],
-            round_about.cameras.intrinsics[view],
-        )
-        after, _ = project(
-            round_about.points_world,
-            part.cameras.cam_from_world[view],
-            part.cameras.intrinsics[view],
+        before, after = (
+            project(points, one.cameras.cam_from_world[view], one.cameras.intrinsics[view])[0]
+            for one in (round_about, part)
         )
         u, v = before.long().unbind(dim=1)
         x, y = after.floor().long().unbind(dim=1)

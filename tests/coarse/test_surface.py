@@ -1,21 +1,21 @@
 import pytest
 import torch
-from scenes import without_points
+from scenes import ball, without_points
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_bench.scenes.procedural_meshes import icosphere
+import pimper_torch as pt
+from pimper_bench.scenes.procedural_meshes import icosphere, table
+from pimper_bench.scenes.render_in_memory import Sphere, render_shape
 from pimper_bench.scenes.scene_cameras import arc_cameras
-from pimper_torch.geometry.contours import Contours
+from pimper_bench.scenes.true_clouds import sparse_scene
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.topology import face_components, face_pairs
-from pimper_torch.records import Mesh, Silhouettes, Support
-from pimper_torch.runtime.errors import InputError, ReconstructionError
+from pimper_torch.records import Support
 from pimper_torch.stages.coarse.surface import (
-    CoarseSurface,
-    facets_of,
     limit_faces_per_edge,
+    point_covariances,
     smoothed_normals,
 )
 from tests.coarse.ball import SETTINGS, photographed
@@ -23,8 +23,8 @@ from tests.coarse.ball import SETTINGS, photographed
 
 def built(scene, mesh=None):
     """The coarse mesh of photographs without silhouettes."""
-    contours = Contours.none(Silhouettes.everything(scene.views), scene.cameras)
-    return CoarseSurface(SETTINGS)(scene, contours, mesh)
+    contours = pt.Contours.none(pt.Silhouettes.everything(scene.views), scene.cameras)
+    return pt.CoarseSurface(SETTINGS)(scene, contours, mesh)
 
 
 @pytest.fixture(scope="module")
@@ -92,9 +92,9 @@ def test_masks_exclude_the_background():
 
 def test_there_are_no_facets_below_the_supporting_plane(whole, round_about):
     plane = torch.tensor([0.0, 0.6, 0.8, -0.2])
-    silhouettes = Silhouettes.everything(round_about.views, plane[None])
-    contours = Contours.none(silhouettes, round_about.cameras)
-    mesh = CoarseSurface(SETTINGS)(round_about, contours).mesh
+    silhouettes = pt.Silhouettes.everything(round_about.views, plane[None])
+    contours = pt.Contours.none(silhouettes, round_about.cameras)
+    mesh = pt.CoarseSurface(SETTINGS)(round_about, contours).mesh
     side = 0.15  # of a facet
     height = mesh.vertices_world.double() @ plane[:3].double() + plane[3]
     assert -side < height.min() < side
@@ -106,23 +106,22 @@ def test_there_are_no_facets_below_the_supporting_plane(whole, round_about):
 
 
 def test_a_given_mesh_is_oriented_to_the_cameras_and_simplified(round_about):
-    vertices, faces = icosphere(3)
-    inside_out = Mesh(vertices_world=vertices, faces=faces.flip(1))
-    coarse = built(round_about, inside_out)
+    whole = ball()
+    coarse = built(round_about, whole.replace(faces=whole.faces.flip(1)))
     outward = face_normals(coarse.mesh.vertices_world, coarse.mesh.faces)
     centre = coarse.mesh.vertices_world[coarse.mesh.faces].mean(dim=1)
     assert ((outward * centre).sum(dim=-1) > 0).all()
-    assert len(coarse.mesh.faces) <= 600 < len(faces)
+    assert len(coarse.mesh.faces) <= 600 < len(whole.faces)
     assert (centre.norm(dim=1) - 1).abs().max() < 0.03
     assert len(coarse.points.facet) > 0.9 * len(round_about.points_world)
 
 
 def test_a_small_given_mesh_is_unchanged(round_about):
-    vertices, faces = icosphere(1)
-    assert vertices.dtype == torch.float64  # as read from files
-    coarse = built(round_about, Mesh(vertices_world=vertices, faces=faces))
-    assert coarse.mesh.vertices_world.dtype == round_about.cameras.intrinsics.dtype == torch.float32
-    assert_close(coarse.mesh.vertices_world[coarse.mesh.faces], vertices.float()[faces])
+    mesh = ball(level=1)
+    assert mesh.vertices_world.dtype == torch.float64  # as read from files
+    found = built(round_about, mesh).mesh
+    assert found.vertices_world.dtype == round_about.cameras.intrinsics.dtype == torch.float32
+    assert_close(found.vertices_world[found.faces], mesh.vertices_world.float()[mesh.faces])
 
 
 @pytest.mark.parametrize(
@@ -134,13 +133,13 @@ def test_a_small_given_mesh_is_unchanged(round_about):
 )
 def test_an_unusable_mesh_is_rejected(round_about, change, message):
     vertices, faces = change(*icosphere(1))
-    with pytest.raises(InputError, match=message):
-        built(round_about, Mesh(vertices_world=vertices.float(), faces=faces))
+    with pytest.raises(pt.InputError, match=message):
+        built(round_about, pt.Mesh(vertices_world=vertices.float(), faces=faces))
 
 
 def test_a_cloud_without_reliable_points_is_rejected(round_about):
     doubtful = round_about.replace(reprojection_errors_px=round_about.reprojection_errors_px + 100)
-    with pytest.raises(ReconstructionError, match="0 of"):
+    with pytest.raises(pt.ReconstructionError, match="0 of"):
         built(doubtful)
 
 
@@ -154,13 +153,7 @@ def test_smoothing_normals_keeps_a_plane_and_halves_a_crease():
     line = torch.linspace(-1, 1, 3)
     y, x = torch.meshgrid(line, line, indexing="ij")
     flat = torch.stack([x, y, 0 * x], dim=-1).reshape(-1, 3)
-    corner = torch.tensor([0, 1, 3, 4])
-    faces = torch.cat(
-        [
-            torch.stack([corner, corner + 1, corner + 4], dim=1),
-            torch.stack([corner, corner + 4, corner + 3], dim=1),
-        ]
-    )
+    faces = table(1.0, cells=2).faces
     up = torch.tensor([0.0, 0.0, 1.0]).expand(9, 3)
     assert_close(smoothed_normals(flat, faces), up)
     # A roof along y: normals (-1, 0, 1), up and (1, 0, 1) rotate halfway to their neighbours.
@@ -176,8 +169,8 @@ def test_smoothing_normals_keeps_a_plane_and_halves_a_crease():
 
 def test_facets_of_a_mesh_are_its_faces_with_points_as_in_a_chain(round_about):
     vertices, faces = icosphere(2)
-    mesh = Mesh(vertices_world=vertices, faces=faces.flip(1))  # wound inwards
-    found = facets_of(mesh, round_about)
+    mesh = pt.Mesh(vertices_world=vertices, faces=faces.flip(1))  # wound inwards
+    found = pt.facets_of(mesh, round_about)
     assert len(found.mesh.faces) == len(faces)
     assert found.mesh.vertices_world.dtype == round_about.points_world.dtype
     outward = face_normals(found.mesh.vertices_world, found.mesh.faces)
@@ -187,12 +180,47 @@ def test_facets_of_a_mesh_are_its_faces_with_points_as_in_a_chain(round_about):
     assert_close(found.points.points_world, expected.points.points_world)
     assert_close(found.points.covariance_world, expected.points.covariance_world)
     bare = without_points(round_about)
-    assert len(facets_of(mesh, bare, round_about.views.names[3]).points.facet) == 0
-    assert facets_of(mesh, bare, round_about.views.names[3]).reference == 3
+    assert len(pt.facets_of(mesh, bare, round_about.views.names[3]).points.facet) == 0
+    assert pt.facets_of(mesh, bare, round_about.views.names[3]).reference == 3
 
 
 def test_facets_of_a_misplaced_mesh_are_rejected(round_about):
-    vertices, faces = icosphere(2)
-    mesh = Mesh(vertices_world=1000 * vertices, faces=faces)
-    with pytest.raises(InputError, match="not where the photographs show the object"):
-        facets_of(mesh, round_about)
+    with pytest.raises(pt.InputError, match="not where the photographs show the object"):
+        pt.facets_of(ball(1000.0, level=2), round_about)
+
+
+def noisy_cloud(noise_px, seed, span_deg=50.0):
+    cameras = arc_cameras(
+        6, width=160, height=120, focal_px=200.0, distance=4.0, sway_deg=0.0, span_deg=span_deg
+    )
+    lights = torch.tensor([[0.4, 0.0, 0.0, 0.4]], dtype=torch.float64).expand(6, 4)
+    scene = render_shape(Sphere(), cameras, lights, lambda points: torch.ones_like(points))
+    generator = torch.Generator().manual_seed(seed)
+    return sparse_scene(scene, 1500, generator, noise_px=noise_px, dtype=torch.float64)
+
+
+def test_covariances_match_the_errors_of_triangulated_points():
+    noise = 0.3
+    cloud = noisy_cloud(noise, 0)
+    everyone = torch.arange(len(cloud.points_world))
+    covariance = point_covariances(cloud, everyone)
+    # The points came from a sphere: the radial error is known without knowing the point.
+    radial = cloud.points_world / cloud.points_world.norm(dim=1, keepdim=True)
+    predicted = torch.einsum("pi,pij,pj->p", radial, covariance, radial)
+    error = cloud.points_world.norm(dim=1) - 1
+    ratio = float((error.square() / predicted).mean())
+    assert 0.6 < ratio < 1.6  # the triangulation is not weighted by depth, nor noise by track
+    # Points with a larger predicted error have a larger one.
+    order = predicted.argsort()
+    half = len(order) // 2
+    spread = [float(error[part].square().mean()) for part in (order[:half], order[half:])]
+    assert spread[1] > 1.2 * spread[0]
+
+
+def test_points_without_error_are_certain_and_all_covariances_are_symmetric():
+    cloud = noisy_cloud(0.0, 2)
+    covariance = point_covariances(cloud, torch.arange(20))
+    assert covariance.abs().max() < 1e-6  # rounding of the depth maps
+    noisy = point_covariances(noisy_cloud(0.3, 2), torch.arange(20))
+    assert_close(noisy, noisy.mT)
+    assert (torch.linalg.eigvalsh(noisy) > 0).all()

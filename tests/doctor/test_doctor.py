@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 from PIL import Image
+from scenes import write_ball
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.cli.doctor.checks import (
     blur,
     examine_folder,
@@ -21,15 +21,8 @@ from pimper_torch.cli.doctor.findings import available_gb, machine, total_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
 from pimper_torch.cli.doctor.photograph import Photograph, edge_blur_px, of_views, summarize
 from pimper_torch.cli.main import main
-from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.photographs import load_views
-from pimper_torch.records import Mesh
 from pimper_torch.stages.sfm.matching import VerifiedPair
-
-
-@pytest.fixture
-def generator():
-    return torch.Generator().manual_seed(44)
 
 
 def photograph(**changes):
@@ -55,7 +48,8 @@ def squares(side=400, cell=40):
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 3.0])
-def test_the_blur_of_edges_is_found_in_pixels(sigma, generator):
+def test_the_blur_of_edges_is_found_in_pixels(sigma):
+    generator = torch.Generator().manual_seed(44)
     image = torch.from_numpy(gaussian_filter(squares().numpy(), sigma))
     noise = 0.003 * torch.randn(image.shape, generator=generator)
     # A pixel's area adds a twelfth to the variance; aliased edges add a little.
@@ -145,8 +139,7 @@ def test_the_machine_is_described():
 def photos(tmp_path_factory):
     """Photographs of a ball."""
     folder = tmp_path_factory.mktemp("scenes")
-    vertices, faces = icosphere(3)
-    write_ply(Mesh(vertices_world=vertices, faces=faces), folder / "ball.ply")
+    write_ball(folder / "ball.ply")
     small = "--num-views 5 --width 320 --height 240 --span-deg 25 --supersample 1 --processes 1 -q"
     assert main(["render", str(folder / "ball.ply"), "-o", str(folder / "a"), *small.split()]) == 0
     return folder / "a" / "photos"

@@ -1,14 +1,5 @@
 import pytest
-
-from pimper_torch.cli.main import main
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
-
-
-def contents(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.*")}
+from command_line import contents, run
 
 
 def test_each_format_has_a_folder_with_its_name(folder, tmp_path, capsys):

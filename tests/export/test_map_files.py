@@ -6,8 +6,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_torch.export.map_files import with_axes, write_maps
+from pimper_torch.export.picture_files import file_names, refuse_skew
 from pimper_torch.io.decode import decode
 from pimper_torch.io.openexr import write_exr
+from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.numpy_files import read_npz
 from pimper_torch.viz.maps import view_maps
 
@@ -64,3 +66,21 @@ def test_sixteen_bit_normals_are_exact_to_half_a_level(result, tmp_path):
     # Half a level of 65,535 for a range of two, and float32's rounding in both directions.
     assert_close(found, expected, rtol=0, atol=1.02 / 65535)
     assert (png.samples[:, ~maps.seen] == 0).all()
+
+
+def test_file_names_are_unique_and_stay_in_the_folder():
+    names = ["a.jpg", "a.png", "../b.png", "/c/b.png", "c\\d.tif", "a_jpg.png"]
+    files = file_names(names)
+    assert len(set(files)) == len(names)
+    assert not any("/" in file or "\\" in file or ".." in file for file in files)
+    assert all(file.endswith(".png") for file in files)
+
+
+def test_a_skew_that_moves_pixels_is_refused_and_rounding_is_not(reconstruction):
+    cameras, names = reconstruction.cameras, reconstruction.scene.views.names
+    K = cameras.intrinsics.clone()
+    K[1, 0, 1] = 1e-2  # times half of 40 pixels, divided by a focal length of 90
+    refuse_skew(cameras.replace(intrinsics=K), names, "a toy")
+    K[1, 0, 1] = 0.1
+    with pytest.raises(InputError, match=r"b\.png have a skew"):
+        refuse_skew(cameras.replace(intrinsics=K), names, "a toy")

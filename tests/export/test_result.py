@@ -40,13 +40,8 @@ def test_a_result_folder_is_read_back_as_in_the_run(folder, run):
     assert found.summary["registered"] == 3
     assert list(found.summary["thumbnails"]) == ["a.png", "b.png", "c.png"]
     assert found.mesh.vertices_world.dtype == torch.float32
-    assert_close(
-        found.lights_world,
-        estimate_of(run).lights_world.double(),
-        rtol=1e-5,
-        atol=1e-6,
-        equal_nan=True,
-    )
+    lights = estimate_of(run).lights_world.double()
+    assert_close(found.lights_world, lights, rtol=1e-5, atol=1e-6, equal_nan=True)
 
 
 def test_moved_photographs_are_named(folder, photographs, tmp_path):

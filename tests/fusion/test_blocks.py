@@ -16,13 +16,8 @@ MOST = 600.0
 
 
 @pytest.fixture(scope="module")
-def cap():
-    return cap_of(4)
-
-
-@pytest.fixture(scope="module")
-def drawn(cap):
-    return noisy(cap, 0.05, 0.3, torch.Generator().manual_seed(5))
+def drawn():
+    return noisy(cap_of(4), 0.05, 0.3, torch.Generator().manual_seed(5))
 
 
 @pytest.fixture(scope="module")

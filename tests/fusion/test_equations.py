@@ -114,14 +114,8 @@ def test_kept_steps_are_those_of_the_current_surface(subdivision, generator):
     found = kept_steps(edges, subdivision.points, height, 0.01)
     assert_close(found.residual(height + 3), torch.zeros(len(edges)).double(), rtol=0, atol=1e-12)
     assert found.residual(1.1 * height).abs().max() > 0.01
-    flat = kept_slopes(
-        edges,
-        subdivision.points,
-        UP.expand(len(height), 3),
-        UP.expand(len(height), 3),
-        height,
-        0.01 + 0 * height,
-    )
+    along = UP.expand(len(height), 3)
+    flat = kept_slopes(edges, subdivision.points, along, along, height, 0.01 + 0 * height)
     assert_close(found.information, flat.information)
     assert not found.evaluated
 

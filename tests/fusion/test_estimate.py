@@ -90,13 +90,7 @@ def test_one_solve_is_plain_least_squares(generator):
 
 def test_vertices_without_equations_keep_their_heights():
     kind = places(torch.zeros(COUNT).double(), 0.1)
-    some = kind.replace(
-        unknowns=kind.unknowns[:10],
-        coefficients=kind.coefficients[:10],
-        targets=kind.targets[:10],
-        information=kind.information[:10],
-        correlated=kind.correlated[:10],
-    )
+    some = kind.take(torch.arange(10))
     start = torch.full((COUNT,), 5.0, dtype=torch.float64)
     found = fuse_terms([some], start, torch.full((COUNT,), 1e-9).double(), 1).heights
     assert_close(found[10:], start[10:])

@@ -49,10 +49,10 @@ def heights(subdivision, deviation, correlated=1.0, vertices=None):
     )
 
 
-def solved(subdivision, *kinds):
+def solved(subdivision, *kinds, iterations=1):
     count = len(subdivision.points)
     damping = torch.full((count,), 1e-6).double()
-    return fuse_terms(kinds, torch.zeros(count).double(), damping, iterations=1)
+    return fuse_terms(kinds, torch.zeros(count).double(), damping, iterations)
 
 
 def dense(fused):
@@ -71,6 +71,13 @@ def dense(fused):
 
 def near(found, expected):
     assert ((found / expected - 1).abs() < CLOSE).all()
+
+
+def shared_by_regions(subdivision, edges):
+    """Return which pairs of edges share an error of their region, by their directions."""
+    along = normalize(subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]], dim=1)
+    region = regions(subdivision)[subdivision.facet[edges[:, 0]]]
+    return (along @ along.mT) * (region[:, None] == region)
 
 
 def test_independent_noise_gives_the_diagonal_of_the_inverse(square):
@@ -110,11 +117,8 @@ def test_a_tilt_of_a_region_acts_on_edges_by_direction(square):
     found = expected_error(fused, fused, subdivision, facets, DRAWS)
     # Oracle: one tilt of five times 0.1 per region, about both axes of the plane.
     edges = kept.unknowns
-    along = normalize(subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]], dim=1)
-    region = regions(subdivision)[subdivision.facet[edges[:, 0]]]
-    alike = (along @ along.mT) * (region[:, None] == region)
     deviation = 5 * kept.information.rsqrt()
-    covariance = deviation[:, None] * deviation * alike
+    covariance = deviation[:, None] * deviation * shared_by_regions(subdivision, edges)
     _, answer = dense(fused)
     own = answer[:, : len(edges)]
     total = own @ covariance @ own.mT
@@ -134,13 +138,10 @@ def test_detail_and_coarse_shape_share_their_noise(square):
     answer = of_fine + low @ (of_coarse - of_fine)
     # Noise is that of the coarse solve; edges of a region share part of it.
     edges = tied.unknowns
-    along = normalize(subdivision.points[edges[:, 1]] - subdivision.points[edges[:, 0]], dim=1)
     facet = subdivision.facet[edges[:, 0]]
     count = torch.bincount(facet)[facet].double()
     fraction = (8 / (count - 1)).clamp(0, 1)
-    region = regions(subdivision)[facet]
-    alike = (along @ along.mT) * (region[:, None] == region)
-    together = (fraction[:, None] * fraction).sqrt() * alike
+    together = (fraction[:, None] * fraction).sqrt() * shared_by_regions(subdivision, edges)
     deviation = (tied.information * 9).rsqrt()
     covariance = deviation[:, None] * deviation * (together + torch.diag(1 - fraction))
     own, rest = answer[:, : len(edges)], answer[:, len(edges) : len(edges) + len(eye)]
@@ -159,9 +160,7 @@ def test_facets_without_vertices_have_regions():
 def test_noise_factors_below_one_do_not_reduce_the_error(square, generator):
     subdivision, facets = square
     exact = [differences(subdivision, 0.1), heights(subdivision, 0.1)]  # without noise
-    count = len(subdivision.points)
-    damping = torch.full((count,), 1e-6).double()
-    modest = fuse_terms(exact, torch.zeros(count).double(), damping, 5)
+    modest = solved(subdivision, *exact, iterations=5)
     assert max(modest.factors) < 0.5
     claimed = solved(subdivision, *exact)
     found = expected_error(modest, modest, subdivision, facets, DRAWS)
@@ -185,11 +184,9 @@ def test_downweighted_outliers_do_not_raise_the_error(square, generator):
     noise = 0.05 * torch.randn(len(measured.targets), generator=generator, dtype=torch.float64)
     wild = noise.clone()
     wild[::15] += 3.0
-    count = len(subdivision.points)
-    damping = torch.full((count,), 1e-6).double()
     tied = differences(subdivision, 0.02)
     plain, spoiled = (
-        fuse_terms([tied, measured.replace(targets=one)], torch.zeros(count).double(), damping, 6)
+        solved(subdivision, tied, measured.replace(targets=one), iterations=6)
         for one in (noise, wild)
     )
     clean = expected_error(plain, plain, subdivision, facets, DRAWS)

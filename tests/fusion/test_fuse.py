@@ -9,14 +9,13 @@ from torch import nn
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+import pimper_torch as pt
 from pimper_torch.chains.photometric import warn_of_priors
-from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.pinholes import pinholes
 from pimper_torch.geometry.rigid import rotate
 from pimper_torch.geometry.topology import face_edges
-from pimper_torch.records import Cameras, ContourPoints, FacetPoints, PatchPriors, Silhouettes
-from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
+from pimper_torch.records import ContourPoints, FacetPoints, PatchPriors
 from pimper_torch.stages.fusion.equations import Equations
-from pimper_torch.stages.fusion.fuse import Fuse
 from pimper_torch.stages.fusion.fuse_config import KINDS, FuseConfig
 from pimper_torch.stages.fusion.terms import (
     TERMS,
@@ -26,7 +25,6 @@ from pimper_torch.stages.fusion.terms import (
     Term,
     TouchedRays,
 )
-from pimper_torch.stages.sweep.sweep import Sweep
 
 
 def without(*names: str) -> tuple[str, ...]:
@@ -34,15 +32,11 @@ def without(*names: str) -> tuple[str, ...]:
 
 
 # Silhouettes without constraint.
-FREE = Contours.none(
-    Silhouettes(
+FREE = pt.Contours.none(
+    pt.Silhouettes(
         inside=torch.ones(1, 1, 1), reliable=torch.zeros(1, dtype=torch.bool), source="everything"
     ),
-    Cameras(
-        intrinsics=torch.eye(3)[None],
-        cam_from_world=torch.eye(4)[None],
-        sizes_px=torch.ones(1, 2, dtype=torch.long),
-    ),
+    pinholes(torch.eye(4)[None], 1.0, 1, 1),
 )
 
 
@@ -52,7 +46,7 @@ def swept(lift):
     def make(height: float):
         lifted = lift(height)
         scene = lifted.scene
-        return lifted, Sweep()(scene.views, scene.cameras, lifted.seen, lifted.photometric)
+        return lifted, pt.Sweep()(scene.views, scene.cameras, lifted.seen, lifted.photometric)
 
     return make
 
@@ -65,26 +59,21 @@ def off_plane(lifted, surface) -> torch.Tensor:
 
 def test_facets_off_a_plane_are_moved_onto_it(swept):
     lifted, given = swept(-1.5)
-    surface = Fuse()(given, FREE)
+    surface = pt.Fuse()(given, FREE)
     off = off_plane(lifted, surface).abs()
     assert off.quantile(0.9) < 0.05
     assert off.max() < 0.3
     cosine = (surface.normals_world.double() @ lifted.normal).clamp(-1, 1)
     assert cosine.acos().rad2deg().quantile(0.9) < 0.5
-    assert (
-        abs(
-            float(surface.convergence.residual) / float(lifted.seen.patches.buckets[0].spacing[0])
-            - abs(lifted.height)
-        )
-        < 0.1
-    )
+    spacing = float(lifted.seen.patches.buckets[0].spacing[0])
+    assert abs(float(surface.convergence.residual) / spacing - abs(lifted.height)) < 0.1
 
 
 def test_heights_alone_move_facets_and_slopes_alone_do_not(swept):
     lifted, given = swept(1.0)
-    heights = Fuse(FuseConfig(terms=without("normals")))(given, FREE)
+    heights = pt.Fuse(FuseConfig(terms=without("normals")))(given, FREE)
     assert off_plane(lifted, heights).abs().median() < 0.05
-    slopes = Fuse(FuseConfig(terms=without("swept_heights", "cloud_points")))(given, FREE)
+    slopes = pt.Fuse(FuseConfig(terms=without("swept_heights", "cloud_points")))(given, FREE)
     # Heights are undetermined: the facets, which are parallel, stay a sample above.
     assert (off_plane(lifted, slopes) - lifted.height).abs().max() < 0.05
 
@@ -97,8 +86,8 @@ def test_normal_bias_of_a_facet_does_not_tilt_it(swept):
         return found.replace(normals_patch=normalize(wrong, dim=-1))
 
     tilted = given.replace(photometric=each_bucket(given.photometric, tilt))
-    kept = off_plane(lifted, Fuse()(tilted, FREE))
-    trusting = off_plane(lifted, Fuse(FuseConfig(bias_iterations=0))(tilted, FREE))
+    kept = off_plane(lifted, pt.Fuse()(tilted, FREE))
+    trusting = off_plane(lifted, pt.Fuse(FuseConfig(bias_iterations=0))(tilted, FREE))
     assert kept.std() < 0.1
     assert kept.std() < 0.5 * trusting.std()
 
@@ -114,7 +103,7 @@ def test_normals_perpendicular_to_the_heights_raise_no_fold(swept):
         return found.replace(normals_patch=normals)
 
     wrong = given.replace(photometric=each_bucket(given.photometric, spoil))
-    surface = Fuse(FuseConfig(terms=without("swept_heights")))(wrong, FREE)
+    surface = pt.Fuse(FuseConfig(terms=without("swept_heights")))(wrong, FREE)
     assert (off_plane(lifted, surface) - lifted.height).abs().max() < 1.0  # a fold: 5.6
 
 
@@ -141,14 +130,14 @@ def spoiled(given, **changes):
 )
 def test_impossible_normals_and_information_are_rejected(swept, changes, message):
     _, given = swept(0.5)
-    with pytest.raises(InputError, match=message):
-        Fuse()(spoiled(given, valid=True, **changes), FREE)
+    with pytest.raises(pt.InputError, match=message):
+        pt.Fuse()(spoiled(given, valid=True, **changes), FREE)
 
 
 def test_invalid_normals_may_face_away(swept):
     _, given = swept(0.5)
     away = spoiled(given, valid=False, normals_patch=torch.tensor([0.0, 0, 1]).double())
-    assert Fuse()(away, FREE).vertices_world.isfinite().all()
+    assert pt.Fuse()(away, FREE).vertices_world.isfinite().all()
 
 
 def with_points(given, points, claimed: float):
@@ -177,14 +166,14 @@ def test_biased_heights_do_not_outvote_points(swept):
     # Wrong shading shifts all heights at which views agree.
     wrong = tuple(b.replace(offset=b.offset + 1.5 * spacing) for b in given.buckets)
     misled = known.replace(buckets=wrong)
-    off = off_plane(lifted, Fuse()(misled, FREE))
+    off = off_plane(lifted, pt.Fuse()(misled, FREE))
     assert off.abs().quantile(0.9) < 0.1
-    assert off_plane(lifted, Fuse(FuseConfig(bias_iterations=0))(misled, FREE)).median() > 0.5
+    assert off_plane(lifted, pt.Fuse(FuseConfig(bias_iterations=0))(misled, FREE)).median() > 0.5
     # Correct heights still help: they carry more information than a few points.
-    assert off_plane(lifted, Fuse()(known, FREE)).abs().quantile(0.9) < 0.05
+    assert off_plane(lifted, pt.Fuse()(known, FREE)).abs().quantile(0.9) < 0.05
 
 
-class Touching(Contours):
+class Touching(pt.Contours):
     """Contours with given tangent points, independent of the surface."""
 
     def __init__(self, points, normal, sigma):
@@ -213,13 +202,13 @@ def test_contours_pull_the_surface_to_tangency(swept):
     points = points + 3 * spacing * torch.linspace(-1, 1, 60).double()[:, None] * ray
     contours = Touching(points, lifted.normal, 0.1 * spacing)
     silent = FuseConfig(terms=without("swept_heights", "cloud_points"))
-    assert off_plane(lifted, Fuse(silent)(given, contours)).abs().quantile(0.9) < 0.1
+    assert off_plane(lifted, pt.Fuse(silent)(given, contours)).abs().quantile(0.9) < 0.1
     deaf = FuseConfig(terms=without("swept_heights", "cloud_points", "contour_rays"))
-    unheard = Fuse(deaf)(given, contours)
+    unheard = pt.Fuse(deaf)(given, contours)
     assert (off_plane(lifted, unheard) - lifted.height).abs().max() < 0.05
     # A tenth of them are off the object: the others outvote them.
     points[::10] += 5 * spacing * lifted.normal
-    wrong = Fuse(silent)(given, Touching(points, lifted.normal, 0.1 * spacing))
+    wrong = pt.Fuse(silent)(given, Touching(points, lifted.normal, 0.1 * spacing))
     assert off_plane(lifted, wrong).abs().quantile(0.9) < 0.3
 
 
@@ -234,7 +223,7 @@ def test_overconfident_points_raise_no_pimples(swept):
         buckets.append(found.replace(normals_patch=normalize(wrong, dim=-1)))
     tilted = given.replace(photometric=given.photometric.replace(buckets=tuple(buckets)))
     points = near_plane(lifted, 0.3 * spacing, count=60)
-    surface = Fuse(FuseConfig(max_lost=0.0))(with_points(tilted, points, 0.02 * spacing), FREE)
+    surface = pt.Fuse(FuseConfig(max_lost=0.0))(with_points(tilted, points, 0.02 * spacing), FREE)
     off = off_plane(lifted, surface)
     edges = face_edges(surface.faces)[0]
     edges = torch.cat([edges, edges.flip(1)])
@@ -246,7 +235,7 @@ def test_overconfident_points_raise_no_pimples(swept):
 def test_an_unlit_surface_keeps_its_shape(swept):
     lifted, given = swept(0.8)
     dark = each_bucket(unlit(given), lambda found: found.replace(information=0 * found.information))
-    surface = Fuse()(dark, FREE)
+    surface = pt.Fuse()(dark, FREE)
     off = off_plane(lifted, surface)
     assert off.std() < 1e-4  # as flat as the facets, and not moved
     assert abs(float(off.mean()) - lifted.height) < 0.02
@@ -268,7 +257,7 @@ def test_albedo_of_unlit_surface_is_inpainted_from_its_surroundings(swept):
     photometric = each_bucket(
         given.photometric, lambda found: in_the_centre_of_each(found, lambda square: None)
     )
-    whole, holed = Fuse()(given, FREE), Fuse()(given.replace(photometric=photometric), FREE)
+    whole, holed = pt.Fuse()(given, FREE), pt.Fuse()(given.replace(photometric=photometric), FREE)
     dark = holed.confidence == 0
     assert dark.any()
     off = (holed.albedo - whole.albedo)[dark].abs()
@@ -298,7 +287,7 @@ def with_dark_dents(given, spacings: float):
 
 def test_a_dent_without_evidence_is_bridged(swept):
     lifted, given = swept(0.0)
-    surface = Fuse()(with_dark_dents(given, 5.0), FREE)
+    surface = pt.Fuse()(with_dark_dents(given, 5.0), FREE)
     assert (surface.confidence == 0).any()
     assert off_plane(lifted, surface).abs().max() < 0.5
 
@@ -307,7 +296,7 @@ def test_inpainted_normals_do_not_outvote_points(swept):
     lifted, given = swept(0.0)
     spacing = float(given.patches.buckets[0].spacing[0])
     holed = with_dark_dents(given, 0.0)
-    fuse = Fuse(FuseConfig(max_lost=0.0))  # the same vertex spacing in the holes as elsewhere
+    fuse = pt.Fuse(FuseConfig(max_lost=0.0))  # the same vertex spacing in the holes as elsewhere
     flat = fuse(holed, FREE)
     (dark,) = torch.nonzero((flat.confidence == 0) & (flat.facet == 0), as_tuple=True)
     places = flat.vertices_world[dark].double()
@@ -322,7 +311,7 @@ def test_inpainted_normals_do_not_outvote_points(swept):
 
 
 def test_fusion_without_terms_is_rejected():
-    with pytest.raises(ConfigError, match=r"fuse\.terms"):
+    with pytest.raises(pt.ConfigError, match=r"fuse\.terms"):
         FuseConfig(terms=())
 
 
@@ -354,7 +343,7 @@ def test_a_custom_term_is_fused_and_its_parameters_have_gradients(swept):
     lifted, given = swept(1.0)
     spacing = float(given.patches.buckets[0].spacing[0])
     own = At(0.7 * spacing)
-    fuse = Fuse(FuseConfig(noise_iterations=1, error_draws=0), [KeptSlopes(), own])
+    fuse = pt.Fuse(FuseConfig(noise_iterations=1, error_draws=0), [KeptSlopes(), own])
     surface = fuse(given, FREE)
     assert_close(
         off_plane(lifted, surface), torch.full_like(surface.information, 1.7), atol=1e-2, rtol=0
@@ -362,15 +351,15 @@ def test_a_custom_term_is_fused_and_its_parameters_have_gradients(swept):
     surface.vertices_world.sum().backward()
     # All facets are raised together: every vertex moves along its direction.
     assert own.height.grad.abs() > 0.9 * len(surface.information) * abs(float(lifted.normal.sum()))
-    with pytest.raises(ConfigError, match="modules derived from Term"):
-        Fuse(terms=[nn.Identity()])
+    with pytest.raises(pt.ConfigError, match="modules derived from Term"):
+        pt.Fuse(terms=[nn.Identity()])
 
 
 def test_named_terms_equal_listed_terms(swept):
     _, given = swept(1.0)
-    named = Fuse(FuseConfig(terms=without("cloud_points")))(given, FREE)
+    named = pt.Fuse(FuseConfig(terms=without("cloud_points")))(given, FREE)
     listed = [KeptSlopes(), TouchedRays(), SweptHeights(), Normals()]
-    assert torch.equal(named.vertices_world, Fuse(terms=listed)(given, FREE).vertices_world)
+    assert torch.equal(named.vertices_world, pt.Fuse(terms=listed)(given, FREE).vertices_world)
 
 
 def with_prior_normals(lifted, given, lean: float, error_deg: float):
@@ -402,13 +391,13 @@ def unlit(given):
 
 def test_a_contradicted_prior_is_overruled_despite_its_small_error(swept):
     lifted, given = swept(0.5)
-    surface = Fuse()(given, FREE)
+    surface = pt.Fuse()(given, FREE)
     plain = off_plane(lifted, surface).abs()
     for error_deg in (5.0, 1.0):
         wrong = with_prior_normals(lifted, given, lean=0.3, error_deg=error_deg)
-        off = off_plane(lifted, Fuse()(wrong, FREE)).abs()
+        off = off_plane(lifted, pt.Fuse()(wrong, FREE)).abs()
         assert off.quantile(0.9) < plain.quantile(0.9) + 0.05
-    deaf = Fuse(FuseConfig(terms=without("prior_normals")))(wrong, FREE)
+    deaf = pt.Fuse(FuseConfig(terms=without("prior_normals")))(wrong, FREE)
     assert torch.equal(deaf.vertices_world, surface.vertices_world)
 
 
@@ -417,7 +406,7 @@ def test_normal_priors_determine_slopes_of_unlit_surface(swept):
     axis = torch.tensor([1.0, 0.0, 0.0]).double()
     across = normalize(axis - (axis @ lifted.normal) * lifted.normal, dim=0)
     silent = FuseConfig(terms=without("swept_heights", "cloud_points"), bias_iterations=0)
-    surface = Fuse(silent)(with_prior_normals(lifted, unlit(given), 0.1, 0.5), FREE)
+    surface = pt.Fuse(silent)(with_prior_normals(lifted, unlit(given), 0.1, 0.5), FREE)
     away = off_plane(lifted, surface)
     along = surface.vertices_world.double() @ across
     along = along / float(given.patches.buckets[0].spacing[0])
@@ -432,7 +421,7 @@ def test_disagreement_of_priors_is_reported_and_warned_of(swept):
     assert right["prior_normals_deg"] < 0.1
     wrong = with_prior_normals(lifted, given, lean=0.3, error_deg=1.0).figures()
     assert abs(wrong["prior_normals_deg"] - math.degrees(math.atan(0.3))) < 0.5
-    with pytest.warns(PimperWarning, match=r"Prior normals deviate .* 7\.0 times"):
+    with pytest.warns(pt.PimperWarning, match=r"Prior normals deviate .* 7\.0 times"):
         warn_of_priors(wrong)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -4,32 +4,23 @@ import math
 
 import pytest
 import torch
-from scenes import each_bucket
 from scipy.spatial import Delaunay
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.contours import Contours
+import pimper_torch as pt
+from pimper_torch.geometry.pinholes import pinholes
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.geometry.template_normals import transferred_normals
-from pimper_torch.records import (
-    Cameras,
-    CoarseMesh,
-    Heights,
-    Mesh,
-    PhotometricPatches,
-    Silhouettes,
-    SweptPatches,
-)
+from pimper_torch.records import Heights
 from pimper_torch.stages.fusion.blend import vertex_spacing
 from pimper_torch.stages.fusion.detail import spacing_of
 from pimper_torch.stages.fusion.estimate import fuse_terms
-from pimper_torch.stages.fusion.fuse import Fuse
 from pimper_torch.stages.fusion.fuse_config import FuseConfig
 from pimper_torch.stages.fusion.problem import build_problem, subdivide_facets
 from pimper_torch.stages.fusion.terms import KeptSlopes, Normals, SweptHeights
-from pimper_torch.stages.patches.decompose import Decompose
 from pimper_torch.stages.patches.patches_config import DecomposeConfig
+from tests.fusion.test_fuse import unlit
 from tests.threads import on_threads
 
 # Center of the sphere of radius 1, which is seen from -z.
@@ -44,19 +35,14 @@ def off_sphere(points):
 def cameras():
     cam_from_world = torch.eye(4, dtype=torch.float64)[None].clone()
     cam_from_world[0, 2, 3] = 4
-    focal = 4 / SPACING
-    return Cameras(
-        intrinsics=torch.tensor([[[focal, 0, 50], [0, focal, 50], [0, 0, 1]]]).double(),
-        cam_from_world=cam_from_world,
-        sizes_px=torch.tensor([[100, 100]]),
-    )
+    return pinholes(cam_from_world, 4 / SPACING, 100, 100)
 
 
 def free():
     views = torch.ones(1, 1, 1)
     nothing = torch.zeros(1, dtype=torch.bool)
-    silhouettes = Silhouettes(inside=views, reliable=nothing, source="everything")
-    return Contours.none(silhouettes, cameras())
+    silhouettes = pt.Silhouettes(inside=views, reliable=nothing, source="everything")
+    return pt.Contours.none(silhouettes, cameras())
 
 
 @pytest.fixture(scope="module")
@@ -80,17 +66,19 @@ def cap_of(count, samples_per_pixel=1.0):
     vertices = torch.cat([xy, 1 - (1 - xy.square().sum(dim=1, keepdim=True)).sqrt()], dim=1)
     faces = torch.tensor(Delaunay(xy.numpy()).simplices).long()
     faces = torch.where((face_normals(vertices, faces)[:, 2] > 0)[:, None], faces.flip(1), faces)
-    mesh = Mesh(vertices_world=vertices, faces=faces, normals_world=vertex_normals(vertices, faces))
-    coarse = CoarseMesh(mesh=mesh, reference=0, is_point=torch.ones(len(xy), dtype=torch.bool))
+    mesh = pt.Mesh(
+        vertices_world=vertices, faces=faces, normals_world=vertex_normals(vertices, faces)
+    )
+    coarse = pt.CoarseMesh(mesh=mesh, reference=0, is_point=torch.ones(len(xy), dtype=torch.bool))
     config = DecomposeConfig(overlap_samples=3.0, samples_per_pixel=samples_per_pixel)
-    patches = Decompose(config)(coarse, cameras())
+    patches = pt.Decompose(config)(coarse, cameras())
     normals, heights = zip(
         *(exact(coarse, templates) for templates in patches.buckets), strict=True
     )
-    photometric = PhotometricPatches.of(
+    photometric = pt.PhotometricPatches.of(
         patches, normals=normals, lights=torch.ones(1, 4), information=1e4
     )
-    return SweptPatches(photometric=photometric, buckets=heights, averaged=1.0)
+    return pt.SweptPatches(photometric=photometric, buckets=heights, averaged=1.0)
 
 
 def exact(coarse, templates):
@@ -181,7 +169,7 @@ def test_vertex_spacing_follows_the_detail_of_each_facet(wide, period, sizes, ap
 def test_a_ripple_is_kept_while_other_facets_are_coarse(wide):
     """Its slopes are photometric: heights have the wave's amplitude over its wave number."""
     swept = rippled(wide, 8, normals=0.2)
-    some, every = (Fuse(FuseConfig(max_lost=lost))(swept, free()) for lost in (0.1, 0.0))
+    some, every = (pt.Fuse(FuseConfig(max_lost=lost))(swept, free()) for lost in (0.1, 0.0))
     assert 3 * len(some.vertices_world) < len(every.vertices_world)
     facet = swept.patches.buckets[0].facet[0]
     inner = (some.facet == facet) & (some.barycentric > 0.2).all(dim=1)
@@ -193,7 +181,7 @@ def test_a_ripple_is_kept_while_other_facets_are_coarse(wide):
 
 
 def test_flat_facets_are_moved_onto_the_sphere(cap):
-    surface = Fuse(FuseConfig(max_lost=0.0))(cap, free())
+    surface = pt.Fuse(FuseConfig(max_lost=0.0))(cap, free())
     mesh = cap.patches.coarse.mesh
     sag = off_sphere(mesh.vertices_world[mesh.faces].mean(dim=1)).abs().max()
     assert sag > 0.7 * SPACING
@@ -209,7 +197,7 @@ def test_flat_facets_are_moved_onto_the_sphere(cap):
 @pytest.mark.parametrize(("rotation", "lift"), [(0.05, 0.5), (0.2, 2.0)])
 def test_the_expected_error_matches_draws_despite_wrong_variances(cap, rotation, lift):
     # Facets share no error, so the normal bias would be chance and is not estimated.
-    fuse = Fuse(FuseConfig(bias_iterations=0))
+    fuse = pt.Fuse(FuseConfig(bias_iterations=0))
     generator = torch.Generator().manual_seed(7)
     true, expected = [], []
     for _ in range(8):
@@ -252,7 +240,7 @@ def test_heights_without_photometric_normals_have_their_own_noise_factor(cap):
 def test_a_large_surface_is_bitwise_equal_on_any_number_of_threads(cap):
     """Torch splits sums of more than 32,768 numbers among threads."""
     claimed = noisy(cap, 0.05, 0.3, torch.Generator().manual_seed(5))
-    fuse = Fuse(
+    fuse = pt.Fuse(
         FuseConfig(samples_per_vertex=0.25, bias_iterations=1, noise_iterations=1, error_draws=0)
     )
     one, two = on_threads(lambda: fuse(claimed, free()), 1, 2)
@@ -263,12 +251,7 @@ def test_a_large_surface_is_bitwise_equal_on_any_number_of_threads(cap):
 
 def test_heights_alone_bend_flat_facets_to_the_sphere(cap):
     swept = noisy(cap, 0.0, 0.2, torch.Generator().manual_seed(7))
-
-    def dark(found):
-        return found.replace(valid=found.valid & False, information=0 * found.information)
-
-    swept = swept.replace(photometric=each_bucket(cap.photometric, dark))
-    surface = Fuse()(swept, free())
+    surface = pt.Fuse()(unlit(swept.replace(photometric=cap.photometric)), free())
     assert (surface.information == 0).all()
     assert surface.supported.double().mean() > 0.95
     off = off_sphere(surface.vertices_world).abs()

@@ -16,26 +16,22 @@ import trimesh
 from PIL import Image, ImageCms, PngImagePlugin
 from sparse_models import observed, views_of
 
+import pimper_torch as pt
 from pimper_bench.datasets import read_rendered
 from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.video.read import luma_frames
 from pimper_torch.io.cameras.existing import existing_model
 from pimper_torch.io.cameras.layout import DataSetPath
 from pimper_torch.io.cameras.model_files import read_model
 from pimper_torch.io.cameras.read_cameras import read_cameras
 from pimper_torch.io.decode import decode, write_deep_png
-from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
+from pimper_torch.io.meshes import write_glb, write_ply
 from pimper_torch.io.openexr import write_exr
-from pimper_torch.io.photographs import load_views
 from pimper_torch.io.responses import read_curve
-from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
-from pimper_torch.records import Cameras, Mesh
-from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.runtime.config import build, read_mapping, to_yaml
 from pimper_torch.stages.sfm.colmap import reconstruction_of, write_binary
 from tests.io.dng import write_dng
@@ -91,10 +87,10 @@ def _alone(
     return Seed(f"{root.name} {name}", folder, (name,), lambda copy: read(copy / name))
 
 
-def _ball() -> Mesh:
+def _ball() -> pt.Mesh:
     vertices, faces = icosphere(1)
     grey = torch.full((len(vertices), 3), 0.5).double()
-    return Mesh(
+    return pt.Mesh(
         vertices_world=vertices.double(),
         faces=faces,
         albedo=grey,
@@ -154,10 +150,10 @@ def _photographs(root: Path) -> list[Seed]:
     files = ("photos/1.jpg", "photos/2.jpg", "masks/1.png", "masks/2.png")
 
     def masked(folder: Path) -> object:
-        return load_views(folder / "photos", masks=folder / "masks")
+        return pt.load_views(folder / "photos", masks=folder / "masks")
 
     return [
-        Seed("photographs", root, files, lambda folder: load_views(folder / "photos")),
+        Seed("photographs", root, files, lambda folder: pt.load_views(folder / "photos")),
         Seed("masks", root, files, masked),
     ]
 
@@ -178,7 +174,7 @@ def _meshes(root: Path) -> list[Seed]:
         "text.stl": exported(file_type="stl_ascii"),
         "a.off": exported(),
     }
-    return [_alone(root, name, write, read_mesh) for name, write in writers.items()]
+    return [_alone(root, name, write, pt.read_mesh) for name, write in writers.items()]
 
 
 def _models(root: Path) -> list[Seed]:
@@ -213,16 +209,16 @@ def _tables(root: Path) -> list[Seed]:
         return read_toolbox_projections(file, (1, 2))
 
     def config(path: Path) -> object:
-        return build(CoarseToFineConfig, read_mapping(path), str(path))
+        return build(pt.CoarseToFineConfig, read_mapping(path), str(path))
 
     def record(path: Path) -> object:
-        return load_record(Mesh, path) and None  # values are checked by stages
+        return pt.load_record(pt.Mesh, path) and None  # values are checked by stages
 
     files: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
         "curve.csv": (lambda path: path.write_text(text), read_curve),
         "curve.npy": (lambda path: np.save(path, curve), read_curve),
-        "settings.yaml": (lambda path: path.write_text(to_yaml(CoarseToFineConfig())), config),
-        "mesh.safetensors": (lambda path: save_record(_ball(), path), record),
+        "settings.yaml": (lambda path: path.write_text(to_yaml(pt.CoarseToFineConfig())), config),
+        "mesh.safetensors": (lambda path: pt.save_record(_ball(), path), record),
         "calibration.mat": (lambda path: scipy.io.savemat(path, arrays), matlab),
         "packed.mat": (lambda path: scipy.io.savemat(path, arrays, do_compression=True), matlab),
     }
@@ -246,8 +242,8 @@ def _maps(root: Path) -> list[Seed]:
 
     def read(path: Path) -> object:
         if path.suffix == ".png":
-            return read_depth(path.parent, views).depth
-        return read_normals(path.parent, views).normals
+            return pt.read_depth(path.parent, views).depth
+        return pt.read_normals(path.parent, views).normals
 
     return [_alone(root, name, write, read) for name, write in writers.items()]
 
@@ -255,7 +251,7 @@ def _maps(root: Path) -> list[Seed]:
 def _camera_files(root: Path) -> list[Seed]:
     """Write camera files that refer to photographs in other folders, as for `--sparse FILE`."""
 
-    def seed(write: Callable[[Cameras, Path], Path]) -> Seed:
+    def seed(write: Callable[[pt.Cameras, Path], Path]) -> Seed:
         folder = root / write.__name__
         folder.mkdir(parents=True)
         name = write(rigs.rig_of(7), folder).name

@@ -95,11 +95,3 @@ def test_the_pinhole_agrees_with_colmap():
         in_cam = world_to_cam * point
         assert_close(pixel, torch.from_numpy(camera.img_from_cam(in_cam)))
         assert_close(z, torch.tensor(in_cam[2]))
-
-
-def test_camera_axes_are_right_down_and_forward():
-    K = torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]], dtype=torch.float64)
-    points = torch.tensor([[0.0, 0, 2], [0.5, 0, 2], [0, 0.5, 2], [0, 0, -2]]).double()
-    pixels, depth = project(points, torch.eye(4, dtype=torch.float64), K)
-    assert pixels[:3].tolist() == [[50.0, 40.0], [75.0, 40.0], [50.0, 65.0]]
-    assert depth.tolist() == [2.0, 2.0, 2.0, -2.0]

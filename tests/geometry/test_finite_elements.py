@@ -1,5 +1,6 @@
 import pytest
 import torch
+from draws import normal
 from scipy.spatial import Delaunay
 from torch.testing import assert_close
 
@@ -10,16 +11,12 @@ from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.systems import prepare
 
 
-def random(generator, *shape):
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-
 def square(count, generator, jitter=0.25):
     """Return a triangulated unit square with jittered inner vertices."""
     side = torch.linspace(0, 1, count + 1, dtype=torch.float64)
     places = torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1).reshape(-1, 2)
     inner = ((places > 0) & (places < 1)).all(dim=1, keepdim=True)
-    places = places + inner * jitter / count * random(generator, *places.shape).clamp(-1, 1)
+    places = places + inner * jitter / count * normal(generator, *places.shape).clamp(-1, 1)
     faces = torch.from_numpy(Delaunay(places.numpy()).simplices).long()
     return torch.cat([places, torch.zeros(len(places), 1).double()], dim=1), faces
 
@@ -43,7 +40,7 @@ def test_the_laplacian_is_the_inner_product_of_weighted_gradients(surface, gener
     vertices, faces = surface
     mesh = elements(vertices, faces)
     weight = torch.rand(len(faces), generator=generator, dtype=torch.float64)
-    one, other = random(generator, mesh.count, 2).unbind(dim=1)
+    one, other = normal(generator, mesh.count, 2).unbind(dim=1)
     matrix = dense(*cotangent_laplacian(mesh, weight), mesh.count)
     assert_close(matrix, matrix.T)
     edges = vertices[faces].diff(dim=1)
@@ -116,7 +113,7 @@ def test_gradients_reach_weights_and_vertices(generator):
     vertices = bent(vertices).requires_grad_()
     weight = (0.5 + torch.rand(len(faces), generator=generator).double()).requires_grad_()
     anchor = torch.full((len(vertices),), 0.3, dtype=torch.float64)
-    rhs = random(generator, len(vertices))
+    rhs = normal(generator, len(vertices))
 
     def solution(vertices, weight):
         mesh = elements(vertices, faces)

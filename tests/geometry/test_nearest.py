@@ -1,9 +1,8 @@
 import pytest
 import torch
-from scenes import CORNERS, FACETS
+from scenes import CORNERS, FACETS, ball
 from torch.testing import assert_close
 
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
@@ -66,8 +65,7 @@ def test_distances_to_tiny_and_huge_triangles_are_those_of_brute_force(generator
 
 
 def test_points_on_a_surface_far_from_the_origin_have_distance_zero():
-    vertices, faces = icosphere(3)
-    far = Mesh(vertices_world=vertices + 1e6, faces=faces)
+    far = ball(center=(1e6, 1e6, 1e6))
     found = NearestSurface(far).query(far.vertices_world)
     assert float(found.distance.max()) < 1e-8  # float64 at a million
 

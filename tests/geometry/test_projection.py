@@ -8,17 +8,13 @@ from pimper_torch.geometry.projection import project, rays_through, triangulatio
 
 
 @pytest.fixture
-def cameras():
-    return arc_cameras(3, width=64, height=48, focal_px=70.0, distance=4.0)
-
-
-@pytest.fixture
 def points():
     generator = torch.Generator().manual_seed(121)
     return torch.rand(40, 3, generator=generator, dtype=torch.float64) - 0.5
 
 
-def test_a_ray_at_its_depth_is_the_point(cameras, points):
+def test_a_ray_at_its_depth_is_the_point(points):
+    cameras = arc_cameras(3, width=64, height=48, focal_px=70.0, distance=4.0)
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
     assert pixels.shape == (3, 40, 2)
     rays = rays_through(pixels, cameras.cam_from_world, cameras.intrinsics)

@@ -5,17 +5,9 @@ from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.supporting_plane import fixation, supporting_plane
 
 
-def cameras(elevation_deg=40.0):
-    return arc_cameras(
-        9,
-        width=80,
-        height=60,
-        focal_px=90.0,
-        distance=3.0,
-        span_deg=120.0,
-        elevation_deg=elevation_deg,
-        target=(0.1, 0.4, -0.2),
-    )
+def cameras():
+    view = {"width": 80, "height": 60, "focal_px": 90.0, "distance": 3.0, "span_deg": 120.0}
+    return arc_cameras(9, **view, elevation_deg=40.0, target=(0.1, 0.4, -0.2))
 
 
 def test_the_supporting_plane_of_a_table_is_found(generator):

@@ -17,10 +17,6 @@ from pimper_torch.geometry.surfaces import (
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
 
 
-def as_tensors(mesh):
-    return torch.tensor(mesh.vertices, dtype=torch.float64), torch.tensor(mesh.faces)
-
-
 def test_slopes_and_normals_are_inverse(generator):
     slopes = 3 * torch.randn(50, 2, generator=generator, dtype=torch.float64)
     normals = normals_from_slopes(slopes)
@@ -46,7 +42,8 @@ def test_steep_and_averted_normals_get_the_steepest_slope_of_their_direction():
 
 
 def test_face_normals_have_twice_the_area_and_point_out():
-    vertices, faces = as_tensors(trimesh.creation.box(extents=(1.0, 2.0, 3.0)))
+    box = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
+    vertices, faces = torch.tensor(box.vertices), torch.tensor(box.faces)
     normals = face_normals(vertices, faces)
     assert_close(normals.norm(dim=1).sum() / 2, torch.tensor(22.0, dtype=torch.float64))
     assert ((vertices[faces].mean(dim=1) * normals).sum(dim=1) > 0).all()

@@ -18,19 +18,15 @@ from pimper_torch.geometry.topology import (
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
 
 
+def neighbours(pairs, edges):
+    return {(frozenset(pair), frozenset(edge)) for pair, edge in zip(pairs, edges, strict=True)}
+
+
 def test_neighbours_agree_with_trimesh_on_a_closed_mesh():
     mesh = trimesh.creation.icosphere(subdivisions=2)
     pairs, edges = face_pairs(torch.tensor(mesh.faces))
-    found = {
-        (frozenset(pair), frozenset(edge))
-        for pair, edge in zip(pairs.tolist(), edges.tolist(), strict=True)
-    }
-    expected = {
-        (frozenset(pair), frozenset(edge))
-        for pair, edge in zip(
-            mesh.face_adjacency.tolist(), mesh.face_adjacency_edges.tolist(), strict=True
-        )
-    }
+    expected = neighbours(mesh.face_adjacency.tolist(), mesh.face_adjacency_edges.tolist())
+    found = neighbours(pairs.tolist(), edges.tolist())
     assert len(pairs) == len(expected)
     assert found == expected
 

@@ -1,11 +1,11 @@
 import torch
+from scenes import ball
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere, table
 from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.visibility import RayCaster, cast_view
-from pimper_torch.records import Mesh
 
 
 def brute_force(origin, directions, vertices, faces):
@@ -54,10 +54,11 @@ def test_points_behind_the_ball_are_hidden_and_the_surface_does_not_hide_itself(
 
 def test_depth_of_a_ball_is_along_the_camera_axis():
     cameras = arc_cameras(2, width=24, height=18, focal_px=40.0, distance=4.0)
-    vertices, faces = icosphere(5)
-    hits = cast_view(Mesh(vertices_world=vertices, faces=faces), cameras, 1)
+    mesh = ball(level=5)
+    hits = cast_view(mesh, cameras, 1)
     assert hits.distance.shape == (18, 24)
-    points_cam = hits.interpolate(vertices, faces) @ cameras.cam_from_world[1, :3, :3].mT
+    points_world = hits.interpolate(mesh.vertices_world, mesh.faces)
+    points_cam = points_world @ cameras.cam_from_world[1, :3, :3].mT
     depth = points_cam[..., 2] + cameras.cam_from_world[1, 2, 3]
     hit = hits.face >= 0
     assert 0.2 < hit.float().mean() < 0.9

@@ -12,6 +12,12 @@ from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.records import Cameras, Views
 
 
+def save_image(path, array, **options):
+    """Write an image of 8 bits, and its folder."""
+    path.parent.mkdir(exist_ok=True, parents=True)
+    Image.fromarray(array).save(path, **options)
+
+
 def save_photographs(views, folder):
     """Write 8-bit sRGB PNG files, named by the views."""
     for index, name in enumerate(views.names):

@@ -9,7 +9,7 @@ from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.topology import half_edges
 from pimper_torch.io.meshes import write_ply
-from pimper_torch.records import Mesh, SparseScene
+from pimper_torch.records import Mesh, Silhouettes, SparseScene
 
 # A square of side 1 and its two facets.
 CORNERS = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
@@ -39,6 +39,12 @@ def ball(radius=1.0, level=3, center=(0.0, 0.0, 0.0)):
     vertices, faces = icosphere(level)
     placed = vertices * vertices.new_tensor(radius) + vertices.new_tensor(center)
     return Mesh(vertices_world=placed, faces=faces)
+
+
+def trusted(inside, source="masks", **more):
+    """Return silhouettes that are reliable in every view."""
+    reliable = torch.ones(len(inside), dtype=torch.bool)
+    return Silhouettes(inside=inside, reliable=reliable, source=source, **more)
 
 
 def write_ball(path: Path, *shape, **options) -> Path:

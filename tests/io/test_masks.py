@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from photographs import save_image as save
 from PIL import Image
 
 from pimper_torch.io.decode import rotated
@@ -14,11 +15,6 @@ from pimper_torch.io.photographs import load_views, read_mask
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 NAMES = ("1", "2", "10")
-
-
-def save(path, array, **options):
-    path.parent.mkdir(exist_ok=True, parents=True)
-    Image.fromarray(array).save(path, **options)
 
 
 def box(value=255):
@@ -82,10 +78,6 @@ def soft_disc():
     return coverage, torch.from_numpy(coverage >= 0.5)
 
 
-def overlap(one, other):
-    return float((one & other).sum() / (one | other).sum())
-
-
 @pytest.mark.parametrize(
     "form", ["8", "16", "grey", "jpg", "alpha", "cut out", "labels", "0 and 1"]
 )
@@ -107,7 +99,8 @@ def test_masks_mark_half_covered_pixels_in_any_format(tmp_path, form):
         save(tmp_path / "masks" / f"{name}.{suffix}", array, **options)
     masks = load_views(tmp_path / "photos", masks=tmp_path / "masks").masks
     # The border has 94 pixels; counting all pixels above zero gives 0.88, rounding 0.998.
-    assert overlap(masks[1], truth) > (0.98 if form == "jpg" else 0.995)
+    overlap = float((masks[1] & truth).sum() / (masks[1] | truth).sum())
+    assert overlap > (0.98 if form == "jpg" else 0.995)
     assert torch.equal(read_mask(tmp_path / "masks" / f"10.{suffix}"), masks[2])
 
 

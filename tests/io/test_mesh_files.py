@@ -6,25 +6,20 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+import pimper_torch as pt
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.export.results import write_result
 from pimper_torch.geometry.rigid import transform
-from pimper_torch.io.assets.mesh_files import MeshFiles
-from pimper_torch.io.meshes import read_mesh
-from pimper_torch.radiometry import Encoding
 from pimper_torch.radiometry.base_color import albedo_scale
-from pimper_torch.records import Mesh
-from pimper_torch.runtime.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
-def half_ball() -> Mesh:
+def half_ball() -> pt.Mesh:
     vertices, faces = icosphere(4)
     kept = faces[(vertices[faces][..., 2] > 0).all(dim=1)]
     used, kept = torch.unique(kept, return_inverse=True)
     vertices = vertices[used].float()
-    return Mesh(
+    return pt.Mesh(
         vertices_world=vertices,
         faces=kept,
         normals_world=vertices,
@@ -35,9 +30,9 @@ def half_ball() -> Mesh:
 
 
 def test_a_watertight_mesh_marks_faces_that_were_not_measured(reconstruction, tmp_path):
-    files = MeshFiles(faces=1000, watertight=True, formats=("stl", "obj"))
+    files = pt.MeshFiles(faces=1000, watertight=True, formats=("stl", "obj"))
     mesh = half_ball()
-    write_result(reconstruction.replace(mesh=mesh), Encoding(), tmp_path / "out", files=files)
+    pt.write_result(reconstruction.replace(mesh=mesh), pt.Encoding(), tmp_path / "out", files=files)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     ply = trimesh.load(tmp_path / "out" / "mesh.ply", process=False)
     assert ply.is_watertight
@@ -51,7 +46,7 @@ def test_a_watertight_mesh_marks_faces_that_were_not_measured(reconstruction, tm
     assert ply.volume == pytest.approx(2 / 3 * torch.pi, rel=0.1)
     known = np.zeros(len(ply.vertices), bool)
     known[ply.faces[measured]] = True
-    whole = read_mesh(tmp_path / "out" / "mesh.ply")
+    whole = pt.read_mesh(tmp_path / "out" / "mesh.ply")
     assert np.array_equal(whole.confidence.numpy() == 0, ~known)
     glb = trimesh.load_scene(tmp_path / "out" / "mesh.glb", process=False)
     (shape,) = glb.geometry.values()
@@ -63,11 +58,11 @@ def test_a_watertight_mesh_marks_faces_that_were_not_measured(reconstruction, tm
 
 @pytest.mark.parametrize("suffix", ["stl", "obj"])
 def test_written_meshes_are_read_by_other_programs(reconstruction, tmp_path, suffix):
-    files = MeshFiles(faces="all", formats=(suffix,))
+    files = pt.MeshFiles(faces="all", formats=(suffix,))
     mesh = half_ball()
-    write_result(reconstruction.replace(mesh=mesh), Encoding(), tmp_path / "out", files=files)
+    pt.write_result(reconstruction.replace(mesh=mesh), pt.Encoding(), tmp_path / "out", files=files)
     assert not (tmp_path / "out" / f"mesh.{({'stl', 'obj'} - {suffix}).pop()}").exists()
-    found = read_mesh(tmp_path / "out" / f"mesh.{suffix}")
+    found = pt.read_mesh(tmp_path / "out" / f"mesh.{suffix}")
     corners = found.vertices_world[found.faces]
     assert_close(corners, mesh.vertices_world[mesh.faces].double(), atol=1e-7, rtol=0)
     assert (tmp_path / "out" / "asset.obj").exists() == (suffix == "obj")
@@ -83,17 +78,17 @@ def test_written_meshes_are_read_by_other_programs(reconstruction, tmp_path, suf
 def test_far_files_have_an_offset_and_the_asset_a_translation(reconstruction, tmp_path, metric):
     offset = (448231.0, 5411923.0, 312.0)
     far = reconstruction.scene.replace(offset_world=offset)
-    files = MeshFiles(faces="all", formats=("stl", "obj"))
-    write_result(
+    files = pt.MeshFiles(faces="all", formats=("stl", "obj"))
+    pt.write_result(
         reconstruction.replace(mesh=half_ball(), scene=far),
-        Encoding(),
+        pt.Encoding(),
         tmp_path / "out",
         files=files,
         about={"scale": {"unit": "in"}} if metric else None,
     )
     shift = torch.tensor(offset).double()
     vertices = half_ball().vertices_world
-    obj = read_mesh(tmp_path / "out" / "mesh.obj").vertices_world
+    obj = pt.read_mesh(tmp_path / "out" / "mesh.obj").vertices_world
     assert_close(obj - shift, vertices.double(), atol=1e-5, rtol=0)
     data = (tmp_path / "out" / "asset.glb").read_bytes()
     tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
@@ -103,7 +98,7 @@ def test_far_files_have_an_offset_and_the_asset_a_translation(reconstruction, tm
     unit = float(back[:3, 0].norm())
     assert unit == pytest.approx(39.3701 if metric else 2.0, rel=1e-5 if metric else 0.01)
     for name in ("asset.obj", "asset.glb"):
-        placed = read_mesh(tmp_path / "out" / name).vertices_world.double()
+        placed = pt.read_mesh(tmp_path / "out" / name).vertices_world.double()
         assert_close(placed.amin(dim=0)[1], torch.tensor(0.0).double(), atol=1e-5, rtol=0)
         world = transform(back, placed) + shift
         for one, other in zip(world.aminmax(dim=0), obj.aminmax(dim=0), strict=True):
@@ -113,5 +108,5 @@ def test_far_files_have_an_offset_and_the_asset_a_translation(reconstruction, tm
 
 
 def test_fewer_than_four_faces_are_refused():
-    with pytest.raises(ConfigError, match="faces is 3; needed: all, or at least 4"):
-        MeshFiles(faces=3)
+    with pytest.raises(pt.ConfigError, match="faces is 3; needed: all, or at least 4"):
+        pt.MeshFiles(faces=3)

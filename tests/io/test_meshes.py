@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scenes import ball
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
 from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh
@@ -210,20 +210,13 @@ def test_normals_that_are_not_finite_are_dropped(mesh, tmp_path):
 
 
 UTM = (448231.25, 5411923.5, 312.125)
-
-
-def fine_mesh(offset=(0.0, 0.0, 0.0), scale=1.0):
-    vertices, faces = icosphere(4)
-    return Mesh(
-        vertices_world=scale * (vertices + torch.tensor(offset, dtype=torch.float64)), faces=faces
-    )
+FINE = ball(level=4)
 
 
 @pytest.mark.parametrize("offset", [UTM, (4.2e6, 1.7e5, -4.78e6)])
 @pytest.mark.parametrize(("write", "suffix"), [(write_ply, ".ply"), (write_glb, ".glb")])
 def test_far_from_the_origin_positions_keep_their_precision(write, suffix, offset, tmp_path):
-    mesh = fine_mesh()
-    local = mesh.replace(vertices_world=mesh.vertices_world.float())
+    local = FINE.to(torch.float32)
     write(local, tmp_path / f"a{suffix}", offset)
     read = read_mesh(tmp_path / f"a{suffix}")
     wanted = local.vertices_world.double() + torch.tensor(offset, dtype=torch.float64)
@@ -238,14 +231,14 @@ def without_faces(mesh):
 @pytest.mark.parametrize(
     ("mesh", "offset", "kind"),
     [
-        (fine_mesh(), (0.0, 0.0, 0.0), "float"),
-        (fine_mesh(scale=1e-6), (0.0, 0.0, 0.0), "float"),
-        (fine_mesh(scale=1e6), (0.0, 0.0, 0.0), "float"),
-        (fine_mesh((20.0, 0, 0)), (0.0, 0.0, 0.0), "float"),
-        (fine_mesh(UTM), (0.0, 0.0, 0.0), "double"),
-        (fine_mesh(), UTM, "double"),
-        (without_faces(fine_mesh()), (0.0, 0.0, 0.0), "float"),
-        (without_faces(fine_mesh(UTM)), (0.0, 0.0, 0.0), "double"),
+        (FINE, (0.0, 0.0, 0.0), "float"),
+        (ball(1e-6, level=4), (0.0, 0.0, 0.0), "float"),
+        (ball(1e6, level=4), (0.0, 0.0, 0.0), "float"),
+        (ball(level=4, center=(20.0, 0, 0)), (0.0, 0.0, 0.0), "float"),
+        (ball(level=4, center=UTM), (0.0, 0.0, 0.0), "double"),
+        (FINE, UTM, "double"),
+        (without_faces(FINE), (0.0, 0.0, 0.0), "float"),
+        (without_faces(ball(level=4, center=UTM)), (0.0, 0.0, 0.0), "double"),
     ],
 )
 def test_positions_are_doubles_only_if_floats_would_round_them(tmp_path, mesh, offset, kind):
@@ -261,7 +254,7 @@ def test_positions_are_doubles_only_if_floats_would_round_them(tmp_path, mesh, o
 
 def test_the_node_of_a_glb_has_the_offset_if_there_is_one(tmp_path):
     for offset, placed in ((UTM, [{"mesh": 0, "translation": list(UTM)}]), ((0.0,) * 3, None)):
-        write_glb(fine_mesh(), tmp_path / "a.glb", offset)
+        write_glb(FINE, tmp_path / "a.glb", offset)
         tree, _ = parts_of(tmp_path / "a.glb")
         nodes = [{key: node[key] for key in node if key != "name"} for node in tree["nodes"]]
         assert [node for node in nodes if "translation" in node] == (placed or [])

@@ -8,6 +8,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
+from photographs import save_image as save
 from PIL import Image
 from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
@@ -17,11 +18,6 @@ from pimper_torch.radiometry import LINEAR, linear_from_srgb
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from pimper_torch.runtime.progress import listening
 from pimper_torch.stages.sfm.lenses import choose_lenses
-
-
-def save(path, array, **options):
-    path.parent.mkdir(exist_ok=True, parents=True)
-    Image.fromarray(array).save(path, **options)
 
 
 def test_photographs_are_read_in_natural_order_as_linear_radiance(photos, pixels):
@@ -209,11 +205,6 @@ def test_a_huge_image_among_small_ones_is_refused_before_decoding(photos, mode):
     assert time.perf_counter() - begin < 0.5
     assert tracemalloc.get_traced_memory()[1] < 2e7
     tracemalloc.stop()
-
-
-def test_photographs_of_different_sizes_are_not_refused_as_huge(photos, pixels):
-    save(photos / "3.png", np.tile(pixels, (20, 20, 1)))
-    assert load_views(photos).num_views == 4
 
 
 def test_padding_does_not_make_a_photograph_black(photos):

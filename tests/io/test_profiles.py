@@ -56,12 +56,12 @@ def stored(pixels):
 def three(tmp_path):
     """Write one image three times, and read it."""
 
-    def read(write, suffix, **settings):
+    def read(array, encoding=None, **options):
         folder = tmp_path / "three"
         folder.mkdir(exist_ok=True)
         for index in range(3):
-            write(folder / f"{index}.{suffix}")
-        return load_views(folder, **settings).images[0].double()
+            Image.fromarray(array).save(folder / f"{index}.png", **options)
+        return load_views(folder, encoding=encoding or Encoding()).images[0].double()
 
     return read
 
@@ -320,36 +320,26 @@ def test_saturation_is_found_per_profile(tmp_path, make_profile):
 
 
 def test_a_given_response_overrides_the_profile(three, pixels, stored, make_profile, tmp_path):
-    profile = make_profile(IDENTITY, SRGB, name="mine")
-
-    def write(path):
-        Image.fromarray(pixels).save(path, icc_profile=profile)
-
+    mine = {"icc_profile": make_profile(IDENTITY, SRGB, name="mine")}
     told = r'3 of 3 photographs \(0\.png, .*srgb is given, but the ICC profile "mine" states linear'
     with pytest.warns(PimperWarning, match=told):
-        found = three(write, "png", encoding=Encoding(response="srgb"))
+        found = three(pixels, Encoding(response="srgb"), **mine)
     assert_close(found, linear_from_srgb(stored), rtol=0, atol=1e-6)
     with pytest.warns(PimperWarning, match=r"response 1\.8 is given, but .* states linear"):
-        three(write, "png", encoding=Encoding(response=1.8))
+        three(pixels, Encoding(response=1.8), **mine)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert_close(
-            three(write, "png", encoding=Encoding(response="linear")), stored, rtol=0, atol=1e-6
-        )
+        found = three(pixels, Encoding(response="linear"), **mine)
+        assert_close(found, stored, rtol=0, atol=1e-6)
         np.save(tmp_path / "measured.npy", np.arange(256.0) ** 2)
-        found = three(write, "png", encoding=Encoding(response=tmp_path / "measured.npy"))
+        found = three(pixels, Encoding(response=tmp_path / "measured.npy"), **mine)
     assert_close(found, stored**2, rtol=0, atol=1e-6)
 
 
 def test_colours_are_converted_to_srgb_primaries_and_stay_saturated(three, pixels, make_profile):
-    profile = make_profile(IDENTITY, P3)
     array = (pixels // 2 + 50).astype(np.uint8)
     array[2, 3] = (255, 120, 120)
-
-    def write(path):
-        Image.fromarray(array).save(path, icc_profile=profile)
-
-    found = three(write, "png")
+    found = three(array, icc_profile=make_profile(IDENTITY, P3))
     linear = torch.from_numpy(array / 255).movedim(-1, 0)
     # From DCI-P3 with white D65 to BT.709, by SMPTE EG 432-1 and IEC 61966-2-1.
     matrix = torch.tensor(
@@ -376,10 +366,7 @@ def test_primaries_of_adobe_rgb_and_p3_equal_those_of_their_profiles():
 
 @pytest.mark.parametrize("orientation", [0, 9, 200])
 def test_an_unknown_orientation_counts_as_upright(three, pixels, stored, orientation):
-    def write(path):
-        Image.fromarray(pixels).save(path, exif=exif_of(orientation=orientation))
-
     told = rf"3 of 3 .* has an EXIF orientation of {orientation}, not of 1 to 8; .* as upright"
     with pytest.warns(PimperWarning, match=told):
-        found = three(write, "png")
+        found = three(pixels, exif=exif_of(orientation=orientation))
     assert_close(found, linear_from_srgb(stored), rtol=0, atol=1e-6)

@@ -67,11 +67,7 @@ def test_every_choice_gives_its_response(tmp_path):
         ("a.csv", "", "no rows, or rows of different lengths"),
         ("a.csv", "0,1\n1,dark\n", "has no table"),
         ("a.csv", "\n".join("1,2,3,4,5" for _ in range(20)), "a table of 20 x 5"),
-        (
-            "a.csv",
-            "\n".join(str(level) for level in range(100)),
-            "is not a response curve: the last",
-        ),
+        ("a.csv", "\n".join(map(str, range(100))), "is not a response curve: the last"),
         ("a.npy", "not an array", "has no table"),
         ("a.xlsx", "", r"a\.xlsx: is not a response .*needed: srgb, linear"),
     ],

@@ -147,17 +147,11 @@ def test_the_common_light_combines_the_observed_parts_of_all_patches(reconstruct
         directed = (turning @ truth[None, :, 1:, None])[..., 0]
         lights = torch.cat([truth[None, :, :1].expand_as(directed[..., :1]), directed], dim=-1)
         lights[..., 2] += 5.0
-        buckets.append(
-            found.replace(
-                normals_patch=normals,
-                lights_patch=lights,
-                valid=torch.ones_like(found.valid),
-                status=torch.zeros_like(found.status),
-            )
-        )
-    patches = reconstruction.patches
+        found = found.replace(normals_patch=normals, lights_patch=lights)
+        buckets.append(found.replace(valid=found.valid | True, status=0 * found.status))
+    photometric = photometric.replace(buckets=tuple(buckets))
     rotated = reconstruction.replace(
-        patches=patches.replace(photometric=photometric.replace(buckets=tuple(buckets)))
+        patches=reconstruction.patches.replace(photometric=photometric)
     )
     found, counts = common_lights(rotated)
     assert counts.tolist() == [2, 2, 2]

@@ -2,22 +2,12 @@
 
 import pytest
 import torch
+from sparse_models import views_of
 from torch.nn.functional import pad
 
 from pimper_torch.io.thumbnails import compare_thumbnails, thumbnails
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, PimperWarning
-
-
-def views_of(images, sizes=None):
-    count, _, height, width = images.shape
-    return Views(
-        images=images,
-        sizes_px=torch.tensor([[width, height]] * count if sizes is None else sizes),
-        names=tuple(f"{index}.png" for index in range(count)),
-        focals_px=torch.full((count,), torch.nan),
-    )
 
 
 @pytest.fixture
@@ -33,7 +23,7 @@ def test_the_thumbnail_of_a_uniform_photograph_is_its_grey_level():
 
 def test_neither_a_resize_nor_padding_changes_thumbnails(images):
     larger = images.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
-    padded = views_of(pad(images, (0, 7, 0, 5), value=0.9), [[40, 24]] * 3)
+    padded = views_of(pad(images, (0, 7, 0, 5), value=0.9), [(40, 24)] * 3)
     assert thumbnails(views_of(images)) == thumbnails(views_of(larger)) == thumbnails(padded)
 
 

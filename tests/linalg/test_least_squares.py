@@ -1,16 +1,13 @@
 import torch
+from draws import normal
 from torch.testing import assert_close
 
 from pimper_torch.linalg.least_squares import normal_equations
 
 
-def random(generator, *shape):
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-
 def test_normal_equations_are_those_of_the_dense_matrix(generator):
     unknowns = torch.randint(6, (9, 3), generator=generator)
-    coefficients, targets = random(generator, 9, 3), random(generator, 9)
+    coefficients, targets = normal(generator, 9, 3), normal(generator, 9)
     weights = torch.rand(9, generator=generator, dtype=torch.float64)
     rows, cols, values, rhs = normal_equations(unknowns, coefficients, targets, weights, 6)
     dense = torch.zeros(9, 6, dtype=torch.float64)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from draws import normal
 from scipy.sparse import csr_array
 from torch.testing import assert_close
 
@@ -11,10 +12,6 @@ from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.linalg.systems import prepare
-
-
-def random(generator, *shape):
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
 def entries(size, generator, decades=6.0, anchor=1e-3):
@@ -39,7 +36,7 @@ def compressed(rows, cols, values, size):
 @pytest.mark.parametrize("columns", [(), (0,), (2, 2)])
 def test_solutions_equal_those_of_cholesky(columns, generator):
     parts = entries(1500, generator)
-    rhs = random(generator, 1500, *columns)
+    rhs = normal(generator, 1500, *columns)
     found = Multigrid(*parts, size=1500).solve(rhs)
     expected = SparseCholesky(*parts, size=1500).solve(rhs)
     assert_close(found, expected, rtol=1e-6, atol=1e-6 * float(expected.abs().sum() > 0))
@@ -92,7 +89,7 @@ def test_creases_in_the_near_null_space_cost_few_cycles(generator):
     cols = torch.cat([one, other, other, one, pixel.flatten()])
     system = Multigrid(rows, cols, torch.cat([a * a, b * b, -a * b, -a * b, anchor]), side * side)
     # 90 if the prolongation keeps constants.
-    assert system.iterate(random(generator, side * side))[1] <= 40
+    assert system.iterate(normal(generator, side * side))[1] <= 40
 
 
 def test_a_matrix_solved_by_smoothing_needs_no_levels(generator):
@@ -105,7 +102,7 @@ def test_a_matrix_solved_by_smoothing_needs_no_levels(generator):
         torch.cat([values, torch.full((size,), 1e4, dtype=torch.float64)]),
     )
     system = Multigrid(*parts, size=size)
-    rhs = random(generator, size)
+    rhs = normal(generator, size)
     assert_close(system.solve(rhs), SparseCholesky(*parts, size=size).solve(rhs))
     assert system.iterate(rhs)[1] < 8
 
@@ -114,7 +111,7 @@ def test_gradients_reach_matrix_and_right_hand_side(generator, monkeypatch):
     monkeypatch.setattr(hierarchy, "_DENSE", 3)  # so that there are cycles to differentiate
     rows, cols, values = entries(7, generator, decades=1.0, anchor=0.3)
     assert len(Hierarchy(compressed(rows, cols, values, 7))._levels) > 1
-    rhs = random(generator, 7).requires_grad_()
+    rhs = normal(generator, 7).requires_grad_()
     half = (len(values) - 7) // 4
     weight = values[:half].clone().requires_grad_()
 
@@ -127,7 +124,7 @@ def test_gradients_reach_matrix_and_right_hand_side(generator, monkeypatch):
 
 def test_float32_input_gives_float32_output(generator):
     rows, cols, values = entries(1200, generator, decades=2.0, anchor=1.0)
-    rhs = random(generator, 1200).float()
+    rhs = normal(generator, 1200).float()
     found = Multigrid(rows, cols, values.float(), size=1200).solve(rhs)
     expected = SparseCholesky(rows, cols, values.float(), size=1200).solve(rhs)
     assert found.dtype == torch.float32
@@ -141,7 +138,7 @@ def test_an_indefinite_matrix_is_rejected_with_iterations_and_residual(generator
     with pytest.raises(SingularSystemError, match=r"the seams.*after \d+ iterations"):
         Multigrid(
             torch.cat([rows, loop]), torch.cat([cols, loop]), shifted, 900, "the seams"
-        ).solve(random(generator, 900))
+        ).solve(normal(generator, 900))
 
 
 def test_a_smooth_solution_is_accepted_once_its_error_is_below_the_tolerance(generator):

@@ -36,11 +36,6 @@ def solve(rows, cols, values, rhs, what="the seams"):
     return SparseCholesky(rows, cols, values, len(rhs), what).solve(rhs)
 
 
-def dense(rows, cols, values, size):
-    matrix = torch.zeros(size, size, dtype=values.dtype)
-    return matrix.index_put((rows, cols), values, accumulate=True)
-
-
 @pytest.mark.parametrize("columns", [(), (3,), (0,)])
 def test_solutions_equal_those_of_a_dense_solve(generator, columns):
     start, end, weights, anchor = small_system(generator)
@@ -48,7 +43,8 @@ def test_solutions_equal_those_of_a_dense_solve(generator, columns):
     order = torch.randperm(len(rows), generator=generator)
     rhs = torch.randn(12, *columns, generator=generator, dtype=torch.float64)
     found = solve(rows[order], cols[order], values[order], rhs)
-    expected = torch.linalg.solve(dense(rows, cols, values, 12), rhs.reshape(12, -1))
+    dense = torch.zeros(12, 12).to(values).index_put((rows, cols), values, accumulate=True)
+    expected = torch.linalg.solve(dense, rhs.reshape(12, -1))
     assert_close(found, expected.reshape(rhs.shape))
 
 

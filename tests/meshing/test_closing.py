@@ -40,13 +40,8 @@ def test_a_ball_without_poles_is_closed_by_two_flat_caps():
     assert found.borders == 2
     # A slice of a ball between planes at ±h has volume 2 pi (h - h^3 / 3); borders are ragged.
     assert whole.volume == pytest.approx(2 * torch.pi * (0.7 - 0.7**3 / 3), rel=0.03)
-    caps = found.mesh.faces[~found.measured]
-    assert_close(
-        found.mesh.vertices_world[caps][..., 2].abs(),
-        torch.full((len(caps), 3), 0.7).double(),
-        atol=0.07,
-        rtol=0,
-    )
+    heights = found.mesh.vertices_world[found.mesh.faces[~found.measured]][..., 2].abs()
+    assert_close(heights, torch.full_like(heights, 0.7), atol=0.07, rtol=0)
     assert bool(((found.mesh.normals_world[len(mesh.vertices_world) :, 2]).abs() > 0.9).all())
 
 
@@ -59,9 +54,8 @@ def test_measured_surface_is_kept_and_caps_are_marked():
         assert torch.equal(getattr(found.mesh, name)[:count], getattr(mesh, name)), name
     assert bool((found.mesh.confidence[count:] == 0).all())
     extent = (mesh.vertices_world.amax(dim=0) - mesh.vertices_world.amin(dim=0)).norm()
-    assert_close(
-        found.mesh.expected_error[count:], extent.expand(len(found.mesh.confidence) - count)
-    )
+    errors = found.mesh.expected_error[count:]
+    assert_close(errors, extent.expand_as(errors))
     assert_close(found.mesh.albedo[count:], torch.full_like(found.mesh.albedo[count:], 0.4))
 
 
@@ -106,12 +100,8 @@ def test_a_moebius_strip_is_rejected():
     upper, lower = turn, turn + count
     following, below = (turn + 1) % count, (turn + 1) % count + count
     following[-1], below[-1] = count, 0
-    faces = torch.cat(
-        [
-            torch.stack([upper, lower, following], dim=1),
-            torch.stack([following, lower, below], dim=1),
-        ]
-    )
+    halves = (upper, lower, following), (following, lower, below)
+    faces = torch.cat([torch.stack(half, dim=1) for half in halves])
     with pytest.raises(InputError, match="opposite orientation"):
         closed(Mesh(vertices_world=torch.rand(2 * count, 3), faces=faces))
 

@@ -84,20 +84,13 @@ def test_components_that_touch_in_a_vertex_are_separated():
     surface = sheet()
     x, y = columns(surface), surface.vertices_world[:, 1]
     hourglass = ((x <= 10) & (y >= 10)) | ((x >= 10) & (y <= 10))
-    mesh = Extract(ExtractConfig(max_hole=0.1, min_piece=0.0))(
-        surface.replace(information=hourglass.double())
-    )
+    touching = surface.replace(information=hourglass.double())
+    mesh = Extract(ExtractConfig(max_hole=0.1, min_piece=0.0))(touching)
     # Diagonals have the other direction, so that no face bridges the two squares.
     waist = (mesh.vertices_world[:, :2] == 10).all(dim=1)
     assert waist.sum() == 2
-    assert (
-        len(
-            Extract(ExtractConfig(max_hole=0.1, min_piece=1.0))(
-                surface.replace(information=hourglass.double())
-            ).vertices_world
-        )
-        == 121
-    )
+    largest = Extract(ExtractConfig(max_hole=0.1, min_piece=1.0))(touching)
+    assert len(largest.vertices_world) == 121
 
 
 def test_spikes_and_flipped_faces_are_removed():
@@ -156,7 +149,6 @@ def test_faces_with_a_large_expected_error_are_removed():
     kept = mesh.vertices_world[:, 0] / (SIDE - 1) / 10 * diagonal(surface.vertices_world)
     assert_close(mesh.expected_error, kept)  # each belongs to its vertex
     assert len(Extract(ExtractConfig(max_expected_error=0.11))(inexact).faces) == len(surface.faces)
+    vague = surface.replace(expected_error=1 + 0 * fraction)
     with pytest.raises(ReconstructionError, match="max_expected_error"):
-        Extract(ExtractConfig(max_expected_error=1e-9))(
-            surface.replace(expected_error=1 + 0 * fraction)
-        )
+        Extract(ExtractConfig(max_expected_error=1e-9))(vague)

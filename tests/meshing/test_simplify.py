@@ -3,9 +3,9 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_bench.scenes.procedural_meshes import icosphere, table
 from pimper_torch.geometry.nearest import NearestSurface, closest_on_triangles
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import face_normals, vertex_normals
 from pimper_torch.records import Mesh
 from pimper_torch.stages.meshing.simplify import simplify
 from tests.threads import on_threads
@@ -14,12 +14,9 @@ from tests.threads import on_threads
 def square(side, height):
     """A height field over the unit square, with random values at its vertices."""
     generator = torch.Generator().manual_seed(3)
-    steps = torch.linspace(0, 1, side, dtype=torch.float64)
-    y, x = torch.meshgrid(steps, steps, indexing="ij")
-    vertices = torch.stack([x, y, height(x, y)], dim=-1).reshape(-1, 3)
-    first = (torch.arange(side - 1)[:, None] * side + torch.arange(side - 1)).reshape(-1)
-    lower = torch.stack([first, first + 1, first + side + 1], dim=1)
-    faces = torch.cat([lower, torch.stack([first, first + side + 1, first + side], dim=1)])
+    flat = table(0.5, cells=side - 1)
+    x, y = (flat.vertices_world[:, :2] + 0.5).unbind(dim=1)
+    vertices, faces = torch.stack([x, y, height(x, y)], dim=1), flat.faces
     return Mesh(
         vertices_world=vertices,
         faces=faces,
@@ -95,13 +92,7 @@ def test_a_plane_keeps_little_more_than_its_border():
     mesh = square(40, lambda x, _: 0.0 * x)
     found = simplify(mesh)
     assert len(found.kept) < 4 * 39 + 40
-    area = torch.linalg.cross(
-        *(
-            found.mesh.vertices_world[found.mesh.faces[:, k]]
-            - found.mesh.vertices_world[found.mesh.faces[:, 0]]
-            for k in (1, 2)
-        )
-    )
+    area = face_normals(found.mesh.vertices_world, found.mesh.faces)
     assert (area[:, 2] > 0).all()  # no face is flipped
     assert_close(area[:, 2].sum() / 2, torch.tensor(1.0, dtype=torch.float64))
 

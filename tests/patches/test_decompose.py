@@ -7,6 +7,7 @@ from pimper_torch.geometry.rigid import transform
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.stages.patches.decompose import Decompose, enlarge, group_by_size, views_facing
 from pimper_torch.stages.patches.patches_config import DecomposeConfig
+from tests.patches.test_transfer import places
 
 
 def test_the_facet_is_in_the_plane_z_0_and_faces_the_camera(plane_scene, plane_mesh):
@@ -52,14 +53,9 @@ def test_every_point_near_a_facet_has_a_sample_and_samples_are_a_pixel_apart(
         # Discrete samples along the contour, and corners clipped at twice the overlap: 3 %.
         assert ((area - wanted).abs() / wanted < 0.03).all()
         reference = plane_mesh.reference
-        pixels, _ = project(
-            torch.linalg.solve(
-                bucket.patch_from_world[:, None, None, :3, :3],
-                (bucket.points_patch - bucket.patch_from_world[:, None, None, :3, 3])[..., None],
-            )[..., 0].reshape(-1, 3),
-            plane_scene.cameras.cam_from_world[reference],
-            plane_scene.cameras.intrinsics[reference],
-        )
+        camera = plane_scene.cameras.cam_from_world[reference]
+        K = plane_scene.cameras.intrinsics[reference]
+        pixels, _ = project(places(bucket).reshape(-1, 3), camera, K)
         steps = pixels.reshape(*spacing.shape[:1], *bucket.depth.shape[1:], 2).diff(dim=2)
         assert 0.8 < steps.norm(dim=-1).median() < 1.2
 

@@ -7,11 +7,8 @@ from derivatives import check_derivatives
 from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
+import pimper_torch as pt
 from pimper_torch.geometry.rigid import rotate
-from pimper_torch.records import DepthPrior, InlierPrior, LightPrior, NormalPrior
-from pimper_torch.runtime.errors import InputError
-from pimper_torch.stages.patches.decompose import Decompose
-from pimper_torch.stages.patches.warp import Warp
 from tests.patches.conftest import TILTED
 
 NORMAL = normalize(torch.tensor(TILTED.normal, dtype=torch.float64), dim=0)
@@ -19,21 +16,21 @@ NORMAL = normalize(torch.tensor(TILTED.normal, dtype=torch.float64), dim=0)
 
 @pytest.fixture
 def patches(plane_mesh, plane_scene):
-    return Decompose()(plane_mesh, plane_scene.cameras)
+    return pt.Decompose()(plane_mesh, plane_scene.cameras)
 
 
-def normal_prior(scene, frame="camera", variance=0.01) -> NormalPrior:
+def normal_prior(scene, frame="camera", variance=0.01) -> pt.NormalPrior:
     views, cameras = scene.views, scene.cameras
     normals = NORMAL.expand(*views.images[:, 0].shape, 3)
     if frame == "camera":
         normals = torch.einsum("vij,vhwj->vhwi", cameras.cam_from_world[:, :3, :3], normals)
     variances = torch.full_like(views.images[:, 0], variance)
-    return NormalPrior(
+    return pt.NormalPrior(
         names=views.names, sizes_px=views.sizes_px, normals=normals, variance=variances, frame=frame
     )
 
 
-def depth_prior(scene, raised: float = 0.0) -> DepthPrior:
+def depth_prior(scene, raised: float = 0.0) -> pt.DepthPrior:
     """Return the plane's depth along each camera axis, raised along the plane's normal."""
     views, cameras = scene.views, scene.cameras
     height, width = views.images.shape[2:]
@@ -43,7 +40,7 @@ def depth_prior(scene, raised: float = 0.0) -> DepthPrior:
     along = torch.einsum("vij,vhwi->vhwj", cameras.cam_from_world[:, :3, :3], rays)
     start = cameras.centers_world @ NORMAL
     depth = (raised - start)[:, None, None] / (along @ NORMAL)
-    return DepthPrior(
+    return pt.DepthPrior(
         names=views.names,
         sizes_px=views.sizes_px,
         depth=depth,
@@ -54,7 +51,7 @@ def depth_prior(scene, raised: float = 0.0) -> DepthPrior:
 
 def guessed(scene, patches, *priors, warp=None):
     views = scene.views.replace(priors=priors)
-    seen = (warp or Warp())(views, scene.cameras, patches)
+    seen = (warp or pt.Warp())(views, scene.cameras, patches)
     return seen, [bucket.priors for bucket in seen.buckets]
 
 
@@ -129,7 +126,7 @@ def test_unknown_pixels_and_other_photographs_give_no_information(plane_scene, p
     for silent in (unknown, strange):
         seen, found = guessed(plane_scene, patches, silent)
         assert not any(own is not None and own.normal_information.any() for own in found)
-        plain = Warp()(plane_scene.views, plane_scene.cameras, patches)
+        plain = pt.Warp()(plane_scene.views, plane_scene.cameras, patches)
         for one, other in zip(seen.buckets, plain.buckets, strict=True):
             assert torch.equal(one.radiance, other.radiance)
             assert torch.equal(one.valid, other.valid)
@@ -137,7 +134,7 @@ def test_unknown_pixels_and_other_photographs_give_no_information(plane_scene, p
 
 def test_inlier_priors_apply_to_their_view_and_are_1_elsewhere(plane_scene, patches):
     views = plane_scene.views
-    half = InlierPrior(
+    half = pt.InlierPrior(
         names=views.names[1:2],
         sizes_px=views.sizes_px[1:2],
         probability=torch.full_like(views.images[1:2, 0], 0.25),
@@ -179,7 +176,7 @@ def test_gradients_with_respect_to_the_maps_match_differences(plane_scene, patch
 
 def test_depth_in_other_than_scene_units_is_rejected(plane_scene, patches):
     loose = replace(depth_prior(plane_scene), gauge="affine")
-    with pytest.raises(InputError, match="scene units"):
+    with pytest.raises(pt.InputError, match="scene units"):
         guessed(plane_scene, patches, loose)
 
 
@@ -191,7 +188,7 @@ def test_prior_lights_shade_the_same_in_the_patch_frame(plane_scene, patches, fr
     if frame == "camera":
         rotated = (cameras.cam_from_world[:, :3, :3] @ lights[:, 1:, None])[..., 0]
         own = torch.cat([lights[:, :1], rotated], dim=1)
-    given = LightPrior(
+    given = pt.LightPrior(
         lights=own[1:], variance=torch.ones(4).double(), names=views.names[1:], frame=frame
     )
     _, found = guessed(plane_scene, patches, given)

@@ -2,10 +2,10 @@ import math
 
 import pytest
 import torch
+from scenes import ball as unit_ball
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.scene_cameras import turntable_directions
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.surfaces import face_normals
@@ -47,10 +47,8 @@ def weights(mesh: Mesh, cameras: Cameras, hiding: Mesh | None = None) -> torch.T
 @pytest.fixture(scope="module")
 def ball() -> tuple[Mesh, Cameras]:
     """A ball, and 90 cameras around it at three elevations."""
-    vertices, faces = icosphere(3)
-    mesh = Mesh(vertices_world=vertices.double(), faces=faces)
     directions = [turntable_directions(30, elevation_deg=each) for each in (-35.0, 5.0, 45.0)]
-    return mesh, cameras_at(DISTANCE * torch.cat(directions))
+    return unit_ball(), cameras_at(DISTANCE * torch.cat(directions))
 
 
 def test_the_weight_of_a_view_is_the_projected_area_up_to_one_pixel():

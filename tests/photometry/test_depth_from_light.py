@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from scenes import ball, trusted
 from skimage.measure import marching_cubes
 
 from pimper_bench.scenes.render_in_memory import Sphere, render_shape
@@ -27,11 +28,7 @@ def scene_of(num_views=VIEWS, texture=None):
     white = texture or (lambda points: torch.full_like(points, 0.6))
     rendered = render_shape(Sphere(), cameras, lights.harmonics_world(), white)
     scene = sparse_scene(rendered, 20, generator, dtype=torch.float64)
-    silhouettes = Silhouettes(
-        inside=rendered.depth.isfinite().double(),
-        reliable=torch.ones(num_views, dtype=torch.bool),
-        source="masks",
-    )
+    silhouettes = trusted(rendered.depth.isfinite().double())
     contours = TraceContours()(silhouettes, scene.cameras)
     ambient, lamp = lights.harmonics_world().split([1, 3], dim=1)
     field = LightField(
@@ -55,14 +52,6 @@ def surface_of(contours):
     vertices, faces, _, _ = marching_cubes(distance.clamp(-1, 1).numpy(), 0.0)
     step = float(hull.spacing)
     world = hull.origin_world + step * (torch.from_numpy(vertices.copy()) - 1)
-    return Mesh(vertices_world=world.double(), faces=torch.from_numpy(faces.copy()).long())
-
-
-def ball(radius=1.0):
-    steps = torch.linspace(-1.2, 1.2, 60)
-    grid = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1)
-    vertices, faces, _, _ = marching_cubes((radius - grid.norm(dim=-1)).numpy(), 0.0)
-    world = -1.2 + torch.from_numpy(vertices.copy()) * float(steps[1] - steps[0])
     return Mesh(vertices_world=world.double(), faces=torch.from_numpy(faces.copy()).long())
 
 
@@ -99,7 +88,8 @@ def test_rotated_lights_do_not_bias_depths(arc):
 
 def test_a_correct_surface_yields_no_points(arc):
     scene, contours, field = arc
-    assert len(DepthFromLight()(scene, contours, ball(), field).points_world) == 0
+    cloud = DepthFromLight()(scene, contours, ball(level=5).to(torch.float64), field)
+    assert len(cloud.points_world) == 0
 
 
 def test_soft_light_yields_no_points(arc):

@@ -3,22 +3,20 @@ from dataclasses import asdict
 
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scenes import each_bucket, first_bucket
 from solved import solved
 from torch.nn.functional import pad
 from torch.testing import assert_close
 
+import pimper_torch as pt
 from pimper_torch.geometry.template_normals import coarse_normals
 from pimper_torch.lighting.light_field import LightField, harmonics
-from pimper_torch.presets.load_config import load_config
-from pimper_torch.records import PatchStatus, PatchViews
-from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.records import PatchStatus
 from pimper_torch.stages.photometry import factorize
-from pimper_torch.stages.photometry.factorize import Factorize
-from pimper_torch.stages.photometry.fit_light import FitLight
-from pimper_torch.stages.photometry.photometry_config import FactorizeConfig
 
-EXACT = FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
+EXACT = pt.FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
 
 
 def angles_deg(found, truth, where):
@@ -37,7 +35,7 @@ def median_error(found, scene):
 
 def test_exact_coarse_normals_are_kept(scene):
     true = scene(bumps=0.0)
-    found = solved(Factorize(EXACT), true.seen)
+    found = solved(pt.Factorize(EXACT), true.seen)
     ratios = []
     for bucket, normals, albedo, registered in zip(
         found.buckets, true.normals, true.albedo, true.seen.buckets, strict=True
@@ -63,7 +61,7 @@ def test_bumps_missing_from_the_mesh_are_recovered(scene, solver):
             for t, n in zip(true.seen.patches.buckets, true.normals, strict=True)
         ]
     ).median()
-    found = solved(Factorize(FactorizeConfig(solver=solver, geometry_weight=0.0)), true.seen)
+    found = solved(pt.Factorize(pt.FactorizeConfig(solver=solver, geometry_weight=0.0)), true.seen)
     assert start > 10
     assert median_error(found, true) < 0.25 * start
     for bucket in found.buckets:
@@ -78,10 +76,10 @@ def test_bumps_missing_from_the_mesh_are_recovered(scene, solver):
 @pytest.mark.parametrize("loss", factorize.LOSSES)
 def test_every_loss_recovers_bumps_and_has_gradients(scene, loss):
     true = scene(bumps=0.2)
-    config = FactorizeConfig(loss=loss, geometry_weight=0.0)
+    config = pt.FactorizeConfig(loss=loss, geometry_weight=0.0)
     seen = true.seen.to(torch.float32)
     radiance = seen.buckets[0].radiance.clone().requires_grad_()
-    found = solved(Factorize(config), first_bucket(seen, radiance=radiance))
+    found = solved(pt.Factorize(config), first_bucket(seen, radiance=radiance))
     assert median_error(found, true) < 3  # of a start 10 degrees off
     total = sum(bucket.albedo.square().sum() for bucket in found.buckets)
     (slope,) = torch.autograd.grad(total, radiance)
@@ -91,8 +89,8 @@ def test_every_loss_recovers_bumps_and_has_gradients(scene, loss):
 
 def test_the_published_method_keeps_the_gauge_of_its_start(scene):
     true = scene(bumps=0.3)
-    paper = load_config("paper")
-    found = solved(Factorize(paper.factorize), true.seen, **asdict(paper.light))
+    paper = pt.load_config("paper")
+    found = solved(pt.Factorize(paper.factorize), true.seen, **asdict(paper.light))
     assert median_error(found, true) < 5  # the bumps have 17 degrees
 
 
@@ -102,7 +100,7 @@ def test_samples_lit_in_few_views_keep_coarse_normals(scene):
     valid = first.valid.clone()
     valid[1, 3:, 4:7] = False  # leaves three views in these rows
     seen = first_bucket(true.seen, valid=valid)
-    found = solved(Factorize(), seen).buckets[0]
+    found = solved(pt.Factorize(), seen).buckets[0]
     assert not found.valid[1, 4:7].any()
     assert (found.information[1, 4:7] == 0).all()
     coarse = coarse_normals(seen.patches.coarse, seen.patches.buckets[0])
@@ -113,8 +111,8 @@ def test_samples_lit_in_few_views_keep_coarse_normals(scene):
 def test_constant_light_warns_and_keeps_coarse_normals(scene):
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(lights=light * torch.linspace(0.5, 1.5, 12, dtype=torch.float64)[:, None])
-    with pytest.warns(PimperWarning, match=r"8 of 8 patches keep .* silhouettes are wrong"):
-        found = solved(Factorize(), true.seen)
+    with pytest.warns(pt.PimperWarning, match=r"8 of 8 patches keep .* silhouettes are wrong"):
+        found = solved(pt.Factorize(), true.seen)
     for bucket, templates in zip(found.buckets, true.seen.patches.buckets, strict=True):
         assert (bucket.status == PatchStatus.CONSTANT_LIGHT).all()
         assert not bucket.valid.any()
@@ -131,8 +129,8 @@ def test_a_patch_without_normals_still_has_lights_and_albedo(scene):
     radiance = first.radiance.clone()
     radiance[2, 3] *= 0.6  # a shadow on one patch in one view, missing from the field
     seen = first_bucket(true.seen, radiance=radiance)
-    with pytest.warns(PimperWarning, match="light varies too little"):
-        found = solved(Factorize(), seen)
+    with pytest.warns(pt.PimperWarning, match="light varies too little"):
+        found = solved(pt.Factorize(), seen)
     for bucket, templates, one in zip(
         found.buckets, seen.patches.buckets, seen.buckets, strict=True
     ):
@@ -154,7 +152,7 @@ def test_a_shadowed_patch_has_albedo_only_under_constant_light(scene, monkeypatc
         return lit, torch.zeros_like(lit)
 
     monkeypatch.setattr(factorize, "_illuminated", illuminated)
-    photometric = solved(Factorize(), true.seen)
+    photometric = solved(pt.Factorize(), true.seen)
     found, counts = photometric.buckets[0], photometric.figures()
     assert counts["few_views_patches"] == 1  # one of 8: a figure, not a warning
     assert counts["constant_light_patches"] == (0 if moves else 7)
@@ -183,19 +181,19 @@ def test_soft_light_determines_normals_in_cast_shadow_if_strong(scene, monkeypat
         point_light=lamp,  # shadowed everywhere
         inverse_distance=torch.zeros(12).double(),
     )
-    monkeypatch.setattr(FitLight, "_field", lambda *_: field)
+    monkeypatch.setattr(pt.FitLight, "_field", lambda *_: field)
     monkeypatch.setattr(
         factorize,
         "_illuminated",
         lambda bucket, *_: (torch.zeros_like(bucket.registered.valid), bucket.registered.valid),
     )
     if strength > 1:
-        with pytest.warns(PimperWarning, match="8 of 8 patches keep"):
+        with pytest.warns(pt.PimperWarning, match="8 of 8 patches keep"):
             assert not any(
-                bucket.valid.any() for bucket in solved(Factorize(EXACT), true.seen).buckets
+                bucket.valid.any() for bucket in solved(pt.Factorize(EXACT), true.seen).buckets
             )
         return
-    assert median_error(solved(Factorize(EXACT), true.seen), true) < 0.1
+    assert median_error(solved(pt.Factorize(EXACT), true.seen), true) < 0.1
 
 
 def test_light_colours_do_not_change_normals_and_albedo(scene, generator):
@@ -205,8 +203,8 @@ def test_light_colours_do_not_change_normals_and_albedo(scene, generator):
     tinted = each_bucket(
         true.seen, lambda one: one.replace(radiance=one.radiance * colour[..., None, None])
     )
-    white, found = solved(Factorize(EXACT), true.seen), solved(Factorize(EXACT), tinted)
-    gray = solved(Factorize(EXACT), tinted, colours=False)
+    white, found = solved(pt.Factorize(EXACT), true.seen), solved(pt.Factorize(EXACT), tinted)
+    gray = solved(pt.Factorize(EXACT), tinted, colours=False)
     for one, two, three in zip(white.buckets, found.buckets, gray.buckets, strict=True):
         share = one.albedo / one.albedo.mean(dim=-1, keepdim=True)
 
@@ -226,8 +224,8 @@ def test_exposures_scale_lights_and_do_not_change_normals(scene):
     exposed = each_bucket(
         true.seen, lambda one: one.replace(radiance=one.radiance * exposure[:, None, None, None])
     )
-    plain, found = solved(Factorize(EXACT), true.seen), solved(Factorize(EXACT), exposed)
-    unlike = solved(Factorize(EXACT), exposed, colours=False)
+    plain, found = solved(pt.Factorize(EXACT), true.seen), solved(pt.Factorize(EXACT), exposed)
+    unlike = solved(pt.Factorize(EXACT), exposed, colours=False)
     for one, two, three in zip(plain.buckets, found.buckets, unlike.buckets, strict=True):
         assert (one.exposure == 1).all()
         assert (three.exposure == 1).all()
@@ -242,7 +240,7 @@ def test_exposures_scale_lights_and_do_not_change_normals(scene):
         assert_close(ratio, ratio.mean().expand_as(ratio), rtol=0.02, atol=0)
 
 
-def spoil(seen: PatchViews, how: str) -> PatchViews:
+def spoil(seen: pt.PatchViews, how: str) -> pt.PatchViews:
     first = seen.buckets[0]
     radiance, valid = first.radiance.clone(), first.valid.clone()
     if how == "masked":
@@ -257,8 +255,8 @@ def test_a_bad_patch_is_flagged_and_does_not_affect_others(scene, how):
     true = scene()
     without = spoil(true.seen, "masked")
     keep = torch.tensor([0, 1, 3, 4])
-    found = solved(Factorize(), spoil(true.seen, how))
-    plain = solved(Factorize(), without)
+    found = solved(pt.Factorize(), spoil(true.seen, how))
+    plain = solved(pt.Factorize(), without)
     bad, good = found.buckets[0], plain.buckets[0]
     reason = PatchStatus.UNSEEN if how == "masked" else PatchStatus.NOT_FINITE
     assert bad.status[2] == reason
@@ -275,8 +273,8 @@ def test_views_without_valid_samples_warn(scene):
     nothing = each_bucket(
         true.seen, lambda one: one.replace(radiance=0 * one.radiance, valid=one.valid & False)
     )
-    with pytest.warns(PimperWarning, match="8 have no valid sample in any view"):
-        found = solved(Factorize(), nothing)
+    with pytest.warns(pt.PimperWarning, match="8 have no valid sample in any view"):
+        found = solved(pt.Factorize(), nothing)
     for bucket in found.buckets:
         assert bucket.normals_patch.isfinite().all()
         assert (bucket.albedo == 0).all()
@@ -289,11 +287,56 @@ def test_information_is_the_inverse_variance_of_normals(scene, generator):
         noise = torch.randn(one.radiance.shape, generator=generator, dtype=torch.float64)
         return one.replace(radiance=one.radiance + 0.04 * noise)
 
-    alone = FactorizeConfig(loss="squares", light_prior=1e6, geometry_weight=0.0)
-    found = solved(Factorize(alone), each_bucket(true.seen, noisy), model="soft")
+    alone = pt.FactorizeConfig(loss="squares", light_prior=1e6, geometry_weight=0.0)
+    found = solved(pt.Factorize(alone), each_bucket(true.seen, noisy), model="soft")
     variance, square = [], []
     for bucket, normals in zip(found.buckets, true.normals, strict=True):
         variance.append(1 / bucket.information[bucket.valid])
         square.append(angles_deg(bucket.normals_patch, normals, bucket.valid).deg2rad().square())
     ratio = torch.cat(variance).mean() / torch.cat(square).mean()
     assert ratio == pytest.approx(1, abs=0.1)
+
+
+SEEDS = st.integers(0, 2**31 - 1)
+
+
+def shuffled(count, seed):
+    return torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+
+
+@settings(
+    max_examples=5,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(seed=SEEDS, power=st.integers(-10, 10))
+def test_order_and_brightness_do_not_change_normals(scene, seed, power):
+    seen = scene().seen
+    usual = solved(pt.Factorize(), seen)
+    gain, views = 2.0**power, shuffled(12, seed)
+    orders = [
+        shuffled(len(one.radiance), seed + 1 + index) for index, one in enumerate(seen.buckets)
+    ]
+    patches = seen.patches.replace(
+        buckets=tuple(
+            one.take(order) for one, order in zip(seen.patches.buckets, orders, strict=True)
+        )
+    )
+    buckets = tuple(
+        one.replace(radiance=gain * one.radiance[:, views], valid=one.valid[:, views]).take(order)
+        for one, order in zip(seen.buckets, orders, strict=True)
+    )
+    found = solved(pt.Factorize(), pt.PatchViews(patches=patches, buckets=buckets))
+    for before, after, order in zip(usual.buckets, found.buckets, orders, strict=True):
+        assert torch.equal(after.valid, before.valid[order])
+        normals = before.normals_patch[order]
+        away = (after.normals_patch - normals).norm(dim=-1)[after.valid]
+        assert away.median() < 1e-4
+        assert away.quantile(0.99) < 0.02
+        # Radiance is albedo times light: their product takes the gain.
+        shading, usual_shading = (
+            one.albedo.mean() * one.lights_patch[..., 0].mean() for one in (after, before)
+        )
+        assert_close(shading, gain * usual_shading, rtol=1e-3, atol=0)
+        assert torch.equal(after.status, before.status[order])

@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from draws import normal
 from torch.testing import assert_close
 
 from pimper_torch.linalg.robust import (
@@ -15,12 +16,8 @@ from pimper_torch.linalg.robust import (
 from pimper_torch.runtime.errors import ConfigError
 
 
-def drawn(generator, *shape):
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-
 def test_the_spread_solves_its_equation(generator):
-    noise = drawn(generator, 2, 300)
+    noise = normal(generator, 2, 300)
     everything = torch.ones_like(noise, dtype=torch.bool)
     scale = 0.6472404 * robust_deviation(noise, everything)[:, None]
     fraction = noise**4 / (noise**4 + scale**4)
@@ -28,7 +25,7 @@ def test_the_spread_solves_its_equation(generator):
 
 
 def test_the_spread_tolerates_40_percent_outliers(generator):
-    noise = drawn(generator, 20_000)
+    noise = normal(generator, 20_000)
     noise[:8_000] *= 1e8
     found = robust_deviation(noise, torch.ones_like(noise, dtype=torch.bool))
     # 8 of 20 are beyond any scale: the median absolute value gives 2.05.
@@ -43,7 +40,7 @@ def test_the_spread_of_exact_or_missing_data_is_zero():
 
 
 def test_gradients_of_the_spread_match_differences(generator):
-    noise = drawn(generator, 2, 30).requires_grad_()
+    noise = normal(generator, 2, 30).requires_grad_()
     seen = torch.rand(2, 30, generator=generator) > 0.2
     assert torch.autograd.gradcheck(lambda residual: robust_deviation(residual, seen), noise)
 
@@ -54,7 +51,7 @@ LOSSES = {"linear": Squares(), "cauchy": Cauchy(), "huber": Huber(), None: Geman
 
 @pytest.mark.parametrize("loss", LOSSES.values())
 def test_weights_and_curvatures_are_derivatives_of_the_loss(generator, loss):
-    residual = drawn(generator, 60).requires_grad_()
+    residual = normal(generator, 60).requires_grad_()
     deviation = torch.tensor(0.4, dtype=torch.float64)
     width = loss.scale * deviation
     value = (width**2 / 2 * loss.rho((residual / width) ** 2)).sum()
@@ -81,7 +78,7 @@ def test_each_loss_is_95_percent_efficient_on_gaussian_noise(loss):
 
 
 def test_the_median_deviation_of_gaussian_noise_is_its_standard_deviation(generator):
-    noise = 3 * drawn(generator, 200_000)
+    noise = 3 * normal(generator, 200_000)
     seen = torch.rand(200_000, generator=generator) > 0.3
     found = median_deviation(torch.where(seen, noise, 1e6), seen)
     assert_close(found, torch.tensor(3.0, dtype=torch.float64), rtol=0.01, atol=0)
@@ -89,7 +86,7 @@ def test_the_median_deviation_of_gaussian_noise_is_its_standard_deviation(genera
 
 
 def test_unseen_samples_do_not_affect_the_spread(generator):
-    noise = drawn(generator, 3, 400)
+    noise = normal(generator, 3, 400)
     seen = torch.rand(3, 400, generator=generator) > 0.2
     found = robust_deviation(torch.where(seen, noise, 1e6), seen)
     assert_close(found, robust_deviation(noise, seen))

@@ -2,12 +2,12 @@ import math
 
 import pytest
 import torch
+from scenes import ball
 from torch.nn.functional import normalize
 
-from pimper_bench.scenes.procedural_meshes import icosphere, join, moved, table
+from pimper_bench.scenes.procedural_meshes import join, table
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.lighting.light_field import LightField
-from pimper_torch.records import Mesh
 from pimper_torch.stages.photometry.shadows import cast_shadows, cast_shadows_on_rasters
 
 RADIUS, HEIGHT = 0.5, 1.2  # of the ball, above the plane z = 0
@@ -15,9 +15,7 @@ RADIUS, HEIGHT = 0.5, 1.2  # of the ball, above the plane z = 0
 
 @pytest.fixture(scope="module")
 def ball_over_plane():
-    vertices, faces = icosphere(5)
-    ball = moved(Mesh(vertices_world=vertices, faces=faces), scale=RADIUS, shift=(0.0, 0.0, HEIGHT))
-    both = join(ball, table(8.0))
+    both = join(ball(RADIUS, level=5, center=(0.0, 0.0, HEIGHT)), table(8.0))
     return RayCaster(both.vertices_world, both.faces)
 
 
@@ -64,10 +62,7 @@ def test_a_distant_point_light_casts_an_elliptic_shadow_of_a_ball(ball_over_plan
 
 
 def test_occluders_behind_the_point_light_cast_no_shadow(ball_over_plane, plane):
-    points, normals = plane
-    found = cast_shadows(
-        point_lights([(0, 0, HEIGHT - 0.6)]), ball_over_plane, points, normals, 1e-4
-    )
+    found = cast_shadows(point_lights([(0, 0, HEIGHT - 0.6)]), ball_over_plane, *plane, 1e-4)
     assert found.lit.all()
 
 
@@ -85,27 +80,16 @@ def test_the_attached_shadow_of_a_ball_ends_at_the_terminator(ball_over_plane, g
 
 
 def test_only_samples_near_shadow_edges_are_unsure(ball_over_plane, plane):
-    points, normals = plane
-    point_light_height, guard = 3.0, 0.1
-    found = cast_shadows(
-        point_lights([(0, 0, point_light_height)]),
-        ball_over_plane,
-        points,
-        normals,
-        1e-4,
-        guard=guard,
-    )
-    contour = points[..., :2].norm(dim=-1) - point_light_height * math.tan(
-        math.asin(RADIUS / (point_light_height - HEIGHT))
-    )
+    light_height, guard = 3.0, 0.1
+    given = point_lights([(0, 0, light_height)]), ball_over_plane, *plane, 1e-4
+    found, plain = cast_shadows(*given, guard=guard), cast_shadows(*given)
+    edge = light_height * math.tan(math.asin(RADIUS / (light_height - HEIGHT)))
+    contour = plane[0][..., :2].norm(dim=-1) - edge
     sure = found.sure[..., 0]
     near, far = contour.abs() < 0.95 * guard, contour.abs() > 1.2 * guard  # the edge is curved
     assert near.any()
     assert not sure[near].any()
     assert sure[far].all()
-    plain = cast_shadows(
-        point_lights([(0, 0, point_light_height)]), ball_over_plane, points, normals, 1e-4
-    )
     assert (plain.lit[..., 0] == (contour > 0))[contour.abs() > 0.003].all()
     assert plain.sure.all()
     assert (plain.lit == found.lit).all()

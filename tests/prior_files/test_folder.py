@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from sparse_models import views_of
 
 from pimper_torch.priors.prior_files.folder import read_maps
-from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError
 
 KINDS = {"normal": ("normal",), "depth": ("depth",), "mask": ("mask",)}
@@ -13,20 +13,10 @@ FLAT = ("cup_1.jpg", "cup_2.jpg")
 POSES = ("p_1/a.png", "p_1/b.png", "p_2/a.png", "p_2/b.png")
 
 
-def views_of(names):
-    return Views(
-        images=torch.zeros(len(names), 3, 4, 6),
-        sizes_px=torch.tensor([[6, 4]] * len(names)),
-        names=names,
-        focals_px=torch.full((len(names),), torch.nan),
-    )
-
-
 def numbers_of(folder, names, kind="depth"):
     """Return the number in the map of each photograph that has one."""
-    maps = read_maps(
-        folder, views_of(names), KINDS[kind], lambda _, layer: layer.values, undistorted=False
-    )
+    views = views_of(torch.zeros(len(names), 3, 4, 6), names=names)
+    maps = read_maps(folder, views, KINDS[kind], lambda _, layer: layer.values, undistorted=False)
     return dict(zip(maps.names, maps.values[:, 0, 0, 0].int().tolist(), strict=True))
 
 

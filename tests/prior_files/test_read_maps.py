@@ -6,25 +6,20 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image, PngImagePlugin
+from sparse_models import views_of
 from torch.testing import assert_close
 
 from pimper_torch.io.decode import write_deep_png
 from pimper_torch.io.openexr import read_exr, write_exr
 from pimper_torch.priors.map_config import NORMALS_ERROR_DEG
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
-from pimper_torch.records import Views
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
 
 
 @pytest.fixture
 def views():
     names = ("a b.jpg", "cup_1.png")
-    return Views(
-        images=torch.zeros(2, 3, 24, 32),
-        sizes_px=torch.tensor([[32, 24], [24, 24]]),
-        names=names,
-        focals_px=torch.full((2,), torch.nan),
-    )
+    return views_of(torch.zeros(2, 3, 24, 32), [(32, 24), (24, 24)], names=names)
 
 
 @pytest.fixture
@@ -74,11 +69,7 @@ def test_normals_of_every_format_are_read(file, tolerance, views, normals, tmp_p
 def test_eight_bits_and_arrays_in_unit_range_are_decoded(views, normals, tmp_path):
     normals = normals[:, :24]
     Image.fromarray(np.rint(255 * (normals + 1) / 2).astype(np.uint8)).save(tmp_path / "cup_1.png")
-    np.save(
-        tmp_path / "a b.npy",
-        ((normals + 1) / 2).transpose(2, 0, 1)[None, :, :18],
-        allow_pickle=False,
-    )
+    save(tmp_path / "a b.npy", ((normals + 1) / 2).transpose(2, 0, 1)[None, :, :18])
     found = read_normals(tmp_path, views, "dsine", error_deg=10)
     assert found.sizes_px.tolist() == [[24, 18], [24, 24]]
     assert found.axes == "lub"
@@ -316,12 +307,7 @@ COLOURED = np.where(LABELS[..., None] > 2, [1.0, -1, -1], [-1, 1, 1])
         (read_depth, "a b.npy", np.ones((5, 24, 32)), "a stack of 5 maps; .* Write each map to"),
         (read_depth, "a b.npy", np.eye(24) * np.arange(3)[:, None, None], "nor a stack of maps"),
         (read_normals, "a b.npy", np.ones((2, 24, 32, 3)), "a stack of 2 maps"),
-        (
-            read_depth,
-            "a b.npz",
-            ONES[0, 0],
-            "contains normals, albedo; .* array .* named depth",
-        ),
+        (read_depth, "a b.npz", ONES[0, 0], "contains normals, albedo; .* array .* named depth"),
     ],
 )
 def test_invalid_or_mismatching_maps_are_refused(read, name, values, message, views, tmp_path):

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from sparse_models import views_of
 
 from pimper_torch.cli.options import parse
 from pimper_torch.io.decode import write_deep_png
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
-from pimper_torch.records import Views
 from pimper_torch.runtime.errors import ConfigError, InputError
 from pimper_torch.scale.given import Mark, PixelMark
 
@@ -14,13 +14,8 @@ SOFT = np.linspace(0, 1, 24 * 16).reshape(16, 24).astype(np.float32)
 
 
 @pytest.fixture
-def views() -> Views:
-    return Views(
-        images=torch.full((3, 3, 32, 48), 0.5),
-        sizes_px=torch.tensor([[48, 32]] * 3),
-        names=("a.jpg", "b.jpg", "c.jpg"),
-        focals_px=torch.full((3,), torch.nan),
-    )
+def views():
+    return views_of(torch.full((3, 3, 32, 48), 0.5), names=("a.jpg", "b.jpg", "c.jpg"))
 
 
 def write_bytes(path, values):

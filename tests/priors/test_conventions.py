@@ -200,18 +200,9 @@ DEPTHS = {
     "metres": (lambda depth, _: 3 * depth, "depth along the camera's axis up to a factor per map"),
     "affine": (lambda depth, _: 0.3 * depth - 0.5, "axis up to a factor and an offset per map"),
     "scene": (lambda depth, _: depth, "depth along the camera's axis in the scene's unit"),
-    "disparity": (
-        lambda depth, _: 4 / depth - 0.1,
-        "disparity. along the camera's .* an offset per map",
-    ),
-    "inverse": (
-        lambda depth, _: 4 / depth,
-        "disparity. along the camera's axis up to a factor per map",
-    ),
-    "distance": (
-        lambda depth, rays: 2 * depth * rays,
-        "depth along the ray up to a factor per map",
-    ),
+    "disparity": (lambda z, _: 4 / z - 0.1, "disparity. along the camera's .* an offset per map"),
+    "inverse": (lambda z, _: 4 / z, "disparity. along the camera's axis up to a factor per map"),
+    "distance": (lambda z, rays: 2 * z * rays, "depth along the ray up to a factor per map"),
 }
 
 

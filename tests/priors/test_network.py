@@ -1,5 +1,6 @@
 import pytest
 import torch
+from sparse_models import views_of
 from torch import nn
 from torch.nn.functional import avg_pool2d, interpolate, normalize
 from torch.testing import assert_close
@@ -16,14 +17,8 @@ def views():
     """Two photographs of different sizes."""
     generator = torch.Generator().manual_seed(2)
     images = torch.rand(2, 3, 20, 30, generator=generator)
-    sizes = torch.tensor([[30, 20], [16, 12]])
     images[1, :, 12:], images[1, :, :, 16:] = 0, 0
-    return pt.Views(
-        images=images,
-        sizes_px=sizes,
-        names=("a.png", "b.png"),
-        focals_px=torch.full((2,), torch.nan),
-    )
+    return views_of(images, [(30, 20), (16, 12)], names=("a.png", "b.png"))
 
 
 class Coarse(nn.Module):

@@ -3,18 +3,11 @@
 import torch
 from torch.nn.functional import normalize
 
+import pimper_torch as pt
 from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.paper.cloud_filters import delaunay
-from pimper_torch.records import (
-    Cameras,
-    CoarseMesh,
-    DepthPatches,
-    Depths,
-    Mesh,
-    PhotometricPatches,
-)
-from pimper_torch.stages.patches.decompose import Decompose
+from pimper_torch.records import Depths
 from pimper_torch.stages.patches.patches_config import DecomposeConfig
 
 IDENTITY = torch.tensor([0.0, 0, 1, 0], dtype=torch.float64)
@@ -46,18 +39,16 @@ def facets_over(height, xy, sample=0.02, overlap=6.0, dtype=torch.float64):
     cam_from_world = torch.eye(4, dtype=dtype)[None].clone()
     cam_from_world[0, 2, 3] = 10.0
     focal = (10 + vertices[:, 2].median()) / sample
-    cameras = Cameras(
+    cameras = pt.Cameras(
         intrinsics=torch.diag(torch.tensor([focal, focal, 1.0], dtype=dtype))[None],
         cam_from_world=cam_from_world,
         sizes_px=torch.tensor([[100, 100]]),
     )
-    normals = vertex_normals(vertices, faces)
-    coarse = CoarseMesh(
-        mesh=Mesh(vertices_world=vertices, faces=faces, normals_world=normals),
-        reference=0,
-        is_point=torch.ones(len(vertices), dtype=torch.bool),
+    mesh = pt.Mesh(
+        vertices_world=vertices, faces=faces, normals_world=vertex_normals(vertices, faces)
     )
-    return Decompose(DecomposeConfig(overlap_samples=overlap))(coarse, cameras)
+    coarse = pt.CoarseMesh(mesh=mesh, reference=0, is_point=torch.ones(len(xy), dtype=torch.bool))
+    return pt.Decompose(DecomposeConfig(overlap_samples=overlap))(coarse, cameras)
 
 
 def height_fields(patches, height_field):
@@ -78,10 +69,10 @@ def height_fields(patches, height_field):
         albedo.append(0.5 + 0.25 * world.reshape(surface.shape))
         identity = IDENTITY.expand(len(depth), 4)
         buckets.append(Depths(depth=depth, valid=valid, transform=identity))
-    photometric = PhotometricPatches.of(
+    photometric = pt.PhotometricPatches.of(
         patches, normals=normals, albedo=albedo, lights=torch.ones(1, 4), information=1e3
     )
-    return DepthPatches(photometric=photometric, buckets=tuple(buckets))
+    return pt.DepthPatches(photometric=photometric, buckets=tuple(buckets))
 
 
 def level(points, _):

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from draws import normal
 from slopes import normals_from_slopes
 from torch.testing import assert_close
 
@@ -41,10 +42,6 @@ def slopes_of_bumps(x, y):
     p = 0.4 * x + 0.1 * y + 0.12 * torch.cos(6 * x) * torch.cos(5 * y)
     q = 0.1 * x - 0.1 * torch.sin(6 * x) * torch.sin(5 * y)
     return p, q
-
-
-def random(generator, *shape):
-    return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
 
 def test_the_error_of_closed_form_surfaces_is_of_second_order():
@@ -107,7 +104,7 @@ def test_the_height_field_has_mean_zero_at_the_corners():
 
 def test_the_solution_equals_dense_least_squares_on_steps(generator):
     """Steps of the solution are closest to the given ones, for any source of zero mean."""
-    right, down = random(generator, 5, 5), random(generator, 4, 6)
+    right, down = normal(generator, 5, 5), normal(generator, 4, 6)
     unit = torch.eye(30, dtype=torch.float64).reshape(-1, 5, 6)
     steps = torch.cat([part.flatten(1) for part in differences(unit)], dim=1).T
     wanted = torch.cat([right.flatten(), down.flatten()])
@@ -119,7 +116,7 @@ def test_the_solution_equals_dense_least_squares_on_steps(generator):
 
 def test_filling_keeps_known_values_and_ignores_unknown_ones(generator):
     weight = (torch.rand(2, 9, 14, generator=generator) < 0.3).double()
-    values = random(generator, 2, 3, 9, 14)
+    values = normal(generator, 2, 3, 9, 14)
     filled = fill_smoothly(torch.where(weight[:, None] > 0, values, torch.nan), weight)
     assert filled.isfinite().all()
     known = (weight[:, None] > 0).expand_as(values)

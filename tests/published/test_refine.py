@@ -1,5 +1,6 @@
 import pytest
 import torch
+from scenes import subdivided_square
 from torch.testing import assert_close
 
 from pimper_torch.geometry.subdivision import subdivide
@@ -178,9 +179,8 @@ def test_the_solution_minimises_the_published_energy(folded):
 
 
 def test_vertices_without_support_continue_the_surrounding_plane(folded):
-    plane = folded.points * folded.points.new_tensor([1, 1, 0]) + folded.points.new_tensor(
-        [0, 0, 2]
-    )
+    plane = folded.points.clone()
+    plane[:, 2] = 2
     hole = (plane[:, :2] - torch.tensor([0.3, 0.2])).norm(dim=1) < 0.25
     assert hole.sum() > 5
     spoiled = torch.where(hole[:, None], folded.points, plane)
@@ -190,9 +190,7 @@ def test_vertices_without_support_continue_the_surrounding_plane(folded):
 
 def test_smoothing_increases_with_g_from_centres_to_seams():
     """White noise is kept entirely at G = 0 and least at the vertices."""
-    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=torch.float64)
-    facets, spacing = torch.tensor([[0, 1, 2], [0, 2, 3]]), spaced(0.05)[:2]
-    square = subdivide(vertices, facets, spacing)
+    square, spacing = subdivided_square(0.05), spaced(0.05)[:2]
     noise = torch.randn(
         60, len(square.points), generator=torch.Generator().manual_seed(92)
     ).double()

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from draws import uniform
 from torch.testing import assert_close
 
 from pimper_torch.geometry.projection import project
@@ -18,10 +19,6 @@ from pimper_torch.paper.cloud_filters import (
 from pimper_torch.paper.paper_config import TriangulateConfig
 from pimper_torch.paper.triangulate import Triangulate, peel
 from pimper_torch.runtime.errors import ReconstructionError
-
-
-def uniform(generator, *shape):
-    return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
 
 def test_the_mesh_of_a_ball_is_an_outward_disc_on_the_ball(dome_cloud):

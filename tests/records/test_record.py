@@ -3,6 +3,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from sparse_models import views_of
 from torch.utils import _pytree as pytree
 
 from pimper_bench.scenes.scene_cameras import arc_cameras
@@ -24,13 +25,9 @@ def cameras():
     return arc_cameras(2, width=6, height=4, focal_px=5.0, distance=3.0)
 
 
-def views_of(num_views, height=4, width=6):
-    return Views(
-        images=torch.zeros(num_views, 3, height, width),
-        sizes_px=torch.tensor([[width, height]]).repeat(num_views, 1),
-        names=tuple(f"{view}.png" for view in range(num_views)),
-        focals_px=torch.full((num_views,), torch.nan),
-    )
+@pytest.fixture
+def views():
+    return views_of(torch.zeros(2, 3, 4, 6))
 
 
 @pytest.mark.parametrize("device", [None, "cpu", "meta"])
@@ -74,19 +71,19 @@ def test_a_record_shows_shapes_instead_of_numbers(cameras):
 
 
 @pytest.mark.usefixtures("shapes_unchecked")
-def test_tensors_of_the_wrong_shape_or_kind_are_refused(cameras):
+def test_tensors_of_the_wrong_shape_or_kind_are_refused(cameras, views):
     with pytest.raises(InputError, match=r"Cameras.cam_from_world is float64\[1, 4, 4\]; needed: "):
         cameras.replace(cam_from_world=cameras.cam_from_world[:1])  # one camera, two intrinsics
     with pytest.raises(InputError, match=r"sizes_px is float64\[2, 2\]; needed: Int of shape"):
         cameras.replace(sizes_px=cameras.sizes_px.double())  # sizes are integers
     with pytest.raises(InputError, match=r"shape \(view channel height width\)"):
-        views_of(2).replace(images=torch.zeros(3, 3))
+        views.replace(images=torch.zeros(3, 3))
     with pytest.raises(InputError, match=r"masks is 3; needed: Bool .* or None, next to images"):
-        views_of(2).replace(masks=3)
+        views.replace(masks=3)
 
 
 def test_take_and_concatenate_are_inverse(cameras):
-    views = views_of(3).replace(images=torch.arange(3.0)[:, None, None, None].expand(3, 3, 4, 6))
+    views = views_of(torch.arange(3.0)[:, None, None, None].expand(3, 3, 4, 6))
     some = views.take([2, 0])
     assert some.names == ("2.png", "0.png")
     assert some.images[:, 0, 0, 0].tolist() == [2, 0]
@@ -141,15 +138,15 @@ def test_camera_centres_map_to_the_origin_of_their_camera(cameras):
     torch.testing.assert_close(in_cam[:, :3], torch.zeros(2, 3).double())
 
 
-def test_padding_is_outside_the_photographs():
-    views = views_of(2).replace(sizes_px=torch.tensor([[6, 4], [3, 2]]))
+def test_padding_is_outside_the_photographs(views):
+    views = views.replace(sizes_px=torch.tensor([[6, 4], [3, 2]]))
     assert views.inside[0].all()
     assert views.inside[1].nonzero().tolist() == [[r, c] for r in range(2) for c in range(3)]
 
 
-def test_the_table_of_observations_has_view_and_point_pairs(cameras):
+def test_the_table_of_observations_has_view_and_point_pairs(cameras, views):
     scene = SparseScene(
-        views=views_of(2),
+        views=views,
         cameras=cameras,
         points_world=torch.zeros(3, 3),
         reprojection_errors_px=torch.zeros(3),

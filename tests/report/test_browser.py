@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scenes import trusted
 
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.write import write_asset
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.radiometry.base_color import base_color
-from pimper_torch.records import Materials, Relighting, Silhouettes, ViewErrors
+from pimper_torch.records import Materials, Relighting, ViewErrors
 from pimper_torch.stages.relighting.held_out import predict
 from pimper_torch.stages.texturing.bake import textured
 from pimper_torch.viz.maps import view_maps
@@ -95,11 +96,7 @@ def shown(tmp_path_factory):
     views = scene.views.num_views
     across = torch.arange(SIDE) + 0.5 - SIDE / 2
     y, x = torch.meshgrid(across, across, indexing="ij")
-    silhouettes = Silhouettes(
-        inside=(torch.hypot(x, y) < 0.41 * SIDE).float().expand(views, SIDE, SIDE),
-        reliable=torch.ones(views, dtype=torch.bool),
-        source="found",
-    )
+    inside = (torch.hypot(x, y) < 0.41 * SIDE).float().expand(views, SIDE, SIDE)
     lights_world = torch.tensor([[torch.nan] * 4, *[LIGHT] * 5])
     parts = {
         "title": "ball",
@@ -107,7 +104,7 @@ def shown(tmp_path_factory):
         "asset": (folder / "asset.glb").read_bytes(),
         "surface": asset.mesh,
         "scene": scene,
-        "silhouettes": silhouettes,
+        "silhouettes": trusted(inside, "found"),
         "reference": 0,
         "predictions": predictions(mesh, scene, relighting),
         "summary": SUMMARY,

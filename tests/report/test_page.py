@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scenes import CORNERS, FACETS
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
@@ -258,10 +259,7 @@ def test_outliers_do_not_stretch_the_colour_scale(values, high):
     assert layer.high_text.endswith("mm or more")
 
 
-SQUARE = Mesh(
-    vertices_world=torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
-    faces=torch.tensor([[0, 1, 2], [0, 2, 3]]),
-)
+SQUARE = Mesh(vertices_world=CORNERS.float(), faces=FACETS)
 
 
 def test_a_ball_has_no_ambient_occlusion():

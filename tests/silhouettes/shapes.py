@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import cache
 
 import torch
+from scenes import trusted
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -37,11 +38,7 @@ def silhouettes_of(
         pixels = pixel_centers(WIDTH, HEIGHT, like=cameras.intrinsics).reshape(-1, 2)
         rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
         masks.append(nearest_to(distance, cameras.centers_world[view], rays, reach)[0] < 0)
-    return Silhouettes(
-        inside=torch.stack(masks).reshape(-1, HEIGHT, WIDTH).double(),
-        reliable=torch.ones(len(masks), dtype=torch.bool),
-        source="masks",
-    )
+    return trusted(torch.stack(masks).reshape(-1, HEIGHT, WIDTH).double())
 
 
 def nearest_to(
@@ -54,14 +51,9 @@ def nearest_to(
     for step in torch.linspace(-reach, reach, 121).to(rays):
         points = centers + (centre + step)[:, None] * rays
         found = distance(points)
-        if best is None or place is None:
-            best, place = found, points
-        else:
-            nearer = found < best
-            best, place = (
-                torch.where(nearer, found, best),
-                torch.where(nearer[:, None], points, place),
-            )
+        nearer = torch.ones_like(found, dtype=torch.bool) if best is None else found < best
+        best = found if best is None else torch.where(nearer, found, best)
+        place = points if place is None else torch.where(nearer[:, None], points, place)
     assert best is not None
     assert place is not None
     return best, place

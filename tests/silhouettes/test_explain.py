@@ -1,8 +1,9 @@
+from functools import partial
+
 import pytest
 import torch
+from scenes import ball as mesh_of_ball
 
-from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import PimperWarning
 from pimper_torch.stages.silhouettes.explain import Explain
 from pimper_torch.stages.silhouettes.trace import TraceContours
@@ -17,9 +18,7 @@ def contours(cameras):
     return TraceContours()(silhouettes_of(ball, cameras), cameras)
 
 
-def sphere(radius=1.0):
-    vertices, faces = icosphere(4)
-    return Mesh(vertices_world=radius * vertices, faces=faces)
+sphere = partial(mesh_of_ball, level=4)
 
 
 def test_the_true_surface_explains_its_silhouettes(contours, recwarn):

@@ -1,17 +1,21 @@
 import pytest
 import torch
-from scenes import observing
+from scenes import observing, trusted
+from sparse_models import views_of
 
 from pimper_torch.geometry.opencv import signed_distance
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.supporting_plane import Plane, fixation
-from pimper_torch.records import Silhouettes, Views
+from pimper_torch.records import Silhouettes
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning
 from pimper_torch.stages.silhouettes import cuts, find
-from pimper_torch.stages.silhouettes.cues import Cues, cues_of
+from pimper_torch.stages.silhouettes.cues import (
+    Cues,
+    cues_of,
+)
 from pimper_torch.stages.silhouettes.cuts import cuts_of
-from pimper_torch.stages.silhouettes.find import FindSilhouettes, masked
+from pimper_torch.stages.silhouettes.find import FindSilhouettes, by_session, masked
 from pimper_torch.stages.silhouettes.parallax import (
     background_agreement,
     plane_agreement,
@@ -59,12 +63,7 @@ def test_an_object_in_front_of_a_dark_background_is_found(staged):
 def test_occluders_are_inside_silhouettes_but_not_used(staged):
     hidden = torch.zeros_like(staged.truth)
     hidden[3, 80:100, 110:130] = True
-    silhouettes = Silhouettes(
-        inside=staged.truth.float(),
-        reliable=torch.ones(12, dtype=torch.bool),
-        source="found",
-        hidden=hidden & staged.truth,
-    )
+    silhouettes = trusted(staged.truth.float(), "found", hidden=hidden & staged.truth)
     used = masked(staged.scene, silhouettes).views.masks
     assert torch.equal(silhouettes.masks, staged.truth)
     assert torch.equal(silhouettes.shown, staged.truth & ~hidden)
@@ -232,8 +231,7 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
 )
 def test_silhouettes_with_a_shared_error_are_not_trusted(staged, monkeypatch, grown_px, why):
     """All views agree with hulls twice and half as wide as the ball."""
-    reach = signed_distances(staged.truth)
-    masks = reach > -grown_px
+    masks = torch.stack([signed_distance(mask) for mask in staged.truth]) > -grown_px
     margins = torch.where(masks, 5.0, -5.0)
 
     def agreed(cues):
@@ -242,10 +240,6 @@ def test_silhouettes_with_a_shared_error_are_not_trusted(staged, monkeypatch, gr
     monkeypatch.setattr(find, "cut_in_iterations", agreed)
     with pytest.warns(PimperWarning, match=why):
         assert FindSilhouettes(SMALL)(staged.scene).source == "everything"
-
-
-def signed_distances(masks):
-    return torch.stack([signed_distance(mask) for mask in masks])
 
 
 def test_the_plane_is_learned_from_views_that_show_it(staged, generator):
@@ -291,12 +285,8 @@ def before_shifting_background(generator, num_views=9):
     )
     light = torch.linspace(0.5, 1.5, num_views)[:, None, None] * torch.linspace(0.6, 1, wide)
     images = torch.where(covered, thing[:, 0], seen) * light
-    views = Views(
-        images=images[:, None].expand(-1, 3, -1, -1).contiguous(),
-        sizes_px=torch.tensor([[480, 360]] * 9),
-        focals_px=torch.full((9,), torch.nan),
-        names=tuple("abcdefghi"),
-    )
+    images = images[:, None].expand(-1, 3, -1, -1).contiguous()
+    views = views_of(images, names=tuple("abcdefghi"))
     return views, maps, covered
 
 
@@ -354,3 +344,67 @@ def test_a_region_outside_all_views_is_rejected(staged):
     tiny = SilhouetteConfig(size_px=240, region=(0.0, 0.0, 0.4, 1e-6, 1e-6, 0.400001))
     with pytest.warns(PimperWarning, match="Everything"):  # visible, but without points
         FindSilhouettes(tiny)(staged.scene)
+
+
+@pytest.fixture
+def numbers(staged):
+    """Return a function from the scene of a capture session to the numbers of its views."""
+    names = staged.scene.views.names
+    return lambda part: [names.index(name) for name in part.views.names]
+
+
+def numbered(part, views):
+    """Return silhouettes with the number of each view as value."""
+    inside = torch.tensor(views).float()[:, None, None] * torch.ones_like(part.views.images[:, 0])
+    return Silhouettes(inside=inside, reliable=torch.tensor(views) > 2, source="found")
+
+
+def test_silhouettes_of_sessions_are_in_the_order_of_views(staged, numbers):
+    scene = staged.scene
+    count = scene.views.num_views
+    sessions = torch.arange(count) % 2
+    asked = []
+
+    def find(part):
+        assert len(part.sessions) == 0
+        asked.append(numbers(part))
+        found = numbered(part, numbers(part))
+        return found.replace(hidden=found.inside > 0) if 0 in numbers(part) else found
+
+    found = by_session(scene.replace(sessions=sessions), find)
+    assert asked == [list(range(0, count, 2)), list(range(1, count, 2))]
+    assert found.inside[:, 0, 0].tolist() == list(range(count))
+    assert found.reliable.tolist() == [view > 2 for view in range(count)]
+    assert found.source == "found"
+    assert found.hidden[:, 0, 0].tolist() == [view > 0 and view % 2 == 0 for view in range(count)]
+
+
+def test_without_sessions_all_views_are_processed_together(staged, numbers):
+    scene = staged.scene
+    found = by_session(scene, lambda part: numbered(part, numbers(part)))
+    assert found.inside[:, 0, 0].tolist() == list(range(scene.views.num_views))
+
+
+def test_one_session_without_silhouettes_discards_all(staged, numbers):
+    scene = staged.scene
+
+    def find(part):
+        views = numbers(part)
+        return numbered(part, views) if 0 in views else Silhouettes.everything(part.views)
+
+    sessions = torch.arange(scene.views.num_views) % 2
+    found = by_session(scene.replace(sessions=sessions), find)
+    assert found.source == "everything"
+    assert len(found.inside) == scene.views.num_views
+
+
+def test_everything_is_bounded_by_the_planes_of_all_sessions(staged, numbers):
+    scene = staged.scene
+    sessions = torch.arange(scene.views.num_views) % 2
+
+    def find(part):
+        plane = torch.tensor([[0.0, 0.0, 1.0, float(numbers(part)[0])]])
+        return Silhouettes.everything(part.views, plane)
+
+    found = by_session(scene.replace(sessions=sessions), find)
+    assert found.planes_world[:, 3].tolist() == [0.0, 1.0]

@@ -5,19 +5,17 @@ import warnings
 import pytest
 import torch
 from scenes import observed, observing
+from sparse_models import views_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.chains.chain_config import CoarseToFineConfig
-from pimper_torch.chains.coarse_to_fine import CoarseToFine
+import pimper_torch as pt
 from pimper_torch.chains.prepare import locate
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.decode import rotated
-from pimper_torch.records import CameraModel, SilhouettePrior, Views
-from pimper_torch.runtime.errors import InputError, PimperWarning
+from pimper_torch.records import CameraModel
 from pimper_torch.stages.silhouettes.given import AS_THEY_ARE, Reading, right_reading
 from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
-from pimper_torch.stages.stage import Stage
 from tests.silhouettes.shapes import FOCAL, HEIGHT, WIDTH, all_round, silhouettes_of
 
 # Three balls without symmetry, and the radius of background points.
@@ -58,13 +56,9 @@ def scene(truth):
     seen = framed & torch.where(on_ball, faces & inside, ~inside)
     middle = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     lens = CameraModel(camera=1, model="PINHOLE", params=middle, width=WIDTH, height=HEIGHT)
-    views = Views(
-        images=torch.full((VIEWS, 3, HEIGHT, WIDTH), 0.2),
-        sizes_px=torch.tensor([[WIDTH, HEIGHT]] * VIEWS),
-        names=NAMES,
-        focals_px=torch.full((VIEWS,), torch.nan),
-        orientations=torch.tensor([1, 3] * (VIEWS // 2)),
-    )
+    orientations = torch.tensor([1, 3] * (VIEWS // 2))
+    images = torch.full((VIEWS, 3, HEIGHT, WIDTH), 0.2)
+    views = views_of(images, names=NAMES, orientations=orientations)
     return observed(views, cameras, points, pixels, seen, lens)
 
 
@@ -75,7 +69,7 @@ def hard(views, masks):
 def soft(views, masks):
     """Return masks like those of a segmenter: never certain."""
     inside = torch.where(masks, 0.9, 0.05)
-    prior = SilhouettePrior(names=views.names, sizes_px=views.sizes_px, inside=inside)
+    prior = pt.SilhouettePrior(names=views.names, sizes_px=views.sizes_px, inside=inside)
     return views.replace(masks=None, priors=(prior,))
 
 
@@ -113,7 +107,7 @@ def order(*changed):
 )
 def test_cameras_and_points_select_the_reading_of_masks(scene, truth, form, wrong, said):
     views = form(scene.views, wrong(truth))
-    with pytest.warns(PimperWarning, match=f"if they are {said}.*, so they are read like that"):
+    with pytest.warns(pt.PimperWarning, match=f"if they are {said}.*, so they are read like that"):
         reading = right_reading(scene.replace(views=views), views)
     assert torch.equal(read(views, reading), truth)
     if form is soft:  # with the same certainty
@@ -140,7 +134,7 @@ def test_correct_and_slightly_inaccurate_masks_are_unchanged(scene, truth):
 def test_shifted_names_of_soft_masks_are_corrected(scene, truth):
     prior = soft(scene.views, truth).priors[0].take(list(range(12))).replace(names=NAMES[1:13])
     views = scene.views.replace(priors=(prior,))
-    with pytest.warns(PimperWarning, match=r"shifted by 1 in the list \(00\.png has that of 01"):
+    with pytest.warns(pt.PimperWarning, match=r"shifted by 1 in the list \(00\.png has that of 01"):
         (found,) = right_reading(scene.replace(views=views), views).of(views).priors
     order = [found.names.index(name) for name in NAMES[:12]]
     assert len(found.names) == 12
@@ -152,7 +146,7 @@ def test_clicks_are_unchanged(scene, truth):
     inside = torch.full((2, 40, 60), 0.5)
     inside[0, :, 50:], inside[:, 10:13, 20:23] = 0, 1
     sizes = torch.tensor([[50, 40], [60, 40]])
-    click = SilhouettePrior(names=NAMES[2:4], sizes_px=sizes, inside=inside)
+    click = pt.SilhouettePrior(names=NAMES[2:4], sizes_px=sizes, inside=inside)
     views = soft(scene.views, truth)
     views = views.replace(priors=(click, *views.priors))
     kept, inverted = Reading(inverted=True).of(views).priors
@@ -164,10 +158,10 @@ def test_only_inverted_masks_are_detected_on_an_untextured_object(scene, truth):
     bare = observing(scene, scene.observation_point >= len(scene.points_world) - 300)
     for wrong in (truth, truth.flip(1, 2)):
         views = hard(scene.views, wrong)
-        with pytest.warns(PimperWarning, match="No point of the cloud is in the silhouettes"):
+        with pytest.warns(pt.PimperWarning, match="No point of the cloud is in the silhouettes"):
             assert right_reading(bare.replace(views=views), views) is AS_THEY_ARE
     views = soft(scene.views, ~truth)
-    with pytest.warns(PimperWarning, match="if they are inverted"):
+    with pytest.warns(pt.PimperWarning, match="if they are inverted"):
         assert right_reading(bare.replace(views=views), views).inverted
 
 
@@ -175,7 +169,7 @@ def test_without_a_cloud_only_masks_are_compared(scene, truth):
     bare, views = observing(scene, slice(0)), hard(scene.views, truth)
     assert right_reading(bare.replace(views=views), views) is AS_THEY_ARE
     views = hard(scene.views, truth[order((3, 11), (11, 3))])
-    with pytest.warns(PimperWarning, match=r"exchanged between (03|11)\.png"):
+    with pytest.warns(pt.PimperWarning, match=r"exchanged between (03|11)\.png"):
         reading = right_reading(bare.replace(views=views), views)
     assert torch.equal(read(views, reading), truth)
 
@@ -191,7 +185,7 @@ def test_masks_of_an_object_that_fills_its_photographs_are_not_inverted(scene, t
 def test_masks_that_contradict_points_in_any_reading_are_rejected(scene, truth, form):
     moved = [mask.roll((17 * view % 61, 23 * view % 83), (0, 1)) for view, mask in enumerate(truth)]
     views = form(scene.views, torch.stack(moved))
-    with pytest.raises(InputError, match=r"contradict [0-9]+% of the points in the median view"):
+    with pytest.raises(pt.InputError, match=r"contradict [0-9]+% of the points in the median view"):
         right_reading(scene.replace(views=views), views)
 
 
@@ -216,12 +210,12 @@ def test_quarter_turns_of_square_masks_are_detected(scene, truth):
     square = scene.replace(
         views=views, cameras=cameras.replace(intrinsics=intrinsics, sizes_px=sizes)
     )
-    with pytest.warns(PimperWarning, match="turned by a quarter turn anticlockwise"):
+    with pytest.warns(pt.PimperWarning, match="turned by a quarter turn anticlockwise"):
         reading = right_reading(square, views)
     assert torch.equal(read(views, reading), upright)
 
 
-class Placed(Stage):
+class Placed(pt.Stage):
     """Known cameras instead of structure from motion."""
 
     def __init__(self, scene):
@@ -235,21 +229,21 @@ class Placed(Stage):
 
 def test_a_chain_recomputes_cameras_with_the_corrected_masks(scene, truth):
     stage, views = Placed(scene), hard(scene.views, truth.flip(1, 2))
-    chain = CoarseToFine(reconstruct=stage)
-    with pytest.warns(PimperWarning, match="half turn"):
+    chain = pt.CoarseToFine(reconstruct=stage)
+    with pytest.warns(pt.PimperWarning, match="half turn"):
         placed = locate(chain, chain.running(), views)[0]
     assert torch.equal(stage.asked[0].masks, views.masks)
     assert torch.equal(stage.asked[1].masks, truth)
     assert torch.equal(placed.views.masks, truth)
-    with pytest.warns(PimperWarning, match="half turn"):
+    with pytest.warns(pt.PimperWarning, match="half turn"):
         given = locate(chain, chain.running(), scene.replace(views=views))[0]
     assert torch.equal(given.views.masks, truth)
     assert len(stage.asked) == 2
 
 
 def test_a_chain_without_silhouettes_ignores_masks(scene, truth):
-    config = CoarseToFineConfig(silhouettes=SilhouetteConfig(object="everything"))
-    chain, views = CoarseToFine(config), hard(scene.views, ~truth)
+    config = pt.CoarseToFineConfig(silhouettes=SilhouetteConfig(object="everything"))
+    chain, views = pt.CoarseToFine(config), hard(scene.views, ~truth)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         placed = locate(chain, chain.running(), scene.replace(views=views))[0]

@@ -18,11 +18,17 @@ def of_ball(cameras):
     return silhouettes_of(shapes.ball, cameras)
 
 
+def hull_of(silhouettes, cameras, voxels=32, disagreeing=0.0, **options):
+    """Return a hull and its volume."""
+    options |= {"num_voxels": voxels**3, "disagreeing": disagreeing}
+    hull = visual_hull(silhouettes, cameras, BOX, **options)
+    assert hull is not None
+    return hull, float(hull.occupied.sum() * hull.spacing**3)
+
+
 @pytest.fixture(scope="module")
 def ball(cameras):
-    hull = visual_hull(of_ball(cameras), cameras, BOX, num_voxels=64**3, disagreeing=0.0)
-    assert hull is not None
-    return hull
+    return hull_of(of_ball(cameras), cameras, 64)[0]
 
 
 def test_the_hull_of_a_ball_contains_it_tightly(ball):
@@ -63,24 +69,14 @@ def test_projections_of_the_hull_are_its_silhouettes(ball, cameras):
 
 def test_a_wrong_view_is_outvoted_or_excluded(cameras):
     silhouettes = of_ball(cameras)
-    wrong = silhouettes.inside.clone()
-    wrong[3] = 0
-    believed = visual_hull(
-        silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=32**3, disagreeing=0.0
-    )
-    assert believed is None
-    voted = visual_hull(
-        silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=32**3, disagreeing=0.05
-    )
-    reliable = silhouettes.reliable.clone()
-    reliable[3] = False
-    untrusted = silhouettes.replace(inside=wrong, reliable=reliable)
-    left_out = visual_hull(untrusted, cameras, BOX, num_voxels=32**3, disagreeing=0.0)
-    assert left_out is not None
-    assert voted is not None
-    volume = float(left_out.occupied.sum() * left_out.spacing**3)
-    assert 4.1 < volume < 4.6
-    assert voted.occupied.sum() * voted.spacing**3 >= 0.99 * volume  # inside with one vote less
+    inside = silhouettes.inside.clone()
+    inside[3] = 0
+    wrong = silhouettes.replace(inside=inside)
+    assert visual_hull(wrong, cameras, BOX, num_voxels=32**3, disagreeing=0.0) is None
+    _, voted = hull_of(wrong, cameras, disagreeing=0.05)
+    _, left_out = hull_of(wrong.replace(reliable=torch.arange(20) != 3), cameras)
+    assert 4.1 < left_out < 4.6
+    assert voted >= 0.99 * left_out  # inside with one vote less
 
 
 @pytest.mark.parametrize(("doubt", "held"), [(0.3, True), (0.2, False)])
@@ -89,26 +85,18 @@ def test_votes_are_summed_and_a_tie_counts_as_object(cameras, doubt, held):
     silhouettes = of_ball(cameras).replace(source="found")
     wrong = silhouettes.inside.clone()
     wrong[:10:2, :, WIDTH // 2 :] = doubt * (wrong[:10:2, :, WIDTH // 2 :] > 0)
-    hull = visual_hull(
-        silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=32**3, disagreeing=0.1
-    )
-    assert hull is not None
-    assert (float(hull.occupied.sum() * hull.spacing**3) > 4.0) == held
+    _, volume = hull_of(silhouettes.replace(inside=wrong), cameras, disagreeing=0.1)
+    assert (volume > 4.0) == held
 
 
 def test_separate_components_of_uncertain_silhouettes_are_excluded(cameras):
     """A second ball that no view shows and none excludes with certainty."""
     silhouettes = of_ball(cameras).replace(source="found")
-    hull = visual_hull(silhouettes, cameras, BOX, num_voxels=32**3, disagreeing=0.1)
+    _, before = hull_of(silhouettes, cameras, disagreeing=0.1)
     other = silhouettes_of(lambda points: shapes.ball(3 * (points - 0.9)), cameras).inside
     inside = torch.maximum(silhouettes.inside, 0.48 * other)
-    found = visual_hull(
-        silhouettes.replace(inside=inside), cameras, BOX, num_voxels=32**3, disagreeing=0.1
-    )
-    assert hull is not None
-    assert found is not None
+    found, volume = hull_of(silhouettes.replace(inside=inside), cameras, disagreeing=0.1)
     assert found.depth_of(torch.full((3,), 0.9)) < 0
-    volume, before = (float(one.occupied.sum() * one.spacing**3) for one in (found, hull))
     assert 0.95 * before < volume < 1.2 * before
 
 
@@ -116,11 +104,7 @@ def test_views_abstain_at_unknown_pixels(cameras):
     silhouettes = of_ball(cameras)
     wrong = silhouettes.inside.clone()
     wrong[:9] = 0.5
-    hull = visual_hull(
-        silhouettes.replace(inside=wrong), cameras, BOX, num_voxels=48**3, disagreeing=0.0
-    )
-    assert hull is not None
-    assert 4.1 < float(hull.occupied.sum() * hull.spacing**3) < 4.8
+    assert 4.1 < hull_of(silhouettes.replace(inside=wrong), cameras, 48)[1] < 4.8
 
 
 def test_views_abstain_outside_their_photographs(cameras):
@@ -131,16 +115,8 @@ def test_views_abstain_outside_their_photographs(cameras):
     inside = silhouettes.inside.clone()
     inside[:10, :, WIDTH // 2 :] = 0  # the padding
     cut = cameras.replace(sizes_px=sizes)
-    hull = visual_hull(
-        silhouettes.replace(inside=inside),
-        cut,
-        BOX,
-        num_voxels=48**3,
-        disagreeing=0.0,
-        min_seen=0.4,
-    )
-    assert hull is not None
-    assert 4.1 < float(hull.occupied.sum() * hull.spacing**3) < 4.8
+    _, volume = hull_of(silhouettes.replace(inside=inside), cut, 48, min_seen=0.4)
+    assert 4.1 < volume < 4.8
 
 
 def test_points_seen_by_too_few_views_are_outside(cameras):

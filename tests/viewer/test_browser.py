@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scenes import ball
+from sparse_models import views_of
 
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.pinholes import look_at, pinholes
-from pimper_torch.records import Mesh, Views
 from pimper_torch.viewer.show import add_found
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -71,13 +71,10 @@ def close_cameras(viewer):
     cameras = pinholes(look_at(eyes, torch.zeros(3), up), 300.0, 400, 300)
     images = torch.tensor([1.0, 0.0, 1.0])[None, :, None, None].expand(3, 3, 300, 400)
     names = ("far.jpg", "near.jpg", "aside.jpg")
-    views = Views(
-        images=images, sizes_px=cameras.sizes_px, names=names, focals_px=torch.full((3,), 300.0)
-    )
+    views = views_of(images, names=names, focals_px=torch.full((3,), 300.0))
     viewer.add_cameras(names, cameras, torch.zeros(1, 3), 0, views)
-    vertices, faces = icosphere(4)
-    mesh = Mesh(vertices_world=1.5 * vertices.float(), faces=faces)
-    viewer.add_pass("ball", mesh.replace(confidence=torch.rand(len(vertices))))
+    mesh = ball(1.5, level=4).to(torch.float32)
+    viewer.add_pass("ball", mesh.replace(confidence=torch.rand(len(mesh.vertices_world))))
 
 
 @pytest.mark.usefixtures("close_cameras")

@@ -8,13 +8,11 @@ import sys
 from urllib.request import urlopen
 
 import pytest
+from scenes import write_ball
 
-from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.main import main
 from pimper_torch.export import results
-from pimper_torch.io.meshes import write_ply
-from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError, PimperWarning
 from pimper_torch.viewer.show import add_folder, show
 
@@ -46,9 +44,7 @@ def test_a_folder_without_a_surface_is_refused(tmp_path):
 
 @pytest.fixture
 def ball(tmp_path):
-    vertices, faces = icosphere(2)
-    write_ply(Mesh(vertices_world=vertices, faces=faces), tmp_path / "ball.ply")
-    return tmp_path / "ball.ply"
+    return write_ball(tmp_path / "ball.ply", level=2)
 
 
 def test_the_command_serves_a_page_until_ctrl_c(ball):

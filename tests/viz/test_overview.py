@@ -5,11 +5,12 @@ import pytest
 import torch
 from PIL import Image
 from scipy import ndimage
+from sparse_models import views_of
 from torch.testing import assert_close
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import srgb_from_linear
-from pimper_torch.records import Silhouettes, Views
+from pimper_torch.records import Silhouettes
 from pimper_torch.viz.overview import (
     RELIABLE,
     UNRELIABLE,
@@ -163,18 +164,12 @@ def test_the_border_of_a_square_is_its_outermost_pixels():
 
 def test_every_view_has_its_tile_and_its_silhouette():
     images = torch.linspace(0.1, 0.5, 3)[:, None, None, None].expand(3, 1, 40, 60)
+    views = views_of(images)
     inside = torch.zeros(3, 40, 60)
     for view in range(3):
         inside[view, 10:30, 20 : 30 + 10 * view] = 0.9
-    silhouettes = Silhouettes(
-        inside=inside, reliable=torch.tensor([True, True, False]), source="found"
-    )
-    views = Views(
-        images=images,
-        sizes_px=torch.tensor([[60, 40]]).expand(3, 2),
-        names=("a", "b", "c"),
-        focals_px=torch.ones(3),
-    )
+    reliable = torch.tensor([True, True, False])
+    silhouettes = Silhouettes(inside=inside, reliable=reliable, source="found")
     sheet = thumbnails(views, silhouettes, range(3), width_px=60, across=2)
     assert sheet.shape == (40, 60, 3)  # two rows of two tiles of 30 x 20
     assert_close(sheet[20:, 30:], torch.ones(20, 30, 3))

@@ -1,10 +1,10 @@
 import pytest
 import torch
+from sparse_models import views_of
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from pimper_torch.radiometry import Srgb
-from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization.estimate_gamma import (
     MAX_GAMMA,
@@ -131,12 +131,7 @@ def test_missing_entries_may_hold_anything_and_gains_are_absorbed_by_the_lights(
 def photographs(gamma=1.8, width=14, height=12):
     encoded = (shaded(samples=width * height) ** (1 / gamma)).reshape(10, 1, height, width)
     colours = torch.cat([0.2 * encoded, encoded, 0.4 * encoded], dim=1).float()
-    return Views(
-        images=colours,
-        sizes_px=torch.tensor([[width, height]]).repeat(10, 1),
-        names=tuple(f"{index}.png" for index in range(10)),
-        focals_px=torch.full((10,), torch.nan),
-    )
+    return views_of(colours)
 
 
 def test_gamma_is_recovered_from_photographs_of_a_fixed_camera():

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from draws import uniform
 from torch.testing import assert_close
 
 from pimper_torch.runtime.errors import InputError
@@ -13,10 +14,6 @@ from pimper_torch.single_view.photometric_stereo.regress_lights import (
 from tests.single_view.scenes import BUMPY, angles_deg, strong_lights
 
 COLOURS = torch.tensor([0.9, 0.5, 0.2], dtype=torch.float64)
-
-
-def uniform(generator, *shape):
-    return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
 
 def test_plain_regression_is_weighted_least_squares(generator):
