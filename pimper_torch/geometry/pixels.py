@@ -1,4 +1,4 @@
-"""Pixel conventions, and the only conversions between them.
+"""Pixel conventions, and the conversions of tensors between them.
 
 Ours is COLMAP's: ``(u, v)`` = (right, down) in pixels, with the centre of the top-left pixel at
 (0.5, 0.5), so an image covers ``[0, width] x [0, height]``.
@@ -50,8 +50,7 @@ def pixel_centers(
     width: int, height: int, like: Float[Tensor, "..."]
 ) -> Float[Tensor, "{height} {width} 2"]:
     """Return the centres of all pixels, with the device and dtype of ``like``."""
-    u = torch.arange(width, device=like.device, dtype=like.dtype) + 0.5
-    v = torch.arange(height, device=like.device, dtype=like.dtype) + 0.5
+    u, v = (torch.arange(side, device=like.device).to(like) + 0.5 for side in (width, height))
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.geometry.lens_models import photographed
-from pimper_torch.geometry.pixels import grid_from_pixels
+from pimper_torch.geometry.pixels import grid_from_pixels, pixels_from_indices
 from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.geometry.supporting_plane import fixation
 from pimper_torch.records import Cameras, SparseScene, Views
@@ -148,8 +148,7 @@ def _tracks_of(
     chosen = torch.zeros_like(valid)
     chosen[step // 2 :: step, step // 2 :: step] = True
     chosen &= valid
-    row, column = chosen.nonzero(as_tuple=True)
-    centers = torch.stack([column, row], dim=1).to(maps.inverse_depth) + 0.5
+    centers = pixels_from_indices(chosen.nonzero().flip(1).to(maps.inverse_depth))
     count = scene.cameras.num_views
     pixels = centers.new_zeros(len(centers), count, 2)
     seen = torch.zeros(len(centers), count, dtype=torch.bool, device=centers.device)

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, normalize, pad
 
 from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.pixels import grid_from_pixels, scale_intrinsics
+from pimper_torch.geometry.pixels import grid_from_pixels, pixels_from_indices, scale_intrinsics
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.geometry.visual_hull import Hull
@@ -245,7 +245,7 @@ def _cast(lit: _Lit, hull: Hull, view: int, views: Int[Tensor, " view"]) -> _Ray
     cameras = lit.cameras
     frame, eye = cameras.cam_from_world[view], cameras.centers_world[view]
     inside = lit.inside[view, _STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE].clone()
-    pixels = _STRIDE * inside.nonzero().flip(1).to(frame) + _STRIDE // 2 + 0.5
+    pixels = pixels_from_indices(_STRIDE * inside.nonzero().flip(1).to(frame) + _STRIDE // 2)
     rays = rays_through(pixels, frame, cameras.intrinsics[view])
     low, high = hull.corners_world.to(frame)
     middle, half = (low + high) / 2, (high - low).norm() / 2

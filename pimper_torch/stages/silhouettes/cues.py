@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from pimper_torch.geometry.opencv import convex_hull_of
+from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.supporting_plane import (
     PLANE_TOLERANCE,
@@ -95,7 +96,7 @@ def soft_masks_of(views: Views, sizes_px: Int[Tensor, "view 2"]) -> SoftMasks | 
                 given[view] = True
     if not priors:
         return None
-    centres = tuple(mask.nonzero().flip(1).float() + 0.5 for mask in seeds)
+    centres = tuple(pixels_from_indices(mask.nonzero().flip(1).float()) for mask in seeds)
     return SoftMasks(inside=torch.sigmoid(odds), given=given, seeds_px=centres)
 
 

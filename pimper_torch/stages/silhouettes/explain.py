@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from pimper_torch.geometry.contours import Contours
+from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.visibility import RayCaster
@@ -44,7 +45,7 @@ class Explain(Stage):
             step = max(1, round(math.sqrt(width * height / 20_000)))
             rows, columns = (torch.arange(step // 2, side, step) for side in (height, width))
             inside = silhouettes.inside[view, rows][:, columns].to(vertices)
-            pixels = torch.cartesian_prod(columns, rows).to(vertices) + 0.5
+            pixels = pixels_from_indices(torch.cartesian_prod(columns, rows).to(vertices))
             rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
             face = caster.cast(cameras.centers_world[view], rays).face
             front = (face >= 0) & ((normals[face.clamp_min(0)] * rays).sum(dim=1) < 0)

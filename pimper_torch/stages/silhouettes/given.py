@@ -19,7 +19,7 @@ from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.mask_polarity import around_and_inside
 from pimper_torch.geometry.opencv import shrunk, signed_distance
-from pimper_torch.geometry.pixels import grid_from_pixels, scale_intrinsics
+from pimper_torch.geometry.pixels import grid_from_pixels, pixels_from_indices, scale_intrinsics
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.supporting_plane import well_tracked
 from pimper_torch.geometry.visual_hull import bounding_box
@@ -431,9 +431,9 @@ def _places(
     mask: Mask, camera: Cameras, box_world: Float[Tensor, "2 3"], count: int
 ) -> tuple[Float[Tensor, "place 3"], Float[Tensor, " pixel"]]:
     """Return samples in the box on rays through a mask's pixels, and half their spacing."""
-    index = mask.nonzero()
-    index = index[torch.linspace(0, len(index) - 1, count).round().long()]
-    rays = rays_through(index.flip(1).float() + 0.5, camera.cam_from_world[0], camera.intrinsics[0])
+    pixels = pixels_from_indices(mask.nonzero().flip(1).float())
+    pixels = pixels[torch.linspace(0, len(pixels) - 1, count).round().long()]
+    rays = rays_through(pixels, camera.cam_from_world[0], camera.intrinsics[0])
     eye = camera.centers_world[0]
     ends = (box_world[:, None] - eye) / torch.where(rays.abs() > 1e-9, rays, 1e-9)
     near = ends.amin(dim=0).amax(dim=-1).clamp_min(0)
