@@ -4,12 +4,12 @@ import dataclasses
 
 import pytest
 import torch
-from derivatives import check_derivatives
 from probes import probes, rendered_scene, small_scene
 from torch import nn
 from torch.nn.functional import normalize
 
 import pimper_torch as pt
+from pimper_bench.derivatives import check_derivatives
 from pimper_bench.scenes import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.lighting import lights

@@ -1,10 +1,10 @@
 import pytest
 import torch
-from derivatives import check_derivatives
 from scenes import subdivided_square
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
+from pimper_bench.derivatives import check_derivatives
 from pimper_torch.geometry.topology import face_edges
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import ContourPoints, FacetPoints

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from derivatives import DerivativeCheck, Tensors, check_derivatives
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pimper_bench.derivatives import DerivativeCheck, Tensors, check_derivatives
 from pimper_bench.scenes import render_shape, sparse_scene
 from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras

@@ -3,11 +3,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from derivatives import check_derivatives
 from torch.nn.functional import interpolate, normalize
 from torch.testing import assert_close
 
 import pimper_torch as pt
+from pimper_bench.derivatives import check_derivatives
 from pimper_torch.geometry.rigid import rotate
 from tests.patches.conftest import TILTED
 

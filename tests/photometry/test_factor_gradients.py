@@ -2,11 +2,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
-from derivatives import check_derivatives
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 from twins import using
 
+from pimper_bench.derivatives import check_derivatives
 from pimper_torch.linalg.robust import Cauchy, GemanMcClure, Huber, Squares
 from pimper_torch.single_view.factorization.low_rank import FreeManifold
 from pimper_torch.stages.photometry.bilinear import Bilinear
