@@ -50,7 +50,7 @@ class Equations(Record):
     """Equations of one kind.
 
     Attributes:
-        unknowns: Vertices of the heights in each equation.
+        unknowns: Vertices of the heights in each equation; two in those of slopes.
         targets: Right-hand sides.
         information: Inverse variance of the target, as its source states. If neighbours share an
             error, the variance is enlarged, so that their weight together is not too large.
@@ -64,6 +64,11 @@ class Equations(Record):
     information: Float[Tensor, " equation"]
     correlated: Float[Tensor, " equation"]
     evaluated: bool = True
+
+    @property
+    def is_slope(self) -> bool:
+        """Whether the equations are of slopes, and do not determine positions."""
+        return self.unknowns.shape[1] == 2
 
     def residual(self, heights: PerVertex) -> Float[Tensor, " equation"]:
         """Return the residuals, targets minus sums."""
@@ -111,7 +116,7 @@ def slopes(
     )
 
 
-def upright(edges: Edges, directions: Vertices, normals: Vertices) -> Bool[Tensor, " edge"]:
+def upright_edges(edges: Edges, directions: Vertices, normals: Vertices) -> Bool[Tensor, " edge"]:
     """Return the edges whose slope can follow from heights.
 
     Other edges cross a contour or a fold as seen along the directions: an equal change of height at
