@@ -19,7 +19,7 @@ from pimper_torch.lighting.light_field import harmonics
 from pimper_torch.linalg.robust import Cauchy, Squares
 from pimper_torch.stages.photometry.bilinear import Bilinear, evaluate
 from pimper_torch.stages.photometry.cone import Cone
-from pimper_torch.stages.photometry.factorize import SOLVERS
+from pimper_torch.stages.photometry.factor_solve import SOLVERS
 
 # Weight of the lights' prior relative to the data, and the loss.
 CASES = ((1.0, Squares()), (1.0, Cauchy(2.0)), (1e-6, Squares()))

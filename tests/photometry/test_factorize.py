@@ -13,7 +13,7 @@ from pimper_torch.lighting.light_field import LightField, harmonics
 from pimper_torch.presets.load_config import load_config
 from pimper_torch.records import PatchStatus, PatchViews
 from pimper_torch.runtime.errors import PimperWarning
-from pimper_torch.stages.photometry import factorize
+from pimper_torch.stages.photometry import factorize, shadows
 from pimper_torch.stages.photometry.factorize import Factorize
 from pimper_torch.stages.photometry.fit_light import FitLight
 from pimper_torch.stages.photometry.photometry_config import FactorizeConfig
@@ -149,11 +149,11 @@ def test_a_shadowed_patch_has_albedo_only_under_constant_light(scene, monkeypatc
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(bumps=0.0, lights=None if moves else light.expand(12, 4))
 
-    def illuminated(bucket, *_):
-        lit = bucket.registered.valid & (bucket.templates.facet != 1)[:, None, None, None]
+    def illuminated(templates, registered, *_):
+        lit = registered.valid & (templates.facet != 1)[:, None, None, None]
         return lit, torch.zeros_like(lit)
 
-    monkeypatch.setattr(factorize, "_illuminated", illuminated)
+    monkeypatch.setattr(shadows, "_illuminated", illuminated)
     photometric = solved(Factorize(), true.seen)
     found, counts = photometric.buckets[0], photometric.figures()
     assert counts["few_views_patches"] == 1  # one of 8: a figure, not a warning
@@ -185,9 +185,9 @@ def test_soft_light_determines_normals_in_cast_shadow_if_strong(scene, monkeypat
     )
     monkeypatch.setattr(FitLight, "_field", lambda *_: field)
     monkeypatch.setattr(
-        factorize,
+        shadows,
         "_illuminated",
-        lambda bucket, *_: (torch.zeros_like(bucket.registered.valid), bucket.registered.valid),
+        lambda _, registered, *rest: (torch.zeros_like(registered.valid), registered.valid),
     )
     if strength > 1:
         with pytest.warns(PimperWarning, match="8 of 8 patches keep"):
