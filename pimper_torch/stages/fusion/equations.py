@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import ContourPoints, FacetPoints, Record
 from pimper_torch.records.shapes import (
     Edges,
@@ -287,11 +287,8 @@ def passing(contacts: SurfacePoints, surface: BaseSurface, caster: RayCaster) ->
     # Intersection of the line through each point with the nearer of the faces on both sides.
     ahead, behind = caster.cast(points, line), caster.cast(points, -line)
     first = ahead.distance <= behind.distance
-    hits = Hits(
-        face=torch.where(first, ahead.face, behind.face),
-        distance=torch.where(first, ahead.distance, -behind.distance),
-        barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
-    ).refined(surface.points, surface.faces, points, line)
+    hits = ahead.where(first, behind.replace(distance=-behind.distance))
+    hits = hits.refined(surface.points, surface.faces, points, line)
     lift = -hits.distance
     hit = (hits.face >= 0) & (lift.abs() <= surface.reach)
     corners, fraction, line = surface.faces[hits.face[hit]], hits.barycentric[hit], line[hit]

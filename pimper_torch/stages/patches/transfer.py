@@ -90,11 +90,4 @@ def _nearest(
 
     hit_below, hit_above = faces_outward(below), faces_outward(above)
     first = hit_below & (~hit_above | (below.distance <= above.distance))
-    return (
-        Hits(
-            face=torch.where(first, below.face, above.face),
-            distance=torch.where(first, below.distance, above.distance),
-            barycentric=torch.where(first[..., None], below.barycentric, above.barycentric),
-        ),
-        hit_below | hit_above,
-    )
+    return below.where(first, above), hit_below | hit_above
