@@ -82,8 +82,7 @@ def remesh(
         seen: True for facets that have data even if the surface has no support there.
 
     Returns:
-        The new mesh. Its normals are the piecewise linear fit to the surface's; for points of the
-        cloud see :func:`~pimper_torch.stages.coarse.splitting.with_points`. Unused vertices are
+        The new mesh. Its normals are the piecewise linear fit to the surface's. Unused vertices are
         dropped, and parts of the mesh that are joined only at a vertex get a copy of it each.
 
     If the surface has no support at all, no facet is dropped. Differentiable: vertices and normals,
@@ -117,7 +116,7 @@ def remesh(
     index[child_kept] = torch.arange(int(child_kept.sum()), device=faces.device)
     mesh = Mesh(vertices_world=positions[source], faces=new_faces)
     mesh = mesh.replace(normals_world=splitting.fitted_normals(mesh, surface, split, index))
-    return splitting.with_points(coarse, mesh, split, index, source)
+    return splitting.with_relocated_points(coarse, mesh, split, index)
 
 
 def _on_surface(
@@ -172,6 +171,7 @@ def _with_data(
     area = face_normals(vertices, faces).norm(dim=1) / 2
     return data | enclosed_holes(vertices, faces, data, max_hole * float(total(area)))
 
+
 def _severities(
     vertices: Vertices,
     faces: Faces,
@@ -189,7 +189,6 @@ def _severities(
     typical = residual.nanmedian()
     relative = residual / torch.where(typical > 0, typical, torch.inf) / 3.0
     return torch.maximum(severity, relative.nan_to_num(nan=0.0).to(severity))
-
 
 
 def plane_deviations(vertices: Vertices, faces: Faces, surface: Surface) -> Float[Tensor, " face"]:
