@@ -151,16 +151,12 @@ def _morphed(mask: Mask, operation: int, radius_px: int) -> Mask:
 
 def without_specks(mask: Mask, kept: Mask, min_px: int) -> Mask:
     """Remove components that are small or do not overlap ``kept``, and fill small holes."""
-    large = _large_components(mask, kept, min_px)
-    return ~_large_components(~large, torch.ones_like(mask), min_px)
+    large = components_of(mask, kept, min_px)
+    return ~components_of(~large, torch.ones_like(mask), min_px)
 
 
-def components_of(mask: Mask, meeting: Mask) -> Mask:
-    """Return the components of a mask that overlap ``meeting``."""
-    return _large_components(mask, meeting, 1)
-
-
-def _large_components(mask: Mask, meeting: Mask, min_px: int) -> Mask:
+def components_of(mask: Mask, meeting: Mask, min_px: int = 1) -> Mask:
+    """Return the components of a mask that overlap ``meeting`` and are not smaller than a size."""
     pixels = mask.numpy().astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=4)
     overlapping = np.bincount(labels[meeting.numpy()], minlength=count) > 0

@@ -19,7 +19,7 @@ from torch.nn.utils.rnn import pad_sequence
 from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
 from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.subdivision import Subdivision
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import carried_normals, face_normals
 from pimper_torch.linalg.sums import sum_at
 from pimper_torch.records import (
     CoarseMesh,
@@ -84,11 +84,8 @@ class Blend(Record):
 
 def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Vertices:
     """Return unit ray directions: interpolated smooth normals of the coarse mesh, world."""
-    mesh = coarse.mesh
-    normals = mesh.normals_world
-    if normals is None:
-        normals = vertex_normals(mesh.vertices_world, mesh.faces)
-    return normalize(subdivision.interpolate(normals, mesh.faces), dim=-1)
+    smooth = subdivision.interpolate(carried_normals(coarse.mesh), coarse.mesh.faces)
+    return normalize(smooth, dim=-1)
 
 
 def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
@@ -225,6 +222,9 @@ def _estimates(
         offset=offset.movedim(1, -1)[hits],
         prior_normal=prior_normal.movedim(1, -1)[hits],
         prior_offset=prior_offset.movedim(1, -1)[hits],
+    )
+
+
 def _weighted_normals(
     normals_patch: PatchVectors, information: PatchRaster, templates: Templates
 ) -> Float[Tensor, "patch 4 height width"]:
@@ -239,9 +239,6 @@ def _weighted_offsets(
 ) -> Float[Tensor, "patch 2 height width"]:
     """Return layers of information, and of offsets multiplied by it."""
     return torch.stack([information, information * offset], dim=1)
-
-
-    )
 
 
 def _bands(

@@ -143,10 +143,8 @@ def repair(
 
 def surroundings(faces: Faces, broken: FaceMask, num_vertices: int) -> FaceMask:
     """Return the defective faces and all around them that :func:`repair` may need."""
-    near = broken
-    for _ in range(_RINGS + 3):  # two more rings clamp the plate, and one shows the border
-        near = topology.corners_of(faces, near, num_vertices)[faces].any(dim=1)
-    return near
+    # Two more rings clamp the plate, and one shows the border.
+    return topology.dilated(faces, broken, _RINGS + 3, num_vertices)
 
 
 def _components_with(faces: Faces, among: VertexMask, marked: VertexMask) -> VertexMask:

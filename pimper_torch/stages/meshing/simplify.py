@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import carried_normals
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.parallel import side_by_side
 
@@ -74,12 +74,12 @@ def simplify(
             max_angle_deg=0.0,
         )
     vertices = mesh.vertices_world.detach().cpu().double()
-    normals = mesh.normals_world
-    if normals is None:
-        normals = vertex_normals(mesh.vertices_world, mesh.faces)
+    normals = carried_normals(mesh)
     sample = mesh.faces.cpu()[:: max(1, len(mesh.faces) // _EDGES)]
     spacing = float((vertices[sample[:, 0]] - vertices[sample[:, 1]]).norm(dim=1).median())
     points = _rows(vertices - vertices.mean(dim=0))
+    faces = mesh.faces.to("cpu", torch.int32, copy=True).contiguous().numpy()
+    channels = _rows(normals if values is None else torch.cat([normals, values.to(normals)], dim=1))
     cosine = float(np.cos(np.radians(angle_deg)))
     lists, off = _decimate(points, channels, faces, spacings * spacing, cosine)
     remaining = faces[:, 0] >= 0
@@ -107,8 +107,6 @@ def _decimate(
     """
     from pimper_torch.kernels import decimation  # compiled when it is imported
 
-    faces = mesh.faces.to("cpu", torch.int32, copy=True).contiguous().numpy()
-    channels = _rows(normals if values is None else torch.cat([normals, values.to(normals)], dim=1))
     links = np.empty(len(points) + faces.size, np.int32)
     lists = np.full(len(faces) + len(points), -1, np.int32)
     off = np.tile(np.array([0, 1], np.float32), (len(points), 1))
