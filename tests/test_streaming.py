@@ -7,7 +7,7 @@ from twins import using
 import pimper_torch as pt
 from pimper_torch.chains.photometric import Photometric
 from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.geometry.pyramids import build_pyramids
 from pimper_torch.lighting.lights import thinned
 from pimper_torch.records import Silhouettes, SparseScene, StageReport
 from pimper_torch.runtime.reporting import SilentObserver
@@ -34,7 +34,7 @@ def given():
 def streamed(given):
     views, cameras, patches = given
     light = FitLight()(Warp()(views, cameras, thinned(patches)))
-    return Photometric(Warp(), Factorize(), Sweep())(*given, light, prepare(views))
+    return Photometric(Warp(), Factorize(), Sweep())(*given, light, build_pyramids(views))
 
 
 def values(swept):

@@ -11,9 +11,9 @@ from pimper_torch.chains.chain import Chain, Step
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.chains.fusion_memory import largest_problem
 from pimper_torch.chains.photometric import Factorizing, Photometric, SweepStage, WarpStage
-from pimper_torch.chains.running import ChainRun
+from pimper_torch.chains.running import ChainRun, called
 from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.geometry.pyramids import build_pyramids
 from pimper_torch.lighting.lights import thinned
 from pimper_torch.priors.conventions import resolve_prior_conventions
 from pimper_torch.records import (
@@ -137,7 +137,7 @@ class CoarseToFine(Chain):
         self.show(scene, coarse)
         run(explain, coarse.mesh, contours)
         cameras, surface = scene.cameras, None
-        sources = run(prepare, scene.views, self.config.warp.saturation_level)
+        sources = called("prepare", build_pyramids, scene.views, self.config.warp.saturation_level)
         photometric = Photometric(self.warp, self.factorize, self.sweep)
         by_blocks: tuple[float, ...] = ()
         for scale, last in run.passes(self.config.scales):

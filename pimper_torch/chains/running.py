@@ -28,9 +28,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 # Stages that compute records faster than these are read, and one that keeps its records itself.
-_NOT_KEPT = (
-    *("reconstruct", "contours", "prepare", "decompose", "warp", "gauge", "repair", "explain"),
-)
+_NOT_KEPT = (*("reconstruct", "contours", "decompose", "warp", "gauge", "repair", "explain"),)
 
 # Kernels that stages wait for in the first run of an installation.
 _KERNELS: Mapping[str, Sequence[str]] = {

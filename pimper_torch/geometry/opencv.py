@@ -38,7 +38,7 @@ def _exact_distance(mask: np.ndarray) -> np.ndarray:
     return exact
 
 
-def shrunk(
+def area_resized(
     image: Float[Tensor, "channel height width"], width: int, height: int
 ) -> Float[Tensor, "channel {height} {width}"]:
     """Resize an image to a smaller one by area averaging."""
@@ -108,17 +108,17 @@ def grab_cut(
     return mask
 
 
-def opened(mask: Mask, radius_px: int) -> Mask:
+def opening(mask: Mask, radius_px: int) -> Mask:
     """Open a mask with a disc: remove parts narrower than the disc."""
     return _morphed(mask, cv2.MORPH_OPEN, radius_px)
 
 
-def closed(mask: Mask, radius_px: int) -> Mask:
+def closing(mask: Mask, radius_px: int) -> Mask:
     """Close a mask with a disc: fill gaps narrower than the disc."""
     return _morphed(mask, cv2.MORPH_CLOSE, radius_px)
 
 
-def dilated(layer: Map, reach_px: int) -> Map:
+def dilation(layer: Map, reach_px: int) -> Map:
     """Return the maximum over the square of ``2 reach_px + 1`` pixels a side around each pixel."""
     return torch.from_numpy(cv2.dilate(layer.numpy(), np.ones((2 * reach_px + 1,) * 2)))
 

@@ -120,7 +120,7 @@ class UnboundedHull(Hull):
         return (heights > self.offsets.to(points_world)).all(dim=-1)
 
 
-def bounding_box(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
+def bounding_cube(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
     """Return the two corners of a cube around the object, from the reliable silhouettes.
 
     Its centre is the point nearest to the rays through the centres of the silhouettes' bounding

@@ -86,7 +86,7 @@ def fine_surface(
     """
     cloud, maps, level, pixel = _matched(scene, reliable, contours, levels)
     if more is not None:
-        cloud = OrientedPoints.cat([cloud, oriented.thinned(more, pixel)])
+        cloud = OrientedPoints.cat([cloud, oriented.grid_averaged(more, pixel)])
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
     reach = REACH_PX * pixel
     counts = trim.view_counts(vertices, faces, level, maps, cloud.points_world, reach)

@@ -14,7 +14,7 @@ from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Surface
 from pimper_torch.records.shapes import FaceMask, Faces, Scalar, VertexMask, Vertices
 from pimper_torch.runtime.ledger import leave_out
-from pimper_torch.stages.meshing.faults import diagonal, faults, small_groups
+from pimper_torch.stages.meshing.faults import bounding_diagonal, faults, small_groups
 from pimper_torch.stages.stage import Stage
 
 
@@ -88,7 +88,7 @@ class Repair(Stage):
         before = vertices.detach()
         criteria = faults(before, faces, surface.facet, _MAX_STRETCH)
         local, used = criteria.part(surroundings(faces, criteria.broken(before), len(vertices)))
-        max_extent = _MAX_EXTENT * diagonal(before)
+        max_extent = _MAX_EXTENT * bounding_diagonal(before)
         positions, moving = repair(vertices[used], local.faces, local.broken, max_extent)
         vertices = vertices.index_copy(0, used, positions)
         moved = torch.zeros_like(surface.facet, dtype=torch.bool).index_put((used,), moving)

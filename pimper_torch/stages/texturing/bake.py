@@ -9,7 +9,7 @@ from torch.nn.functional import avg_pool2d, normalize
 from pimper_torch.geometry import surfaces
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.surfaces import carried_normals
-from pimper_torch.geometry.tangents import frames, tangents
+from pimper_torch.geometry.tangents import frames, vertex_tangents
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale, base_color
@@ -61,7 +61,7 @@ def textured(
     normals = carried_normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
     shape = surfaces.vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
-    tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
+    tangent = vertex_tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
     values = torch.cat([carried_normals(full), colors, uncertainty[:, None]], dim=1)
     caster, texel_faces = RayCaster(full.vertices_world, full.faces), _texel_faces(atlas)
