@@ -20,7 +20,7 @@ from pimper_torch.stages.fusion import estimate
 from pimper_torch.stages.patches.decompose import Decompose
 from pimper_torch.stages.patches.patches_config import DecomposeConfig
 from pimper_torch.stages.patches.warp import Warp
-from pimper_torch.stages.photometry import factorize as factorization
+from pimper_torch.stages.photometry import factor_solve
 from pimper_torch.stages.photometry.factorize import Factorize
 from pimper_torch.stages.photometry.fit_light import FitLight
 from pimper_torch.stages.sfm.sparse_scene import sound
@@ -222,7 +222,7 @@ def by_bucket(swept):
 
 def test_a_solution_that_is_not_finite_affects_only_its_patch(given, expected, monkeypatch):
     name = "variable-projection"
-    solve = factorization.SOLVERS[name]
+    solve = factor_solve.SOLVERS[name]
 
     def spoiled(problem, *limits):
         found = solve(problem, *limits)
@@ -234,7 +234,7 @@ def test_a_solution_that_is_not_finite_affects_only_its_patch(given, expected, m
             lights=lights, convergence=found.convergence.replace(residual=residual)
         )
 
-    monkeypatch.setattr(factorization, "SOLVERS", {**factorization.SOLVERS, name: spoiled})
+    monkeypatch.setattr(factor_solve, "SOLVERS", {**factor_solve.SOLVERS, name: spoiled})
     with (
         pytest.raises(ReconstructionError, match=r"factorize: patch \d+ failed"),
         collecting("fail"),

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.geometry.pyramids import build_pyramids
 from pimper_torch.geometry.undistortion import undistort
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import CameraModel, Silhouettes
@@ -163,7 +163,7 @@ def chain_of(photos):
     views, _ = undistort(views.take([2, 0, 3]), (lens, lens, lens))
     inside = mapped.by_view(torch.Tensor.float, views.masks)
     found = Silhouettes(inside=inside, reliable=torch.ones(3, dtype=torch.bool), source="masks")
-    sources = prepare(views.replace(masks=found.masks & views.inside))
+    sources = build_pyramids(views.replace(masks=found.masks & views.inside))
     pyramids = sources.images, sources.gray, sources.unusable
     arrays = [one for pyramid in pyramids for one in (pyramid.finest, pyramid.coarser)]
     return [*arrays, views.masks, realigned(found).inside], digest(sources)

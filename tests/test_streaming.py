@@ -6,7 +6,7 @@ from twins import using
 
 import pimper_torch as pt
 from pimper_torch.chains.photometric import Photometric
-from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.geometry.pyramids import build_pyramids
 from pimper_torch.lighting.lights import thinned
 from pimper_torch.records import StageReport
 from pimper_torch.runtime.reporting import SilentObserver
@@ -27,7 +27,9 @@ def given():
 def streamed(given):
     views, cameras, patches = given
     light = pt.FitLight()(pt.Warp()(views, cameras, thinned(patches)))
-    return Photometric()((pt.Warp(), pt.Factorize(), pt.Sweep()), *given, light, prepare(views))
+    return Photometric()(
+        (pt.Warp(), pt.Factorize(), pt.Sweep()), *given, light, build_pyramids(views)
+    )
 
 
 def values(swept):

@@ -13,7 +13,7 @@ from pimper_torch.chains.photometric import Factorizing, Photometric, SweepStage
 from pimper_torch.chains.prepare import Prepared
 from pimper_torch.chains.running import ChainRun
 from pimper_torch.geometry.contours import Contours
-from pimper_torch.geometry.pyramids import Sources, prepare
+from pimper_torch.geometry.pyramids import Sources, build_pyramids
 from pimper_torch.lighting.lights import thinned
 from pimper_torch.records import (
     Cameras,
@@ -97,7 +97,7 @@ class CoarseToFine(Chain):
         scene, contours, coarse = prepared.scene, prepared.contours, prepared.coarse
         cameras, surface = scene.cameras, None
         with stage("pyramids"):
-            sources = prepare(scene.views, self.config.warp.saturation_level)
+            sources = build_pyramids(scene.views, self.config.warp.saturation_level)
         for scale, last in run.passes(self.config.scales):
             patches = run(self.decompose, coarse, cameras, surface, scale)
             light = self._light(run, scene, patches, sources)

@@ -5,6 +5,8 @@ a side. Sample (row i, column j) is at ``x = origin_x + j spacing``, ``y = origi
 indices, unlike :mod:`~pimper_torch.geometry.pixels`, count from the first sample's centre.
 """
 
+from functools import partial
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -85,31 +87,11 @@ def intersect_height_field(
     Differentiable in ``depth``, ``ray_origins`` and ``ray_directions`` by the implicit function
     theorem: only the last step has gradients, with constant slope, exact if the others converged.
     """
-    x, y, z = ray_origins.unbind(dim=-1)
-    dx, dy, dz = ray_directions.unbind(dim=-1)
-    count, height, width = depth.shape
-    raster = continued_level(depth, valid).to(ray_origins).reshape(count, -1)
-    per_sample = (1 / spacing)[:, None]
-
-    def gap_of(distance: PerRay) -> tuple[PerRay, PerRay]:
-        """Return the distance from the height field to the ray along z, and its derivative."""
-        column = ((x + distance * dx - origin[:, :1]) * per_sample).clamp(0, width - 1)
-        row = ((y + distance * dy - origin[:, 1:]) * per_sample).clamp(0, height - 1)
-        left = column.detach().floor().clamp_max(width - 2)
-        top = row.detach().floor().clamp_max(height - 2)
-        across, down = column - left, row - top
-        first = (top * width + left).long()
-        top_left, top_right = raster.gather(1, first), raster.gather(1, first + 1)
-        low_left, low_right = raster.gather(1, first + width), raster.gather(1, first + width + 1)
-        slope_x = torch.lerp(top_right - top_left, low_right - low_left, down)
-        upper = top_left + across * (top_right - top_left)
-        lower = low_left + across * (low_right - low_left)
-        slope_y = lower - upper
-        climb = (slope_x * dx + slope_y * dy) * per_sample
-        return z + distance * dz - upper - down * slope_y, dz - climb
-
+    raster = continued_level(depth, valid).to(ray_origins)
+    gap_of = partial(_gap, raster, origin, spacing, ray_origins, ray_directions)
+    dz = ray_directions[..., 2]
     min_rate = 1e-3 * ray_directions.norm(dim=-1)
-    distance = -z / _away_from_zero(dz, min_rate)
+    distance = -ray_origins[..., 2] / _away_from_zero(dz, min_rate)
     with torch.no_grad():
         for _ in range(steps - 1):
             gap, rate = gap_of(distance)
@@ -121,19 +103,50 @@ def intersect_height_field(
 
     with torch.no_grad():
         gap, rate = gap_of(distance)
-        neighbours, across, down = _cell(points[..., :2], origin, spacing, depth.shape[-2:])
-        valid_corners = _gather(valid[:, None], neighbours)[:, 0]
-        supported = (_bilinear_weights(across, down) * valid_corners).sum(dim=-1)
-        index = (points[..., :2] - origin[:, None]) / spacing[:, None, None]
-        last = index.new_tensor([depth.shape[2] - 1, depth.shape[1] - 1])
-        slack = _NEGLIGIBLE_WEIGHT
-        hit = (
-            (supported >= 1 - slack)
-            & ((index >= -slack) & (index <= last + slack)).all(dim=-1)
-            & (gap.abs() <= 0.02 * spacing[:, None])
-            & (rate.abs() > min_rate)
-        )
-    return points, hit
+        near = (gap.abs() <= 0.02 * spacing[:, None]) & (rate.abs() > min_rate)
+        return points, near & _supported(points[..., :2], origin, spacing, valid)
+
+
+def _gap(
+    raster: PatchRaster,
+    origin: Origins,
+    spacing: PerPatch,
+    ray_origins: Float[Tensor, "patch ray 3"],
+    ray_directions: Float[Tensor, "patch ray 3"],
+    distance: PerRay,
+) -> tuple[PerRay, PerRay]:
+    """Return the distance from the height field to the ray along z, and its derivative."""
+    x, y, z = ray_origins.unbind(dim=-1)
+    dx, dy, dz = ray_directions.unbind(dim=-1)
+    _, height, width = raster.shape
+    per_sample, flat = (1 / spacing)[:, None], raster.flatten(1)
+    column = ((x + distance * dx - origin[:, :1]) * per_sample).clamp(0, width - 1)
+    row = ((y + distance * dy - origin[:, 1:]) * per_sample).clamp(0, height - 1)
+    left = column.detach().floor().clamp_max(width - 2)
+    top = row.detach().floor().clamp_max(height - 2)
+    across, down = column - left, row - top
+    first = (top * width + left).long()
+    top_left, top_right = flat.gather(1, first), flat.gather(1, first + 1)
+    low_left, low_right = flat.gather(1, first + width), flat.gather(1, first + width + 1)
+    slope_x = torch.lerp(top_right - top_left, low_right - low_left, down)
+    upper = top_left + across * (top_right - top_left)
+    lower = low_left + across * (low_right - low_left)
+    slope_y = lower - upper
+    climb = (slope_x * dx + slope_y * dy) * per_sample
+    return z + distance * dz - upper - down * slope_y, dz - climb
+
+
+def _supported(
+    xy: Float[Tensor, "patch ray 2"], origin: Origins, spacing: PerPatch, valid: PatchMask
+) -> Bool[Tensor, "patch ray"]:
+    """Return whether positions are on the raster, and interpolated from valid samples only."""
+    neighbours, across, down = _cell(xy, origin, spacing, valid.shape[-2:])
+    valid_corners = _gather(valid[:, None], neighbours)[:, 0]
+    weight = (_bilinear_weights(across, down) * valid_corners).sum(dim=-1)
+    index = (xy - origin[:, None]) / spacing[:, None, None]
+    last = index.new_tensor([valid.shape[2] - 1, valid.shape[1] - 1])
+    inside = (index >= -_NEGLIGIBLE_WEIGHT) & (index <= last + _NEGLIGIBLE_WEIGHT)
+    return inside.all(dim=-1) & (weight >= 1 - _NEGLIGIBLE_WEIGHT)
 
 
 def continued_level(depth: PatchRaster, valid: PatchMask) -> PatchRaster:

@@ -38,7 +38,7 @@ def _exact_distance(mask: np.ndarray) -> np.ndarray:
     return exact
 
 
-def shrunk(
+def area_resized(
     image: Float[Tensor, "channel height width"], width: int, height: int
 ) -> Float[Tensor, "channel {height} {width}"]:
     """Resize an image to a smaller one by area averaging."""
@@ -108,17 +108,17 @@ def grab_cut(
     return mask
 
 
-def opened(mask: Mask, radius_px: int) -> Mask:
+def opening(mask: Mask, radius_px: int) -> Mask:
     """Open a mask with a disc: remove parts narrower than the disc."""
     return _morphed(mask, cv2.MORPH_OPEN, radius_px)
 
 
-def closed(mask: Mask, radius_px: int) -> Mask:
+def closing(mask: Mask, radius_px: int) -> Mask:
     """Close a mask with a disc: fill gaps narrower than the disc."""
     return _morphed(mask, cv2.MORPH_CLOSE, radius_px)
 
 
-def dilated(layer: Map, reach_px: int) -> Map:
+def dilation(layer: Map, reach_px: int) -> Map:
     """Return the maximum over the square of ``2 reach_px + 1`` pixels a side around each pixel."""
     return torch.from_numpy(cv2.dilate(layer.numpy(), np.ones((2 * reach_px + 1,) * 2)))
 
@@ -151,16 +151,12 @@ def _morphed(mask: Mask, operation: int, radius_px: int) -> Mask:
 
 def without_specks(mask: Mask, kept: Mask, min_px: int) -> Mask:
     """Remove components that are small or do not overlap ``kept``, and fill small holes."""
-    large = _large_components(mask, kept, min_px)
-    return ~_large_components(~large, torch.ones_like(mask), min_px)
+    large = components_of(mask, kept, min_px)
+    return ~components_of(~large, torch.ones_like(mask), min_px)
 
 
-def components_of(mask: Mask, meeting: Mask) -> Mask:
-    """Return the components of a mask that overlap ``meeting``."""
-    return _large_components(mask, meeting, 1)
-
-
-def _large_components(mask: Mask, meeting: Mask, min_px: int) -> Mask:
+def components_of(mask: Mask, meeting: Mask, min_px: int = 1) -> Mask:
+    """Return the components of a mask that overlap ``meeting`` and are not smaller than a size."""
     pixels = mask.numpy().astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=4)
     overlapping = np.bincount(labels[meeting.numpy()], minlength=count) > 0

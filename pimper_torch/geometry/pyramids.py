@@ -244,7 +244,9 @@ def kernel_geometry(
     return projection, samples
 
 
-def prepare(views: Views, saturation_level: float = SATURATED, levels: int = LEVELS) -> Sources:
+def build_pyramids(
+    views: Views, saturation_level: float = SATURATED, levels: int = LEVELS
+) -> Sources:
     """Build the pyramids of all photographs, once for all scales of a run.
 
     Differentiable in the photographs.
@@ -348,7 +350,7 @@ def _prior_maps(
         zoom=prior.sizes_px / views.sizes_px[view],
         sizes_px=prior.sizes_px,
         kind=kind,
-        maps=prepare(as_views, math.inf, levels),
+        maps=build_pyramids(as_views, math.inf, levels),
         in_world=isinstance(prior, NormalPrior) and prior.frame == "world",
     )
 

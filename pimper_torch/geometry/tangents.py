@@ -9,7 +9,7 @@ from pimper_torch.geometry.visibility import Hits
 from pimper_torch.records.shapes import Faces, Vertices
 
 
-def tangents(
+def vertex_tangents(
     vertices: Vertices, normals: Vertices, uv: Float[Tensor, "vertex 2"], faces: Faces
 ) -> Float[Tensor, "vertex 4"]:
     """Return glTF's tangents: unit, perpendicular to the normal, along ``u``; then a sign.

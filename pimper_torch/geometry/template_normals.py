@@ -4,7 +4,7 @@ import torch
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.rigid import rotate
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import carried_normals
 from pimper_torch.records import CoarseMesh, Templates
 from pimper_torch.records.shapes import PatchVectors, Vectors
 
@@ -25,10 +25,8 @@ def coarse_normals(coarse: CoarseMesh, templates: Templates) -> PatchVectors:
     Barycentric coordinates are clamped to the facet: no extrapolation. Normals face the viewer.
     """
     mesh = coarse.mesh
-    per_vertex = mesh.normals_world
-    if per_vertex is None:
-        per_vertex = vertex_normals(mesh.vertices_world, mesh.faces)
-    corners = rotate(templates.patch_from_world, per_vertex[mesh.faces[templates.facet]])
+    per_corner = carried_normals(mesh)[mesh.faces[templates.facet]]
+    corners = rotate(templates.patch_from_world, per_corner)
     inner = templates.barycentric.clamp_min(0)
     inner = inner / inner.sum(dim=-1, keepdim=True)
     return facing_viewer(torch.einsum("phwc,pcx->phwx", inner, corners.to(inner)))

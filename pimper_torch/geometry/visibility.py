@@ -50,6 +50,14 @@ class Hits(Record):
         values = (self.barycentric[..., None] * corners).sum(dim=-2)
         return torch.where((self.face >= 0)[..., None], values, 0)
 
+    def where(self, chosen: Bool[Tensor, "*batch"], other: "Hits") -> "Hits":
+        """Return the chosen hits, and those of other rays elsewhere."""
+        return Hits(
+            face=torch.where(chosen, self.face, other.face),
+            distance=torch.where(chosen, self.distance, other.distance),
+            barycentric=torch.where(chosen[..., None], self.barycentric, other.barycentric),
+        )
+
     def refined(
         self, vertices: Vertices, faces: Faces, origins: Places, directions: Vectors
     ) -> "Hits":

@@ -120,7 +120,7 @@ class UnboundedHull(Hull):
         return (heights > self.offsets.to(points_world)).all(dim=-1)
 
 
-def bounding_box(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
+def bounding_cube(silhouettes: Silhouettes, cameras: Cameras) -> Float[Tensor, "2 3"] | None:
     """Return the two corners of a cube around the object, from the reliable silhouettes.
 
     Its centre is the point nearest to the rays through the centres of the silhouettes' bounding
@@ -312,9 +312,12 @@ def _vote_on_grid(
 
     slabs = list(side_by_side(of_slab, torch.split(reach[0], slab), tracked=False))
     distance, unweighted = torch.cat(slabs, dim=1)
-    components, count = label((distance > 0).cpu().numpy())
-    labels = torch.from_numpy(components).to(distance.device)
-    separate = torch.bincount(labels[unweighted > 0], minlength=count + 1)[labels] == 0
-    separate &= labels > 0
-    distance = torch.where(separate, -spacing, distance)
+    distance = torch.where(_separate(distance > 0, unweighted > 0), -spacing, distance)
     return Hull(origin_world=low, spacing=spacing, distance=distance)
+
+
+def _separate(inside: Bool[Tensor, "x y z"], sure: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
+    """Return the connected components inside that have no sure voxel."""
+    components, count = label(inside.cpu().numpy())
+    labels = torch.from_numpy(components).to(inside.device)
+    return (labels > 0) & (torch.bincount(labels[sure], minlength=count + 1)[labels] == 0)

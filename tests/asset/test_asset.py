@@ -18,7 +18,7 @@ from torch.testing import assert_close
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.rigid import rotate, transform
-from pimper_torch.geometry.tangents import tangents
+from pimper_torch.geometry.tangents import vertex_tangents
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.usd import write_usdz
@@ -172,11 +172,13 @@ def test_tangents_follow_the_texture_and_mark_mirrored_charts():
     square = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     up, faces = torch.tensor([[0.0, 0, 1]]).expand(4, 3), torch.tensor([[0, 1, 2], [0, 2, 3]])
     uv = square[:, :2] * torch.tensor([1.0, -1.0]) + torch.tensor([0.0, 1.0])
-    assert_close(tangents(square, up, uv, faces), torch.tensor([[1.0, 0, 0, 1]]).expand(4, 4))
+    assert_close(
+        vertex_tangents(square, up, uv, faces), torch.tensor([[1.0, 0, 0, 1]]).expand(4, 4)
+    )
     mirrored = uv * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])
     wanted = torch.tensor([[-1.0, 0, 0, -1]]).expand(4, 4)
-    assert_close(tangents(square, up, mirrored, faces), wanted)
-    lost = tangents(square, up, torch.zeros(4, 2), faces)
+    assert_close(vertex_tangents(square, up, mirrored, faces), wanted)
+    lost = vertex_tangents(square, up, torch.zeros(4, 2), faces)
     assert_close(lost[:, :3].norm(dim=1), torch.ones(4))
     assert_close(lost[:, 2], torch.zeros(4))
 

@@ -19,10 +19,10 @@ from pimper_torch.stages.coarse.densify import (
 )
 from pimper_torch.stages.coarse.oriented import (
     OrientedPoints,
+    grid_averaged,
     no_points,
     refit_normals,
     sparse_oriented,
-    thinned,
 )
 from pimper_torch.stages.coarse.trim import (
     ViewCounts,
@@ -65,7 +65,7 @@ def test_noisy_points_share_larger_cells_but_sides_are_separate():
 
     def count(noise, normals):
         cloud = OrientedPoints(points_world=points, normals_world=normals, noise=noise)
-        return len(thinned(cloud, 0.1).noise)
+        return len(grid_averaged(cloud, 0.1).noise)
 
     assert 100 <= count(exact, up) <= 121
     assert count(noisy, up) < 0.2 * count(exact, up)

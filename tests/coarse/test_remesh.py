@@ -194,7 +194,7 @@ def test_facets_without_data_are_dropped_except_in_small_holes(generator):
     assert boundary_vertices(found.mesh.faces, len(found.mesh.vertices_world)).any()
 
 
-def test_points_are_reassigned_and_moved_vertices_are_not_points(generator):
+def test_points_are_reassigned_to_facets_and_no_vertex_is_a_point(generator):
     coarse = sheet(generator, side=9)
     count = 300
     facet = torch.randint(len(coarse.mesh.faces), (count,), generator=generator)
@@ -202,11 +202,8 @@ def test_points_are_reassigned_and_moved_vertices_are_not_points(generator):
     corners = coarse.mesh.vertices_world[coarse.mesh.faces[facet]]
     places = (inside[:, :, None] * corners).sum(dim=1)
     spread = torch.rand(count, generator=generator, dtype=torch.float64)
-    is_point = torch.rand(len(coarse.mesh.vertices_world), generator=generator) < 0.5
-    known = torch.eye(3).double() * is_point[:, None, None]
     coarse = coarse.replace(
-        is_point=is_point,
-        covariance_world=known,
+        covariance_world=torch.eye(3).double().expand(len(coarse.mesh.vertices_world), 3, 3),
         points=FacetPoints(
             points_world=places,
             covariance_world=spread[:, None, None] * torch.eye(3).double(),
@@ -220,17 +217,10 @@ def test_points_are_reassigned_and_moved_vertices_are_not_points(generator):
     to_point = here[:, None] - new
     side = ahead[..., 0] * to_point[..., 1] - ahead[..., 1] * to_point[..., 0]
     assert (side > -1e-6).all()  # inside its facet, as seen from above
-    assert_close(found.points.points_world[:count], places)
-    assert_close(found.points.covariance_world[:count, 0, 0], spread)
-    # A vertex that was a point is still either of them.
-    moved = len(found.points.facet) - count
-    assert moved > 0
-    assert moved + int(found.is_point.sum()) == int(is_point.sum())
-    old = torch.cdist(found.points.points_world[count:], coarse.mesh.vertices_world[is_point])
-    assert (old.amin(dim=1) == 0).all()
-    assert_close(found.points.covariance_world[count:], torch.eye(3).double().expand(moved, 3, 3))
-    on = found.covariance_world.diagonal(dim1=1, dim2=2).sum(dim=1) > 0
-    assert (on == found.is_point).all()
+    assert_close(found.points.points_world, places)
+    assert_close(found.points.covariance_world[:, 0, 0], spread)
+    assert not found.is_point.any()
+    assert (found.covariance_world == 0).all()
 
 
 @pytest.mark.parametrize(("axes", "far"), [([0, 1], 0.7), ([2], 20.0)])

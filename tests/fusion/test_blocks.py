@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from pimper_torch.geometry.subdivision import subdivide
 from pimper_torch.geometry.topology import face_counts, face_edges
 from pimper_torch.records import Mesh
-from pimper_torch.stages.fusion.blocks import Coarse, block_of, parts_of, pooled
+from pimper_torch.stages.fusion.blocks import Coarse, block_of, partitioned, pooled
 from pimper_torch.stages.fusion.fuse import Fuse
 from tests.fusion.test_sphere import cap_of, free, noisy, off_sphere
 from tests.threads import on_threads
@@ -35,7 +35,7 @@ def ball():
 
 def test_blocks_partition_a_closed_surface(ball):
     mesh, whole = ball
-    parts = parts_of(whole, mesh, len(whole.points) / 3)
+    parts = partitioned(whole, mesh, len(whole.points) / 3)
     assert len(parts) > 3
     assert (torch.stack(parts).sum(dim=0) == 1).all()
     owners = torch.zeros(len(whole.points), dtype=torch.long)

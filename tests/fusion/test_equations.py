@@ -18,7 +18,7 @@ from pimper_torch.stages.fusion.equations import (
     passing,
     slopes,
     swept_heights,
-    upright,
+    upright_edges,
 )
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -98,14 +98,14 @@ def test_edges_across_a_contour_are_not_upright(subdivision):
     along = UP.expand(len(across), 3)
     lean = torch.stack([torch.ones_like(across), 0 * across, across], dim=1)
     both = (lean[edges].sum(dim=1)[:, 2] > 0.25).numpy()  # clearly on the visible side
-    found = upright(edges, along, normalize(lean, dim=1)).numpy()
+    found = upright_edges(edges, along, normalize(lean, dim=1)).numpy()
     assert found[both].all()
     assert not found[(across[edges] < 0).any(dim=1).numpy() & ~both].any()
     # Nor are edges with opposite normals, or with an opposite direction at one end.
-    assert not upright(edges, along, -along).any()
+    assert not upright_edges(edges, along, -along).any()
     rotated = along.clone()
     rotated[0] = -UP
-    assert torch.equal(~upright(edges, rotated, along), (edges == 0).any(dim=1))
+    assert torch.equal(~upright_edges(edges, rotated, along), (edges == 0).any(dim=1))
 
 
 def test_kept_steps_are_those_of_the_current_surface(subdivision, generator):

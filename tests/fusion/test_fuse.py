@@ -318,8 +318,6 @@ def test_fusion_without_terms_is_rejected():
 class At(Term):
     """Equations that place all vertices at one height above the facets."""
 
-    position = True
-
     def __init__(self, height: float) -> None:
         super().__init__()
         self.height = nn.Parameter(torch.tensor(height, dtype=torch.float64))
@@ -353,6 +351,59 @@ def test_a_custom_term_is_fused_and_its_parameters_have_gradients(swept):
     assert own.height.grad.abs() > 0.9 * len(surface.information) * abs(float(lifted.normal.sum()))
     with pytest.raises(pt.ConfigError, match="modules derived from Term"):
         pt.Fuse(terms=[nn.Identity()])
+
+
+class WithEveryMethod(At):
+    """The same with an error that all heights share, known slopes and a list of calls."""
+
+    rank = 1
+
+    def __init__(self, height: float, calls: list[str], variance: float = 0.0) -> None:
+        super().__init__(height)
+        self.calls, self.variance = calls, variance
+
+    def bound(self, problem, contours):
+        assert contours is FREE
+        self.calls.append("bound")
+        self.size = len(problem.points)
+        return self
+
+    def sloped(self, problem):
+        self.calls.append("sloped")
+        return torch.full_like(problem.lit, self.variance > 0)
+
+    def equations(self, problem):
+        full = len(problem.points) > self.size
+        self.calls.append("equations at full size" if full else "equations")
+        assert bool(problem.sloped.all()) == (self.variance > 0)
+        (kind,) = super().equations(problem)
+        return [kind.replace(information=1 / (1 / kind.information + self.variance))]
+
+    def reestimate(self, problem, heights, trusted):
+        self.calls.append("reestimate")
+        error = float((heights[trusted] - self.height).median().detach())
+        term = WithEveryMethod(float(self.height.detach()), self.calls, error**2)
+        term.size = self.size
+        return term
+
+
+def test_methods_of_a_term_are_called_in_the_documented_order(swept):
+    lifted, given = swept(0.0)
+    spacing = float(given.patches.buckets[0].spacing[0])
+    given = with_points(with_dark_dents(given, 0.0), near_plane(lifted, 0.0), 0.1 * spacing)
+    calls, wrong = [], 3 * spacing
+    terms = [*pt.Fuse().terms, WithEveryMethod(wrong, calls)]
+    surface = pt.Fuse(FuseConfig(bias_iterations=1, error_draws=0), terms)(given, FREE)
+    assert calls == [
+        *("bound", "sloped", "equations"),
+        # The term now determines all slopes, so all terms are assembled again.
+        *("reestimate", "sloped", "sloped", "equations"),
+        *("sloped", "equations at full size"),
+    ]
+    # Its common error of three spacings is estimated from the points, which outvote it.
+    assert off_plane(lifted, surface).abs().quantile(0.9) < 0.1
+    sure = pt.Fuse(FuseConfig(error_draws=0), [*pt.Fuse().terms, At(wrong)])(given, FREE)
+    assert off_plane(lifted, sure).median() > 1
 
 
 def test_named_terms_equal_listed_terms(swept):

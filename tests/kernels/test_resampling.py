@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 from twins import using
 
-from pimper_torch.geometry.pyramids import prepare
+from pimper_torch.geometry.pyramids import build_pyramids
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.records import Mesh
 from pimper_torch.stages.patches.patches_config import WarpConfig
@@ -120,7 +120,7 @@ def test_the_adjoint_of_resampling_agrees_with_torch(photographed):
 
 def test_swept_heights_agree_with_torch(photographed):
     views, cameras, lifted = photographed
-    sources = prepare(views)
+    sources = build_pyramids(views)
     with using("torch"):
         wanted = Sweep()(views, cameras, lifted.seen, lifted.photometric, sources)
     found = Sweep()(views, cameras, lifted.seen, lifted.photometric, sources)
@@ -167,7 +167,7 @@ def hypotheses(views, cameras, lifted, coarser):
         ),
         outward=torch.nn.functional.normalize(leaves["outward"], dim=-1),
         cameras=cameras.replace(**{n: leaves[n] for n in ("cam_from_world", "intrinsics")}),
-        sources=prepare(views.replace(images=leaves["images"])),
+        sources=build_pyramids(views.replace(images=leaves["images"])),
         images=torch.arange(cameras.num_views),
         poses=None,
         ladder=torch.arange(-3, 4.0),
@@ -199,6 +199,6 @@ def test_costs_of_heights_and_their_gradients_agree_with_torch(photographed, coa
 def test_the_photographs_are_not_copied(photographed):
     views, _, _ = photographed
     whole = views.replace(images=views.images.nan_to_num())
-    sources = prepare(whole)
+    sources = build_pyramids(whole)
     assert sources.images.finest.data_ptr() == whole.images.data_ptr()
-    assert prepare(views).images.finest.isfinite().all()
+    assert build_pyramids(views).images.finest.isfinite().all()

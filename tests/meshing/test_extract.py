@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.stages.meshing.extract import Extract
-from pimper_torch.stages.meshing.faults import diagonal
+from pimper_torch.stages.meshing.faults import bounding_diagonal
 from pimper_torch.stages.meshing.meshing_config import ExtractConfig
 from tests.meshing.sheets import sheet_of
 
@@ -142,11 +142,11 @@ def test_a_surface_without_enough_support_is_rejected():
 def test_faces_with_a_large_expected_error_are_removed():
     surface = sheet()
     fraction = columns(surface) / (SIDE - 1) / 10
-    inexact = surface.replace(expected_error=fraction * diagonal(surface.vertices_world))
+    inexact = surface.replace(expected_error=fraction * bounding_diagonal(surface.vertices_world))
     mesh = Extract(ExtractConfig(max_expected_error=0.05))(inexact)
     assert columns(mesh).max() == (SIDE - 1) / 2
     assert len(mesh.faces) == len(surface.faces) // 2
-    kept = mesh.vertices_world[:, 0] / (SIDE - 1) / 10 * diagonal(surface.vertices_world)
+    kept = mesh.vertices_world[:, 0] / (SIDE - 1) / 10 * bounding_diagonal(surface.vertices_world)
     assert_close(mesh.expected_error, kept)  # each belongs to its vertex
     assert len(Extract(ExtractConfig(max_expected_error=0.11))(inexact).faces) == len(surface.faces)
     vague = surface.replace(expected_error=1 + 0 * fraction)

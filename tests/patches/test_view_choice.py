@@ -13,7 +13,7 @@ from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Cameras, CoarseMesh, Mesh
 from pimper_torch.stages.patches.decompose import Decompose, views_facing
 from pimper_torch.stages.patches.patches_config import DecomposeConfig
-from pimper_torch.stages.patches.view_choice import best_views, view_blocks, view_weights
+from pimper_torch.stages.patches.view_choice import selected_views, view_blocks, view_weights
 from tests.threads import on_threads
 
 FOCAL, DISTANCE, SPACING = 100.0, 4.0, 0.02
@@ -80,24 +80,24 @@ def some_weights(generator, facets=12, views=30):
 def test_few_views_are_all_chosen_unless_they_see_no_facet(generator):
     weight, directions = some_weights(generator)
     weight[:, 7] = 0
-    assert best_views(weight, directions, 40).logical_not().nonzero().tolist() == [[7]]
-    assert best_views(weight, directions, 5).sum() == 5
-    assert best_views(torch.zeros(3, 4), torch.eye(4)[:, :3], 2).sum() == 1  # at least one
+    assert selected_views(weight, directions, 40).logical_not().nonzero().tolist() == [[7]]
+    assert selected_views(weight, directions, 5).sum() == 5
+    assert selected_views(torch.zeros(3, 4), torch.eye(4)[:, :3], 2).sum() == 1  # at least one
 
 
 def test_views_that_see_no_facet_do_not_affect_the_choice(generator):
     weight, directions = some_weights(generator)
     more = torch.cat([weight, torch.zeros(12, 9)], dim=1), torch.cat([directions, directions[:9]])
-    found = best_views(*more, 10)
-    assert torch.equal(found[:30], best_views(weight, directions, 10))
+    found = selected_views(*more, 10)
+    assert torch.equal(found[:30], selected_views(weight, directions, 10))
     assert not found[30:].any()
 
 
 def test_the_choice_does_not_depend_on_the_order_of_views(generator):
     weight, directions = some_weights(generator)
     order = torch.randperm(30, generator=generator)
-    found = best_views(weight[:, order], directions[order], 10)
-    assert torch.equal(found, best_views(weight, directions, 10)[order])
+    found = selected_views(weight[:, order], directions[order], 10)
+    assert torch.equal(found, selected_views(weight, directions, 10)[order])
 
 
 def test_facets_share_the_views_evenly():
@@ -105,7 +105,7 @@ def test_facets_share_the_views_evenly():
     weight[0, :10], weight[1, 10:] = 0.9, 0.3
     circle = torch.arange(20) * math.pi / 10
     directions = torch.stack([circle.cos(), circle.sin(), 0 * circle], dim=1).double()
-    chosen = best_views(weight, directions, 10)
+    chosen = selected_views(weight, directions, 10)
     seen = (weight * chosen).gt(0).sum(dim=1)
     assert seen.min() >= 3  # by weight alone, the second had none
 
@@ -113,11 +113,11 @@ def test_facets_share_the_views_evenly():
 def test_chosen_views_spread_and_alternate_among_poses():
     steps = torch.deg2rad(torch.linspace(-40, 40, 41, dtype=torch.float64))
     arc = torch.stack([steps.sin(), 0 * steps, -steps.cos()], dim=1)
-    chosen = best_views(steps.cos()[None], arc, 9)
+    chosen = selected_views(steps.cos()[None], arc, 9)
     picked = torch.rad2deg(steps[chosen])
     assert picked.diff().min() >= 6  # 10 if evenly spaced, and 2 by weight alone
     poses = arc[::8].repeat_interleave(5, dim=0)  # six poses, each with five lights
-    chosen = best_views(torch.ones(1, 30), poses.float(), 12).reshape(6, 5)
+    chosen = selected_views(torch.ones(1, 30), poses.float(), 12).reshape(6, 5)
     assert (chosen.sum(dim=1) == 2).all()
     assert chosen.any(dim=0).sum() >= 4  # not the first two lights of each
 

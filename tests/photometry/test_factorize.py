@@ -14,7 +14,8 @@ import pimper_torch as pt
 from pimper_torch.geometry.template_normals import coarse_normals
 from pimper_torch.lighting.light_field import LightField, harmonics
 from pimper_torch.records import PatchStatus
-from pimper_torch.stages.photometry import factorize
+from pimper_torch.stages.photometry import shadows
+from pimper_torch.stages.photometry.factorize import LOSSES
 
 EXACT = pt.FactorizeConfig(geometry_weight=0.0, max_iterations=300, tolerance=1e-6)
 
@@ -73,7 +74,7 @@ def test_bumps_missing_from_the_mesh_are_recovered(scene, solver):
         assert (bucket.confidence <= 1).all()
 
 
-@pytest.mark.parametrize("loss", factorize.LOSSES)
+@pytest.mark.parametrize("loss", LOSSES)
 def test_every_loss_recovers_bumps_and_has_gradients(scene, loss):
     true = scene(bumps=0.2)
     config = pt.FactorizeConfig(loss=loss, geometry_weight=0.0)
@@ -147,11 +148,11 @@ def test_a_shadowed_patch_has_albedo_only_under_constant_light(scene, monkeypatc
     light = torch.tensor([[1.0, 0.1, 0.2, -0.7]], dtype=torch.float64)
     true = scene(bumps=0.0, lights=None if moves else light.expand(12, 4))
 
-    def illuminated(bucket, *_):
-        lit = bucket.registered.valid & (bucket.templates.facet != 1)[:, None, None, None]
+    def illuminated(templates, registered, *_):
+        lit = registered.valid & (templates.facet != 1)[:, None, None, None]
         return lit, torch.zeros_like(lit)
 
-    monkeypatch.setattr(factorize, "_illuminated", illuminated)
+    monkeypatch.setattr(shadows, "_illuminated", illuminated)
     photometric = solved(pt.Factorize(), true.seen)
     found, counts = photometric.buckets[0], photometric.figures()
     assert counts["few_views_patches"] == 1  # one of 8: a figure, not a warning
@@ -183,9 +184,9 @@ def test_soft_light_determines_normals_in_cast_shadow_if_strong(scene, monkeypat
     )
     monkeypatch.setattr(pt.FitLight, "_field", lambda *_: field)
     monkeypatch.setattr(
-        factorize,
+        shadows,
         "_illuminated",
-        lambda bucket, *_: (torch.zeros_like(bucket.registered.valid), bucket.registered.valid),
+        lambda _, registered, *rest: (torch.zeros_like(registered.valid), registered.valid),
     )
     if strength > 1:
         with pytest.warns(pt.PimperWarning, match="8 of 8 patches keep"):

@@ -1,7 +1,7 @@
 import torch
 
 from pimper_torch.records import PatchStatus
-from pimper_torch.stages.photometry.status import light_varies, patch_status
+from pimper_torch.stages.photometry.status import light_varies, photometric_status
 
 
 def test_light_variation_is_the_ratio_of_the_third_singular_value(generator):
@@ -28,7 +28,7 @@ def test_a_patch_has_the_first_status_that_applies(generator):
     seen[3:] = False
     finite = torch.tensor([True, True, True, False, False])
     observed = torch.tensor([True, True, True, True, False])
-    found = patch_status(observed, finite, seen, lights, 4, 0.02)
+    found = photometric_status(observed, finite, seen, lights, 4, 0.02)
     assert found.tolist() == [
         PatchStatus.DETERMINED,
         PatchStatus.CONSTANT_LIGHT,

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.stages.relighting.fit_lights import lights_of, observe_all
-from pimper_torch.stages.relighting.fit_materials import clusters, materials_under
+from pimper_torch.stages.relighting.fit_materials import colour_clusters, materials_under
 from pimper_torch.stages.relighting.held_out import psnr, shaded
 from pimper_torch.stages.relighting.lit_surface import LitSurface, response
 from tests.relighting.ball import ball_mesh, colours, photographed, textbook
@@ -83,11 +83,11 @@ def test_colours_of_two_paints_are_two_clusters():
     red, blue = torch.tensor([0.6, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.7])
     paint = torch.arange(500).remainder(5) == 0
     colors = torch.where(paint[:, None], red, blue) + 0.01 * torch.rand(500, 3)
-    found = clusters(colors, 2)
+    found = colour_clusters(colors, 2)
     assert torch.equal(found == found[0], paint)
 
 
 def test_a_surface_with_few_colours_has_one_cluster_per_colour():
     colours = torch.tensor([[0.2, 0.2, 0.2], [0.8, 0.1, 0.1]]).repeat(50, 1)
-    assert len(clusters(colours[::2], 2).unique()) == 1
-    assert len(clusters(colours, 3).unique()) == 2
+    assert len(colour_clusters(colours[::2], 2).unique()) == 1
+    assert len(colour_clusters(colours, 3).unique()) == 2

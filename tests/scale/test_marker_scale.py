@@ -11,7 +11,7 @@ from PIL import Image
 import pimper_torch as pt
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.cli.options import bundled_photographs
-from pimper_torch.geometry.opencv import shrunk, warped
+from pimper_torch.geometry.opencv import area_resized, warped
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.scale import marker_scale
 from pimper_torch.scale.aruco import find_squares
@@ -59,7 +59,7 @@ def photographed(picture, cameras, paper="a4"):
         large = (FINE * WIDTH, FINE * HEIGHT)
         seen = warped(picture, torch.linalg.inv(pixels_from_picture), large)
         linear = (0.01 + 0.6 * seen).nan_to_num(nan=0.1)
-        images.append(shrunk(linear[None], WIDTH, HEIGHT).expand(3, -1, -1))
+        images.append(area_resized(linear[None], WIDTH, HEIGHT).expand(3, -1, -1))
     return torch.stack(images)
 
 

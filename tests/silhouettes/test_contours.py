@@ -4,7 +4,7 @@ from functools import partial
 import pytest
 import torch
 
-from pimper_torch.geometry.visual_hull import bounding_box
+from pimper_torch.geometry.visual_hull import bounding_cube
 from pimper_torch.runtime.errors import PimperWarning
 from pimper_torch.stages.silhouettes import trace
 from pimper_torch.stages.silhouettes.trace import TraceContours
@@ -20,7 +20,7 @@ def coarse_voxels(monkeypatch):
 
 @pytest.mark.parametrize("shape", [ball, two_balls])
 def test_the_box_of_silhouettes_is_tight(cameras, shape):
-    low, high = bounding_box(silhouettes_of(shape, cameras), cameras)
+    low, high = bounding_cube(silhouettes_of(shape, cameras), cameras)
     assert (low < -1.1).all()
     assert (high > 1.1).all()
     assert (high - low).max() < 2 * 2.4

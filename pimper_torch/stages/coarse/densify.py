@@ -135,7 +135,7 @@ def _search(
     if before is None:
         field, _ = _full_range(matcher, pixels, values, blank, step)
     else:
-        field = filled(before, view)
+        field = filled_inverse_depths(before, view)
         field = interpolate(field[None, None], blank.shape, mode="bilinear", align_corners=False)
         field, _ = _near(matcher, field[0, 0], step)
     offsets = [_LAST_STEP * step * rank for rank in (-2, -1, 0, 1, 2)]
@@ -254,7 +254,7 @@ def count_agreeing(
     return count
 
 
-def filled(maps: DepthMaps, view: int) -> Map:
+def filled_inverse_depths(maps: DepthMaps, view: int) -> Map:
     """Return a view's inverse depths, filled where they are not valid.
 
     First by the nearest of its sources' points, then smoothly from the neighbours.

@@ -27,8 +27,8 @@ from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view, each, zeros
 from pimper_torch.stages.coarse import oriented, trim
-from pimper_torch.stages.coarse.densify import factors
-from pimper_torch.stages.coarse.window_matching import level_of
+from pimper_torch.stages.coarse.densify import DepthMaps, factors
+from pimper_torch.stages.coarse.window_matching import MatchingLevel, level_of
 
 # In pixels of the finest depth maps, at the cloud's median depth. Largest distance of points and
 # surface outside the visual hull; largest distance of a face to the points or contour points that
@@ -84,22 +84,9 @@ def fine_surface(
     Raises:
         ReconstructionError: Silhouettes and photographs support no surface.
     """
-    crop = cropped(scene, contours.silhouettes)
-    centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
-    cloud, maps = oriented.no_points(centre), None
-    if len(reliable) >= 16 or not contours.confine:
-        matched, maps, pixel = oriented.matched_cloud(crop, reliable, levels)
-        near = contours.hull.depth_of(matched.points_world) > -TOLERANCE_PX * pixel
-        leave_out("coarse.matched", ~near, at=matched.points_world)
-        cloud = matched.take(near)
-        level = maps.level
-    else:
-        factor = factors(max(crop.views.images.shape[-2:]), levels)[-1]
-        distance = (scene.cameras.centers_world - centre).norm(dim=1)
-        pixel = factor * float((distance / scene.cameras.intrinsics[:, 0, 0]).median())
-        level = level_of(crop, factor)
+    cloud, maps, level, pixel = _matched(scene, reliable, contours, levels)
     if more is not None:
-        cloud = OrientedPoints.cat([cloud, oriented.thinned(more, pixel)])
+        cloud = OrientedPoints.cat([cloud, oriented.grid_averaged(more, pixel)])
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
     reach = REACH_PX * pixel
     counts = trim.view_counts(vertices, faces, level, maps, cloud.points_world, reach)
@@ -124,6 +111,26 @@ def fine_surface(
     return FineSurface(
         vertices_world=vertices[used], faces=faces, support=support[kept], pixel=pixel
     )
+
+
+def _matched(
+    scene: SparseScene, reliable: Int[Tensor, " reliable"], contours: Contours, levels: int
+) -> tuple[OrientedPoints, DepthMaps | None, MatchingLevel, float]:
+    """Return matched points in the hull, depth maps and their level, and the size of a pixel.
+
+    An object without texture has no points and no depth maps.
+    """
+    crop = cropped(scene, contours.silhouettes)
+    if len(reliable) >= 16 or not contours.confine:
+        matched, maps, pixel = oriented.matched_cloud(crop, reliable, levels)
+        near = contours.hull.depth_of(matched.points_world) > -TOLERANCE_PX * pixel
+        leave_out("coarse.matched", ~near, at=matched.points_world)
+        return matched.take(near), maps, maps.level, pixel
+    centre = contours.hull.corners_world.mean(dim=0).to(scene.points_world)
+    factor = factors(max(crop.views.images.shape[-2:]), levels)[-1]
+    distance = (scene.cameras.centers_world - centre).norm(dim=1)
+    pixel = factor * float((distance / scene.cameras.intrinsics[:, 0, 0]).median())
+    return oriented.no_points(centre), None, level_of(crop, factor), pixel
 
 
 def closed_surface(

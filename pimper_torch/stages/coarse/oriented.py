@@ -176,7 +176,7 @@ def count_contradictions(maps: DepthMaps, view: int, points: Points) -> Int[Tens
     return count
 
 
-def thinned(cloud: OrientedPoints, cell: float) -> OrientedPoints:
+def grid_averaged(cloud: OrientedPoints, cell: float) -> OrientedPoints:
     """Average the points in each grid cell that face the same way.
 
     Noisy points share larger cells, up to eight times as wide, so a surface through them is smooth.
@@ -315,7 +315,7 @@ def matched_cloud(
     maps = depth_maps(scene, reliable, levels)
     pixel = pixel_size(scene, reliable) * maps[-1].factor
     # The coarsest windows of three extend beyond contours: they only initialize the finer ones.
-    dense = refit_normals(thinned(oriented_points(maps[-2:]), pixel))
+    dense = refit_normals(grid_averaged(oriented_points(maps[-2:]), pixel))
     cloud = OrientedPoints.cat([dense, sparse_oriented(scene, reliable, dense, 3 * pixel)])
     return cloud, maps[-1], pixel
 

@@ -84,8 +84,7 @@ def remesh(
         seen: True for facets that have data even if the surface has no support there.
 
     Returns:
-        The new mesh. Its normals are the piecewise linear fit to the surface's; for points of the
-        cloud see :func:`~pimper_torch.stages.coarse.splitting.with_points`. Unused vertices are
+        The new mesh. Its normals are the piecewise linear fit to the surface's. Unused vertices are
         dropped, and parts of the mesh that are joined only at a vertex get a copy of it each.
 
     If the surface has no support at all, no facet is dropped. Differentiable: vertices and normals,
@@ -104,13 +103,7 @@ def remesh(
     with torch.no_grad():
         kept = _with_data(old, faces, surface, seen, config.max_hole)
         leave_out("remesh.data", ~kept, at=(old, faces))
-        severity = plane_deviations(corners, faces, surface) / (config.max_departure * spacing)
-        spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
-        severity = torch.maximum(severity, spread.to(severity))
-        if residual is not None:
-            typical = residual.nanmedian()
-            relative = residual / torch.where(typical > 0, typical, torch.inf) / 3.0
-            severity = torch.maximum(severity, relative.nan_to_num(nan=0.0).to(severity))
+        severity = _severities(corners, faces, surface, residual, spacing, config)
         # Side of the equilateral triangle of each facet's area.
         side = (2 / 3**0.5 * face_normals(corners, faces).norm(dim=1)).sqrt() / spacing
         small = (side < config.min_samples) | ~kept
@@ -125,7 +118,7 @@ def remesh(
     index[child_kept] = torch.arange(int(child_kept.sum()), device=faces.device)
     mesh = Mesh(vertices_world=positions[source], faces=new_faces)
     mesh = mesh.replace(normals_world=splitting.fitted_normals(mesh, surface, split, index))
-    return splitting.with_points(coarse, mesh, split, index, source)
+    return splitting.with_relocated_points(coarse, mesh, split, index)
 
 
 def _on_surface(
@@ -179,6 +172,25 @@ def _with_data(
         return ~data
     area = face_normals(vertices, faces).norm(dim=1) / 2
     return data | enclosed_holes(vertices, faces, data, max_hole * float(total(area)))
+
+
+def _severities(
+    vertices: Vertices,
+    faces: Faces,
+    surface: Surface,
+    residual: PerFacet | None,
+    spacing: float,
+    config: RemeshConfig,
+) -> Float[Tensor, " face"]:
+    """Return how much facets deviate from the surface; those above 1 are split."""
+    severity = plane_deviations(vertices, faces, surface) / (config.max_departure * spacing)
+    spread = torch.rad2deg(normal_spreads(len(faces), surface)) / config.max_spread_deg
+    severity = torch.maximum(severity, spread.to(severity))
+    if residual is None:
+        return severity
+    typical = residual.nanmedian()
+    relative = residual / torch.where(typical > 0, typical, torch.inf) / 3.0
+    return torch.maximum(severity, relative.nan_to_num(nan=0.0).to(severity))
 
 
 def plane_deviations(vertices: Vertices, faces: Faces, surface: Surface) -> Float[Tensor, " face"]:

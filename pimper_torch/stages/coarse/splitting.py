@@ -199,47 +199,20 @@ def fitted_normals(mesh: Mesh, surface: Surface, split: Split, index: Children) 
     return normalize(torch.where(facing, fitted, initial), dim=1).to(mesh.vertices_world)
 
 
-def with_points(
-    coarse: CoarseMesh, mesh: Mesh, split: Split, index: Children, source: Int[Tensor, " vertex"]
+def with_relocated_points(
+    coarse: CoarseMesh, mesh: Mesh, split: Split, index: Children
 ) -> CoarseMesh:
     """Return the coarse mesh of a new mesh, with the cloud's points and support of its facets.
 
-    A vertex that was a point of the cloud and has moved becomes a free vertex. The point becomes
-    one on a facet, with its position and covariance unchanged.
-
-    Args:
-        source: Old vertex that each vertex is a copy of; indices of new vertices follow.
+    No vertex is a point of the cloud, as all have moved.
     """
-    old, points, covariance = coarse.mesh.vertices_world, coarse.points, coarse.covariance_world
-    origin = source.clamp_max(len(old) - 1)
-    was_point = (source < len(old)) & coarse.is_point[origin]
-    is_point = was_point & (mesh.vertices_world == old[origin]).all(dim=1)
-    if points is not None:
-        points = _relocated(coarse, points, split, index)
-    if covariance is not None:
-        (freed,) = torch.nonzero(was_point & ~is_point, as_tuple=True)
-        first = torch.ones_like(freed, dtype=torch.bool)  # copies of a vertex leave one point
-        first[1:] = origin[freed][1:] != origin[freed][:-1]
-        freed = freed[first]
-        first_face = mesh.faces.new_full((len(source),), len(mesh.faces)).scatter_reduce(
-            0,
-            mesh.faces.flatten(),
-            torch.arange(len(mesh.faces), device=source.device).repeat_interleave(3),
-            "amin",
-        )
-        moved = FacetPoints(
-            points_world=old[origin[freed]],
-            covariance_world=covariance[origin[freed]],
-            facet=first_face[freed],
-        )
-        points = moved if points is None else FacetPoints.cat([points, moved])
-        covariance = torch.where(is_point[:, None, None], covariance[origin], 0)
+    points, covariance, vertices = coarse.points, coarse.covariance_world, mesh.vertices_world
     return CoarseMesh(
         mesh=mesh,
         reference=coarse.reference,
-        is_point=is_point,
-        covariance_world=covariance,
-        points=points,
+        is_point=torch.zeros_like(vertices[:, 0], dtype=torch.bool),
+        covariance_world=None if covariance is None else covariance.new_zeros(len(vertices), 3, 3),
+        points=None if points is None else _relocated(coarse, points, split, index),
         support=None if coarse.support is None else coarse.support[split.parent[index >= 0]],
     )
 

@@ -19,7 +19,7 @@ from torch.nn.utils.rnn import pad_sequence
 from pimper_torch.geometry.height_fields import intersect_height_field, sample_raster
 from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.subdivision import Subdivision
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import carried_normals, face_normals
 from pimper_torch.linalg.sums import sum_at
 from pimper_torch.records import (
     CoarseMesh,
@@ -31,7 +31,7 @@ from pimper_torch.records import (
     Record,
     Templates,
 )
-from pimper_torch.records.shapes import PerVertex, VertexMask, Vertices
+from pimper_torch.records.shapes import PatchRaster, PatchVectors, PerVertex, VertexMask, Vertices
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import recomputed
 from pimper_torch.runtime.parallel import side_by_side
@@ -84,11 +84,8 @@ class Blend(Record):
 
 def ray_directions(subdivision: Subdivision, coarse: CoarseMesh) -> Vertices:
     """Return unit ray directions: interpolated smooth normals of the coarse mesh, world."""
-    mesh = coarse.mesh
-    normals = mesh.normals_world
-    if normals is None:
-        normals = vertex_normals(mesh.vertices_world, mesh.faces)
-    return normalize(subdivision.interpolate(normals, mesh.faces), dim=-1)
+    smooth = subdivision.interpolate(carried_normals(coarse.mesh), coarse.mesh.faces)
+    return normalize(smooth, dim=-1)
 
 
 def vertex_spacing(patches: PatchSet, samples_per_vertex: float) -> Float[Tensor, " facet"]:
@@ -199,25 +196,20 @@ def _estimates(
     xy = points[..., :2]
     raster = templates.origin, templates.spacing
     valid, observed = photometry.valid, photometry.observed
-    normals_world = photometry.normals_patch @ templates.patch_from_world[:, None, :3, :3]
-    information = photometry.information[..., None]
-    layers = torch.cat([information, information * normals_world], dim=-1)
-    normal = sample_raster(layers.movedim(-1, 1), xy, *raster, valid=valid)
+    layers = _weighted_normals(photometry.normals_patch, photometry.information, templates)
+    normal = sample_raster(layers, xy, *raster, valid=valid)
     masks = torch.stack([valid, observed], dim=-1).to(layers)
     layers = torch.cat([masks, photometry.albedo], dim=-1)
     known, albedo = sample_raster(layers.movedim(-1, 1), xy, *raster).tensor_split([1], dim=1)
     offset = normal.new_zeros(normal.shape[0], 2, normal.shape[2])
     if swept is not None:
-        layers = torch.stack([swept.information, swept.information * swept.offset], dim=1)
-        offset = sample_raster(layers, xy, *raster)
+        offset = sample_raster(_weighted_offsets(swept.offset, swept.information), xy, *raster)
     prior_normal, prior_offset = torch.zeros_like(normal), torch.zeros_like(offset)
     if swept is not None and swept.priors is not None:
         priors = swept.priors
-        information, offset_information = priors.normal_information, priors.offset_information
-        prior_normals = priors.normals_patch @ templates.patch_from_world[:, None, :3, :3]
-        layers = torch.cat([information[..., None], information[..., None] * prior_normals], dim=-1)
-        prior_normal = sample_raster(layers.movedim(-1, 1), xy, *raster)
-        layers = torch.stack([offset_information, offset_information * priors.offset], dim=1)
+        layers = _weighted_normals(priors.normals_patch, priors.normal_information, templates)
+        prior_normal = sample_raster(layers, xy, *raster)
+        layers = _weighted_offsets(priors.offset, priors.offset_information)
         prior_offset = sample_raster(layers, xy, *raster)
     return _Estimates(
         vertex=vertex[hits],
@@ -231,6 +223,22 @@ def _estimates(
         prior_normal=prior_normal.movedim(1, -1)[hits],
         prior_offset=prior_offset.movedim(1, -1)[hits],
     )
+
+
+def _weighted_normals(
+    normals_patch: PatchVectors, information: PatchRaster, templates: Templates
+) -> Float[Tensor, "patch 4 height width"]:
+    """Return layers of information, and of world normals multiplied by it."""
+    normals_world = normals_patch @ templates.patch_from_world[:, None, :3, :3]
+    layers = torch.cat([information[..., None], information[..., None] * normals_world], dim=-1)
+    return layers.movedim(-1, 1)
+
+
+def _weighted_offsets(
+    offset: PatchRaster, information: PatchRaster
+) -> Float[Tensor, "patch 2 height width"]:
+    """Return layers of information, and of offsets multiplied by it."""
+    return torch.stack([information, information * offset], dim=1)
 
 
 def _bands(

@@ -155,7 +155,7 @@ def pooled(samples: Iterable[Mapping[Key, tuple[int, Scalar]]]) -> Typical:
     return {key: value / count[key] for key, value in total.items()}
 
 
-def parts_of(full: Subdivision, mesh: Mesh, most: float) -> list[Bool[Tensor, " facet"]]:
+def partitioned(full: Subdivision, mesh: Mesh, most: float) -> list[Bool[Tensor, " facet"]]:
     """Return parts of the facets, halved across their longest side until blocks are small enough.
 
     Args:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import ContourPoints, FacetPoints, Record
 from pimper_torch.records.shapes import (
     Edges,
@@ -50,7 +50,7 @@ class Equations(Record):
     """Equations of one kind.
 
     Attributes:
-        unknowns: Vertices of the heights in each equation.
+        unknowns: Vertices of the heights in each equation; two in those of slopes.
         targets: Right-hand sides.
         information: Inverse variance of the target, as its source states. If neighbours share an
             error, the variance is enlarged, so that their weight together is not too large.
@@ -64,6 +64,11 @@ class Equations(Record):
     information: Float[Tensor, " equation"]
     correlated: Float[Tensor, " equation"]
     evaluated: bool = True
+
+    @property
+    def is_slope(self) -> bool:
+        """Whether the equations are of slopes, and do not determine positions."""
+        return self.unknowns.shape[1] == 2
 
     def residual(self, heights: PerVertex) -> Float[Tensor, " equation"]:
         """Return the residuals, targets minus sums."""
@@ -111,7 +116,7 @@ def slopes(
     )
 
 
-def upright(edges: Edges, directions: Vertices, normals: Vertices) -> Bool[Tensor, " edge"]:
+def upright_edges(edges: Edges, directions: Vertices, normals: Vertices) -> Bool[Tensor, " edge"]:
     """Return the edges whose slope can follow from heights.
 
     Other edges cross a contour or a fold as seen along the directions: an equal change of height at
@@ -282,11 +287,8 @@ def passing(contacts: SurfacePoints, surface: BaseSurface, caster: RayCaster) ->
     # Intersection of the line through each point with the nearer of the faces on both sides.
     ahead, behind = caster.cast(points, line), caster.cast(points, -line)
     first = ahead.distance <= behind.distance
-    hits = Hits(
-        face=torch.where(first, ahead.face, behind.face),
-        distance=torch.where(first, ahead.distance, -behind.distance),
-        barycentric=torch.where(first[:, None], ahead.barycentric, behind.barycentric),
-    ).refined(surface.points, surface.faces, points, line)
+    hits = ahead.where(first, behind.replace(distance=-behind.distance))
+    hits = hits.refined(surface.points, surface.faces, points, line)
     lift = -hits.distance
     hit = (hits.face >= 0) & (lift.abs() <= surface.reach)
     corners, fraction, line = surface.faces[hits.face[hit]], hits.barycentric[hit], line[hit]

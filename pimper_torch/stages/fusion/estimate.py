@@ -136,7 +136,7 @@ def fuse_like(fused: FusedHeights, kinds: Sequence[Equations], start: PerVertex)
     no solution, the heights are those of the previous solve.
     """
     factors = tuple(
-        factor.clamp_max(1) if kind.unknowns.shape[1] == 1 else factor.clamp_min(1)
+        factor.clamp_min(1) if kind.is_slope else factor.clamp_max(1)
         for kind, factor in zip(kinds, fused.factors, strict=True)
     )
     heights = fused.heights

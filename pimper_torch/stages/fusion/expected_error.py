@@ -119,7 +119,7 @@ def _noise(
     if kind.evaluated:
         common = ((kind.correlated.double() - 1) / (count - 1).clamp_min(1)).clamp(0, 1)
     num_regions = int(region.max()) + 1
-    if kind.unknowns.shape[1] == 2:
+    if kind.is_slope:
         start, end = kind.unknowns.unbind(dim=1)
         along = normalize((subdivision.points[end] - subdivision.points[start]).double(), dim=-1)
         tilt = _normal(generator, variance.new_empty(num_regions, 3))

@@ -5,19 +5,18 @@ estimated on a coarser subdivision; then the heights are solved for at full size
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.subdivision import Subdivision, transferred
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.kernels.compile import SURFACE
 from pimper_torch.linalg.continuation import about_mean, enclosed
 from pimper_torch.linalg.sums import average
@@ -28,23 +27,22 @@ from pimper_torch.runtime.failures import solved_or
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.stages.fusion import blocks
+from pimper_torch.stages.fusion.assembly import Assembly
 from pimper_torch.stages.fusion.blend import Blend, ray_directions
 from pimper_torch.stages.fusion.detail import spacing_of
-from pimper_torch.stages.fusion.equations import Equations
 from pimper_torch.stages.fusion.estimate import FusedHeights, fuse_like, fuse_terms
 from pimper_torch.stages.fusion.expected_error import expected_error
 from pimper_torch.stages.fusion.fuse_config import FuseConfig
 from pimper_torch.stages.fusion.normal_bias import NormalBias, PiecewiseLinearFit, normal_bias
-from pimper_torch.stages.fusion.problem import FINEST, Problem, build_problem, subdivide_facets
+from pimper_torch.stages.fusion.problem import FINEST, build_problem, subdivide_facets
 from pimper_torch.stages.fusion.terms import (
     ROTATION,
     SLOPES,
     TERMS,
     Normals,
-    PointTerm,
     Term,
     own_slope_variance,
-    rotation,
+    rotation_variance,
 )
 from pimper_torch.stages.stage import Stage
 
@@ -127,9 +125,8 @@ class Fuse(Stage):
         spacing = spacing_of(swept, config.samples_per_vertex, config.max_lost)
         problem = build_problem(swept, subdivide_facets(swept, _COARSER * spacing), self._lit)
         terms = tuple(term.bound(problem, contours) for term in self._terms)
-        problem = _sloped(problem, terms)
         several = _COARSER**2 * len(problem.points) > most
-        shared = self._shared(problem, terms, expected, several)
+        shared = self._shared(Assembly.of(terms, problem), expected, several)
         del problem
         release_memory()
         subdivision = subdivide_facets(swept, spacing).subdivision
@@ -173,7 +170,7 @@ class Fuse(Stage):
         parts = [torch.ones_like(mesh.faces[:, 0], dtype=torch.bool)]
         typical: blocks.Typical = {}
         if coarse.detail is not None:
-            parts = blocks.parts_of(full, mesh, most)
+            parts = blocks.partitioned(full, mesh, most)
             two = parts[:: math.ceil(len(parts) / 2)]  # enough for estimates of the noise
             noise = (self._noise(swept, full, mask, shared) for mask in two)
             typical = {**coarse.typical, **coarse.noise, **blocks.pooled(noise)}
@@ -181,8 +178,9 @@ class Fuse(Stage):
         values = full.points.new_zeros(len(full.points), 1 + channels, dtype=torch.float64)
         blends, owned = [], []
         for mask in parts:
-            problem = self._build(swept, full, mask, shared, typical)
-            heights = self._solve(problem, shared)
+            assembly = self._assembled(swept, full, mask, shared, typical)
+            problem, heights = assembly.problem, self._solve(assembly, shared)
+            del assembly
             release_memory()
             blend, block = problem.blend, problem.block
             albedo = about_mean(blend.albedo, blend.observed, problem.edges)
@@ -195,33 +193,30 @@ class Fuse(Stage):
         joined = Blend.cat(blends).take(torch.cat(owned).argsort())
         return joined, values[:, 0].to(joined.heights), values[:, 1:].to(joined.albedo)
 
-    def _build(
+    def _assembled(
         self,
         swept: SweptPatches,
         full: Subdivision,
         mask: Bool[Tensor, " facet"],
         shared: _Shared,
         typical: blocks.Typical,
-    ) -> Problem:
-        """Return the problem of a block of facets, with corrected normals."""
+    ) -> Assembly:
+        """Return the terms of a block of facets, with corrected normals."""
         block = blocks.block_of(full, swept.patches.coarse.mesh.faces, mask, shared.coarse)
-        problem = build_problem(swept, block, self._lit)
-        problem = _sloped(problem.replace(typical=typical), shared.terms)
-        release_memory()
-        if shared.tilt is None:
-            return problem
-        tilt = shared.tilt.at(problem.subdivision, problem.facets)
-        return problem.replace(photometric=normalize(problem.photometric + tilt, dim=-1))
+        problem = build_problem(swept, block, self._lit).replace(typical=typical)
+        if shared.tilt is not None:
+            tilt = shared.tilt.at(problem.subdivision, problem.facets)
+            problem = problem.replace(photometric=normalize(problem.photometric + tilt, dim=-1))
+        return Assembly.of(shared.terms, problem)
 
     def _noise(
         self, swept: SweptPatches, full: Subdivision, mask: Bool[Tensor, " facet"], shared: _Shared
     ) -> dict[blocks.Key, tuple[int, Scalar]]:
         """Return the noise factors of a block, each with its number of equations."""
-        problem = self._build(swept, full, mask, shared, shared.coarse.typical)
-        assembled = _AssembledTerms.of(shared.terms, problem)
-        fused = self._fused(problem, assembled)
-        counts = [len(kind.targets) for kind in fused.kinds]
-        return dict(zip(assembled.keys, zip(counts, fused.factors, strict=True), strict=True))
+        assembly = self._assembled(swept, full, mask, shared, shared.coarse.typical)
+        counts = [len(kind.targets) for kind in assembly.equations]
+        factors = self._fused(assembly).factors
+        return dict(zip(assembly.keys, zip(counts, factors, strict=True), strict=True))
 
     @property
     def _lit(self) -> bool:
@@ -231,9 +226,7 @@ class Fuse(Stage):
     def _terms(self) -> tuple[Term, ...]:
         return tuple(cast("Term", term) for term in self.terms)
 
-    def _shared(
-        self, problem: Problem, terms: tuple[Term, ...], expected: bool, several: bool
-    ) -> _Shared:
+    def _shared(self, assembly: Assembly, expected: bool, several: bool) -> _Shared:
         """Return the errors that a facet shares, and the expected error of the heights.
 
         Normals and positions are estimated from each other, alternately.
@@ -241,67 +234,55 @@ class Fuse(Stage):
         Args:
             several: Whether there are several blocks, which need the heights.
         """
+        problem = assembly.problem
         subdivision, facets, known = problem.subdivision, problem.facets, problem.known
-        assembled = _AssembledTerms.of(terms, problem)
-        trusted = assembled.equations(lambda term: term.position and not term.biased)
-        biased = assembled.equations(lambda term: term.biased)
+        trusted = [kind for kind in assembly.of_ranks(0, 0).equations if not kind.is_slope]
+        evidence = trusted or assembly.of_ranks(1, 2).equations
         normals, shape = problem.photometric, problem.normals
-        if (
-            self.config.bias_iterations == 0
-            or not bool(problem.lit.any())
-            or not (trusted or biased)
-        ):
+        if self.config.bias_iterations == 0 or not bool(problem.lit.any()) or not evidence:
             return _Shared(
                 tilt=None,
                 tilt_variance=normals.new_zeros(()),
-                terms=terms,
-                coarse=self._coarse(problem, assembled, expected, several),
+                terms=assembly.terms,
+                coarse=self._coarse(assembly, expected, several),
             )
-
-        def unreliable(term: Term) -> bool:
-            return term.biased if trusted else term.guessed
-
+        rank = 0 if trusted else 1
         # First evaluated against the other terms, as their error would bias these.
-        used = assembled.without(unreliable)
-        vertex = torch.cat(
-            [kind.unknowns[:, 0] for kind in trusted or biased] or [problem.edges.new_zeros(0)]
-        )
+        used = assembly.of_ranks(0, rank)
+        vertex = torch.cat([kind.unknowns[:, 0] for kind in evidence])
         for _ in range(self.config.bias_iterations):
             tilt = normal_bias(subdivision, facets, normals, shape, known)
-            tilted = problem.replace(tilt_variance=tilt.variance())
-            fused = self._fused(problem, used.reassemble(tilted))
+            fused = self._fused(used.with_normals(tilt_variance=tilt.variance()))
             moved = fused.heights.to(problem.points)[:, None] * problem.directions
             shape = vertex_normals(subdivision.points + moved, subdivision.faces)
-            assembled, problem = assembled.reestimate(problem, fused.heights, vertex, unreliable)
-            used = assembled
+            used = assembly = assembly.reestimate(fused.heights, vertex, rank)
         tilt = normal_bias(subdivision, facets, normals, shape, known)
         normals = normalize(normals + tilt.at(subdivision, facets), dim=-1)
         variance = normal_bias(subdivision, facets, normals, shape, known).variance()
-        straight = problem.replace(photometric=normals)
+        straight = assembly.with_normals(photometric=normals)
         return _Shared(
             tilt=tilt,
             tilt_variance=variance,
-            terms=assembled.terms,
-            coarse=self._coarse(straight, assembled, expected, several, variance),
+            terms=assembly.terms,
+            coarse=self._coarse(straight, expected, several, variance),
         )
 
     def _coarse(
         self,
-        problem: Problem,
-        assembled: "_AssembledTerms",
+        assembly: Assembly,
         expected: bool,
         several: bool,
         tilt_variance: Scalar | None = None,
     ) -> blocks.Coarse:
         """Return the needed values of the coarser problem's solution."""
-        subdivision, facets, draws = problem.subdivision, problem.facets, self.config.error_draws
+        problem, draws = assembly.problem, self.config.error_draws
+        subdivision, facets = problem.subdivision, problem.facets
         coarse, expected = blocks.Coarse(subdivision=subdivision), expected and draws > 0
         if not (expected or several):
             return coarse
-        assembled = assembled.reassemble(problem)
-        independent = correlated = self._fused(problem, assembled)
+        independent = correlated = self._fused(assembly)
         if tilt_variance is not None:
-            common = assembled.reassemble(problem.replace(tilt_variance=tilt_variance)).equations()
+            common = assembly.with_normals(tilt_variance=tilt_variance).equations
             correlated = fuse_like(independent, common, problem.start_of_shape)
         if several:
             start, known = problem.start, problem.known
@@ -310,10 +291,11 @@ class Fuse(Stage):
                 detail=independent.heights - start,
                 shape=correlated.heights - start,
                 exposed=exposed.double(),
-                noise=dict(zip(assembled.keys, independent.factors, strict=True)),
+                noise=dict(zip(assembly.keys, independent.factors, strict=True)),
                 typical={
                     SLOPES: own_slope_variance(problem),
-                    ROTATION: rotation(problem) / _COARSER,  # shorter steps of a random walk
+                    ROTATION: rotation_variance(problem)
+                    / _COARSER,  # shorter steps of a random walk
                 },
             )
         if not expected:
@@ -328,18 +310,16 @@ class Fuse(Stage):
             )
         )
 
-    def _solve(self, problem: Problem, shared: _Shared) -> PerVertex:
+    def _solve(self, assembly: Assembly, shared: _Shared) -> PerVertex:
         """Return the heights at full size: detail of one solve, coarse shape of a second one.
 
         Noise is estimated again, as residuals may be larger on the coarser mesh.
         """
-        terms = _AssembledTerms.of(shared.terms, problem)
-        release_memory()
-        fused = self._fused(problem, terms)
+        problem, fused = assembly.problem, self._fused(assembly)
         detail = fused.heights
         if shared.tilt is None:
             return detail
-        common = terms.reassemble(problem.replace(tilt_variance=shared.tilt_variance)).equations()
+        common = assembly.with_normals(tilt_variance=shared.tilt_variance).equations
 
         def with_coarse_shape() -> PerVertex:
             shape = fuse_like(fused, common, problem.start_of_shape).heights
@@ -353,74 +333,9 @@ class Fuse(Stage):
             done="The surface has the coarse shape of independent errors",
         )
 
-    def _fused(self, problem: Problem, terms: "_AssembledTerms") -> FusedHeights:
-        typical, iterations = problem.typical, self.config.noise_iterations
-        unit = problem.spacing.new_ones((), dtype=torch.float64)
-        known = any(key in typical for key in terms.keys)
-        factors = [typical.get(key, unit) for key in terms.keys] if known else None
-        return fuse_terms(terms.equations(), problem.start, problem.damping, iterations, factors)
-
-
-@dataclass(frozen=True, slots=True)
-class _AssembledTerms:
-    """Terms and the equations of each."""
-
-    terms: tuple[Term, ...]
-    kinds: tuple[list[Equations], ...]
-
-    @classmethod
-    def of(cls, terms: tuple[Term, ...], problem: Problem) -> "_AssembledTerms":
-        """Assemble the equations of all terms; those of points share a ray caster."""
-        if any(isinstance(term, PointTerm) and term.contacts is not None for term in terms):
-            caster = RayCaster(problem.points, problem.subdivision.faces)
-            problem = problem.replace(caster=caster)
-        return cls(terms, tuple(term.equations(problem) for term in terms))
-
-    def equations(self, select: Callable[[Term], bool] = lambda _: True) -> list[Equations]:
-        """Return the equations of all terms, or of selected ones."""
-        pairs = zip(self.terms, self.kinds, strict=True)
-        return [kind for term, kinds in pairs if select(term) for kind in kinds]
-
-    @property
-    def keys(self) -> list[tuple[int, int]]:
-        """Indices of every kind: that of its term, and its own within the term."""
-        return [(term, kind) for term, kinds in enumerate(self.kinds) for kind in range(len(kinds))]
-
-    def without(self, exclude: Callable[[Term], bool]) -> "_AssembledTerms":
-        """Return all but the excluded terms."""
-        pairs = zip(self.terms, self.kinds, strict=True)
-        terms, kinds = zip(*(pair for pair in pairs if not exclude(pair[0])), strict=True)
-        return _AssembledTerms(terms, kinds)
-
-    def reassemble(self, problem: Problem) -> "_AssembledTerms":
-        """Return terms with the equations of tilted ones updated, for new normals or a new tilt."""
-        pairs = zip(self.terms, self.kinds, strict=True)
-        updated = (term.equations(problem) if term.tilted else kinds for term, kinds in pairs)
-        return _AssembledTerms(self.terms, tuple(updated))
-
-    def reestimate(
-        self,
-        problem: Problem,
-        heights: PerVertex,
-        trusted: Int[Tensor, " known"],
-        unreliable: Callable[[Term], bool],
-    ) -> tuple["_AssembledTerms", Problem]:
-        """Return terms and problem, with unreliable terms reestimated and residual ones updated."""
-        pairs = list(zip(self.terms, self.kinds, strict=True))
-        updated = [unreliable(term) and bool(kinds) for term, kinds in pairs]
-        terms = tuple(
-            term.reestimate(problem, heights, trusted) if new else term
-            for term, new in zip(self.terms, updated, strict=True)
-        )
-        if guessed := any(term.guessed and kinds for term, kinds in pairs):
-            problem = _sloped(problem, terms)
-        kinds = tuple(
-            term.equations(problem) if new or (guessed and term.residual) else old
-            for term, new, old in zip(terms, updated, self.kinds, strict=True)
-        )
-        return _AssembledTerms(terms, kinds), problem
-
-
-def _sloped(problem: Problem, terms: tuple[Term, ...]) -> Problem:
-    masks = [torch.zeros_like(problem.lit), *(term.sloped(problem) for term in terms)]
-    return problem.replace(sloped=torch.stack(masks).any(dim=0))
+    def _fused(self, assembly: Assembly) -> FusedHeights:
+        problem, keys, iterations = assembly.problem, assembly.keys, self.config.noise_iterations
+        typical, unit = problem.typical, problem.spacing.new_ones((), dtype=torch.float64)
+        known = any(key in typical for key in keys)
+        factors = [typical.get(key, unit) for key in keys] if known else None
+        return fuse_terms(assembly.equations, problem.start, problem.damping, iterations, factors)

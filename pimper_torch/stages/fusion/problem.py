@@ -9,13 +9,12 @@ from torch import Tensor
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import boundary_vertices, face_edges
-from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import DepthPatches, Depths, FacetPoints, Record, SweptPatches
 from pimper_torch.records.shapes import PerVertex, Scalar, VertexMask, Vertices
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.stages.fusion.blend import Blend, blend_patches, ray_directions, vertex_spacing
 from pimper_torch.stages.fusion.blocks import Block, Typical
-from pimper_torch.stages.fusion.equations import BaseSurface, upright
+from pimper_torch.stages.fusion.equations import BaseSurface, upright_edges
 
 # Least standard error of a point, in spacings: a choice, as the surface is flat between vertices.
 FINEST = 0.03
@@ -40,7 +39,6 @@ class Problem(Record):
         photometric: Photometric normals, with or without the tilt that facets share.
         tilt_variance: Variance of the tilt that the normals of a facet share, squared radians;
             ``None`` for independent errors.
-        caster: Ray caster of the surface, while equations that need it are assembled.
         block: This subdivision as a part of the full one.
         typical: Values estimated elsewhere, by all facets or by other blocks.
     """
@@ -62,7 +60,6 @@ class Problem(Record):
     photometric: Vertices
     block: Block
     tilt_variance: Scalar | None = None
-    caster: RayCaster | None = None
     typical: Typical = field(default_factory=dict)
 
     @property
@@ -133,7 +130,7 @@ def build_problem(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
     points = subdivision.points + blend.heights[:, None] * directions
     edges = face_edges(subdivision.faces)[0]
     known = blend.seen & slopes
-    lit = known[edges].all(dim=1) & upright(edges, directions, blend.normals_world)
+    lit = known[edges].all(dim=1) & upright_edges(edges, directions, blend.normals_world)
     return Problem(
         subdivision=subdivision,
         facets=patches.coarse.mesh.faces,

@@ -14,9 +14,10 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.contours import Contours
 from pimper_torch.geometry.surfaces import vertex_normals
-from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.geometry.visibility import ray_caster
 from pimper_torch.linalg.continuation import continued, enclosed
 from pimper_torch.linalg.sums import total
+from pimper_torch.records import Mesh
 from pimper_torch.records.shapes import PerVertex, Scalar
 from pimper_torch.stages.fusion import equations
 from pimper_torch.stages.fusion.equations import Equations, SurfacePoints
@@ -48,52 +49,58 @@ UNKNOWN_SLOPE_DEG = 6.0
 # 5.0 on the mug, 11.5 on the potatoes and 3.7 on the jar.
 UNMEASURED = 5.0
 
-# Names of the results of :func:`own_slope_variance` and :func:`rotation` among typical values.
+# Names of results of :func:`own_slope_variance` and :func:`rotation_variance` in typical values.
 SLOPES, ROTATION = "slopes", "rotation"
 
 
 class Term(nn.Module):
     """A kind of residuals of the vertices' heights.
 
-    A custom term overrides :meth:`equations`, and other methods and attributes as needed.
+    A custom term overrides :meth:`equations`, and the other methods as needed. The fusion calls the
+    methods of all terms in this order:
+
+    1. :meth:`bound`, once, on a coarser subdivision of all facets;
+    2. :meth:`sloped`, on the coarser subdivision;
+    3. :meth:`equations`, on the same;
+    4. :meth:`reestimate`, after every solve there, of terms whose :attr:`rank` is above 0;
+       :meth:`sloped` and :meth:`equations` of the terms that it returns;
+    5. :meth:`sloped` and :meth:`equations` at full size, for each block of facets.
 
     Attributes:
-        position: Whether it determines positions, from which the tilt that the normals of a facet
-            share is estimated.
-        biased: Whether its equations of a facet share an error, whose variance is estimated from
-            the other terms (:meth:`reestimate`).
-        guessed: Whether it is from the views' priors: terms from the photographs evaluate it.
-        residual: Whether it covers edges that other terms do not: its equations depend on
-            ``problem.sloped``.
-        tilted: Whether the normals of a facet share a tilt: its equations depend on
-            ``problem.tilt_variance``.
+        rank: 0 if the errors of its equations are independent. If equations of a facet share an
+            error, whose variance the terms of lower ranks determine: 1 if it is from the
+            photographs, 2 if it is from the views' priors. Without positions of rank 0 those of
+            rank 1 are trusted.
     """
 
-    position: ClassVar[bool] = False
-    biased: ClassVar[bool] = False
-    guessed: ClassVar[bool] = False
-    residual: ClassVar[bool] = False
-    tilted: ClassVar[bool] = False
+    rank: ClassVar[int] = 0
 
     def bound(self, problem: Problem, contours: Contours) -> "Term":
-        """Return the term with data that it computes once, on the coarser subdivision."""
+        """Return the term with data that it computes once, such as points on the surface."""
         del problem, contours
         return self
 
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
-        """Return the edges whose slope it determines; :class:`KeptSlopes` skips them."""
+        """Return the edges whose slope it determines; :class:`KeptSlopes` skips them.
+
+        ``problem.sloped`` has those of all terms in :meth:`equations`.
+        """
         return torch.zeros_like(problem.lit)
 
     def equations(self, problem: Problem) -> list[Equations]:
-        """Return equations of one or more kinds, with the variances stated by their source."""
+        """Return equations of one or more kinds, with the variances stated by their source.
+
+        Blocks share the noise factor of a kind by its place in the list. Equations of slopes have
+        two unknowns.
+        """
         raise NotImplementedError
 
     def reestimate(self, problem: Problem, heights: PerVertex, trusted: KnownVertices) -> "Term":
         """Return the term with the variance of its common errors.
 
         Args:
-            heights: Heights of the surface, from the other terms.
-            trusted: Vertices whose positions other terms determine.
+            heights: Heights of the surface, at first from terms of lower ranks, then from all.
+            trusted: Vertices whose positions terms of lower ranks determine.
         """
         del problem, heights, trusted
         return self
@@ -103,9 +110,9 @@ class Normals(Term):
     """Edges are perpendicular to the photometric normals at their ends.
 
     The variance is that of the normals. Without this term the fusion uses no photometric normals.
+    The fusion corrects the tilt that those of a facet share, and calls :meth:`equations` again for
+    ``problem.photometric`` and ``problem.tilt_variance``.
     """
-
-    tilted = True
 
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
         """Return the edges between two photometric normals."""
@@ -137,7 +144,7 @@ class SweptHeights(Term):
         variance: Variance of the error that the heights of a facet share, squared scene units.
     """
 
-    position, biased = True, True
+    rank = 1
 
     def __init__(self, variance: Scalar | None = None) -> None:
         super().__init__()
@@ -186,7 +193,7 @@ class PriorNormals(Term):
         variance: Variance of that tilt, squared radians; ``None`` if unknown.
     """
 
-    biased, guessed = True, True
+    rank = 2
 
     def __init__(self, variance: Scalar | None = None) -> None:
         super().__init__()
@@ -196,7 +203,9 @@ class PriorNormals(Term):
         """Return the edges between two prior normals."""
         known = problem.blend.prior_normal_information > 0
         along, normals = problem.directions, problem.blend.prior_normals_world
-        return known[problem.edges].all(dim=1) & equations.upright(problem.edges, along, normals)
+        return known[problem.edges].all(dim=1) & equations.upright_edges(
+            problem.edges, along, normals
+        )
 
     def sloped(self, problem: Problem) -> Bool[Tensor, " edge"]:
         """Return the edges between prior normals, if these are better than unmeasured slopes.
@@ -242,7 +251,7 @@ class PriorNormals(Term):
 class PriorDepths(SweptHeights):
     """Heights are those of the views' prior depths, with the variance of the prior."""
 
-    guessed = True
+    rank = 2
 
     def equations(self, problem: Problem) -> list[Equations]:
         """Return heights, if there are prior depths."""
@@ -255,8 +264,6 @@ class PriorDepths(SweptHeights):
 class CloudPoints(Term):
     """The surface passes through the points of the cloud, with their covariance."""
 
-    position = True
-
     def bound(self, problem: Problem, contours: Contours) -> Term:
         """Return the term of the points and the lines along which they are known."""
         del contours
@@ -266,8 +273,6 @@ class CloudPoints(Term):
 
 class TouchedRays(Term):
     """The surface is tangent to the rays through silhouettes, with the silhouettes' variance."""
-
-    position = True
 
     def bound(self, problem: Problem, contours: Contours) -> Term:
         """Return the term of the points where the rays touch the current surface."""
@@ -279,8 +284,6 @@ class TouchedRays(Term):
 class PointTerm(Term):
     """The surface passes through points; ``None`` for no points."""
 
-    position = True
-
     def __init__(self, contacts: SurfacePoints | None) -> None:
         super().__init__()
         self.contacts = contacts
@@ -289,10 +292,10 @@ class PointTerm(Term):
         """Return heights of the vertices nearest to the points."""
         if self.contacts is None:
             return []
-        caster = problem.caster or RayCaster(problem.points, problem.subdivision.faces)
+        mesh = Mesh(vertices_world=problem.points, faces=problem.subdivision.faces)
         # Where the object is thin, lines through points of other blocks intersect this one.
         contacts = self.contacts.take(problem.block.facets[self.contacts.facet])
-        return [equations.passing(contacts, problem.surface, caster)]
+        return [equations.passing(contacts, problem.surface, ray_caster(mesh))]
 
 
 class KeptSlopes(Term):
@@ -310,8 +313,6 @@ class KeptSlopes(Term):
         unknown_deg: Standard error of the slopes of a surface without any photometric normal.
     """
 
-    residual = True
-
     def __init__(self, unknown_deg: float = UNKNOWN_SLOPE_DEG) -> None:
         super().__init__()
         self.unknown_deg = unknown_deg
@@ -325,13 +326,15 @@ class KeptSlopes(Term):
         inpainted = enclosed(problem.known, problem.subdivision.faces, problem.border)
         normals = problem.blend.normals_world
         if bool(inpainted.any()):
-            damping = rotation(problem) / together
+            damping = rotation_variance(problem) / together
             normals = continued(normals, ~inpainted, edges, problem.normals, damping)
             normals = normalize(normals, dim=-1)
         free = ~problem.sloped
-        extended = free & inpainted[edges].any(dim=1) & equations.upright(edges, along, normals)
+        extended = (
+            free & inpainted[edges].any(dim=1) & equations.upright_edges(edges, along, normals)
+        )
         kept = free & ~extended
-        upright = kept & equations.upright(edges, along, problem.normals)
+        upright = kept & equations.upright_edges(edges, along, problem.normals)
         swept = (problem.blend.offset_information > 0)[edges].all(dim=1)
         windows = problem.correlated.to(start)
         return [
@@ -377,7 +380,7 @@ def slope_variance(information: PerVertex) -> PerVertex:
     return 0.5 / information.clamp(1 / high, 1 / low)
 
 
-def rotation(problem: Problem) -> Scalar:
+def rotation_variance(problem: Problem) -> Scalar:
     """Return the mean squared angle between normals along lit edges, clipped; squared radians."""
     if ROTATION in problem.typical:
         return problem.typical[ROTATION]

@@ -11,7 +11,7 @@ from pimper_torch.linalg.continuation import continued
 from pimper_torch.records import ClosedMesh, Mesh
 from pimper_torch.records.shapes import Faces, VertexValues
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.stages.meshing.faults import diagonal
+from pimper_torch.stages.meshing.faults import bounding_diagonal
 
 
 def closed(mesh: Mesh) -> ClosedMesh:
@@ -40,7 +40,7 @@ def closed(mesh: Mesh) -> ClosedMesh:
     added = torch.cat(caps)
     num_new = count - len(source)
 
-    extent = float(diagonal(mesh.vertices_world.detach()))
+    extent = float(bounding_diagonal(mesh.vertices_world.detach()))
 
     def extended(values: Tensor | None, filler: float) -> Tensor | None:
         if values is None:

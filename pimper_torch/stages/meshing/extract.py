@@ -12,7 +12,7 @@ from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.reporting import add_counts
 from pimper_torch.stages.meshing.borders import protruding
-from pimper_torch.stages.meshing.faults import diagonal, faults, small_groups
+from pimper_torch.stages.meshing.faults import bounding_diagonal, faults, small_groups
 from pimper_torch.stages.meshing.meshing_config import ExtractConfig
 from pimper_torch.stages.stage import Stage
 
@@ -52,13 +52,13 @@ class Extract(Stage):
         supported = surface.supported
         if not bool(supported.any()):
             supported = ~supported
-        max_hole = self.config.max_hole * diagonal(vertices)
+        max_hole = self.config.max_hole * bounding_diagonal(vertices)
         filled = small_groups(vertices, surface.faces, ~supported, max_hole)
         keep = (supported | filled)[surface.faces].all(dim=1)
         leave_out("extract.support", ~keep, at=(vertices, surface.faces))
         error, bound = surface.expected_error, self.config.max_expected_error
         if error is not None:
-            near = (error <= bound * diagonal(vertices))[surface.faces].all(dim=1)
+            near = (error <= bound * bounding_diagonal(vertices))[surface.faces].all(dim=1)
             leave_out("extract.expected_error", keep & ~near, at=(vertices, surface.faces))
             keep &= near
         with_support = int(keep.sum())

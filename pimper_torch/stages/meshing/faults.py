@@ -101,6 +101,6 @@ def small_groups(
     return among & small[label]
 
 
-def diagonal(vertices: Vertices) -> Scalar:
+def bounding_diagonal(vertices: Vertices) -> Scalar:
     """Return the diagonal of the points' bounding box."""
     return (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()

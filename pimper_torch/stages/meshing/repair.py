@@ -14,7 +14,7 @@ from pimper_torch.linalg.systems import solutions
 from pimper_torch.records import Surface
 from pimper_torch.records.shapes import FaceMask, Faces, Scalar, VertexMask, Vertices
 from pimper_torch.runtime.ledger import leave_out
-from pimper_torch.stages.meshing.faults import diagonal, faults, small_groups
+from pimper_torch.stages.meshing.faults import bounding_diagonal, faults, small_groups
 from pimper_torch.stages.stage import Stage
 
 
@@ -88,7 +88,7 @@ class Repair(Stage):
         before = vertices.detach()
         criteria = faults(before, faces, surface.facet, _MAX_STRETCH)
         local, used = criteria.part(surroundings(faces, criteria.broken(before), len(vertices)))
-        max_extent = _MAX_EXTENT * diagonal(before)
+        max_extent = _MAX_EXTENT * bounding_diagonal(before)
         positions, moving = repair(vertices[used], local.faces, local.broken, max_extent)
         vertices = vertices.index_copy(0, used, positions)
         moved = torch.zeros_like(surface.facet, dtype=torch.bool).index_put((used,), moving)
@@ -143,10 +143,8 @@ def repair(
 
 def surroundings(faces: Faces, broken: FaceMask, num_vertices: int) -> FaceMask:
     """Return the defective faces and all around them that :func:`repair` may need."""
-    near = broken
-    for _ in range(_RINGS + 3):  # two more rings clamp the plate, and one shows the border
-        near = topology.corners_of(faces, near, num_vertices)[faces].any(dim=1)
-    return near
+    # Two more rings clamp the plate, and one shows the border.
+    return topology.dilated(faces, broken, _RINGS + 3, num_vertices)
 
 
 def _components_with(faces: Faces, among: VertexMask, marked: VertexMask) -> VertexMask:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.surfaces import vertex_normals
+from pimper_torch.geometry.surfaces import carried_normals
 from pimper_torch.records import Mesh, Record
 from pimper_torch.runtime.parallel import side_by_side
 
@@ -63,8 +63,6 @@ def simplify(
             shaded without the vertices' normals.
         angle_deg: Largest angle between its normal and the surface's, interpolated from corners.
     """
-    from pimper_torch.kernels import decimation  # compiled when it is imported
-
     if len(mesh.faces) == 0:
         kept = torch.arange(len(mesh.vertices_world), device=mesh.faces.device)
         return Simplified(
@@ -76,38 +74,14 @@ def simplify(
             max_angle_deg=0.0,
         )
     vertices = mesh.vertices_world.detach().cpu().double()
-    normals = mesh.normals_world
-    if normals is None:
-        normals = vertex_normals(mesh.vertices_world, mesh.faces)
+    normals = carried_normals(mesh)
     sample = mesh.faces.cpu()[:: max(1, len(mesh.faces) // _EDGES)]
     spacing = float((vertices[sample[:, 0]] - vertices[sample[:, 1]]).norm(dim=1).median())
     points = _rows(vertices - vertices.mean(dim=0))
     faces = mesh.faces.to("cpu", torch.int32, copy=True).contiguous().numpy()
     channels = _rows(normals if values is None else torch.cat([normals, values.to(normals)], dim=1))
-    links = np.empty(len(points) + faces.size, np.int32)
-    lists = np.full(len(faces) + len(points), -1, np.int32)
-    off = np.tile(np.array([0, 1], np.float32), (len(points), 1))
     cosine = float(np.cos(np.radians(angle_deg)))
-    decimation.link_corners(faces, links)
-
-    # Slices are perpendicular to the mesh's longest side and have equal numbers of vertices.
-    along = points[:, np.ptp(points, axis=0).argmax()]
-    cuts = np.quantile(along, np.arange(1, _SLICES) / _SLICES)
-    labels = np.searchsorted(cuts, along).astype(np.int8)
-    corners = labels[faces]
-    between = np.zeros(len(points), bool)
-    between[faces[(corners != corners[:, :1]).any(axis=1)]] = True
-    candidates = ~between
-
-    def thin_out(free: np.ndarray) -> None:
-        arguments = (free, candidates, faces, links, lists, off)
-        decimation.decimate(points, channels, spacings * spacing, cosine, *arguments)
-
-    inner = [(labels == label) & ~between for label in range(_SLICES)]
-    list(side_by_side(thin_out, inner))
-    candidates |= between
-    thin_out(np.ones_like(between))
-
+    lists, off = _decimate(points, channels, faces, spacings * spacing, cosine)
     remaining = faces[:, 0] >= 0
     used, renumbered = np.unique(faces[remaining], return_inverse=True)
     kept = torch.from_numpy(used).long().to(mesh.faces.device)
@@ -120,6 +94,41 @@ def simplify(
         max_spacings=float(off[:, 0].max()) / spacing,
         max_angle_deg=float(np.degrees(np.arccos(min(1.0, float(off[:, 1].min()))))),
     )
+
+
+def _decimate(
+    points: np.ndarray, channels: np.ndarray, faces: np.ndarray, reach: float, cosine: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Collapse edges in place: removed faces become negative.
+
+    Returns:
+        Linked lists of the removed vertices of every face, and how far off each vertex is: its
+        distance, and the cosine between normals.
+    """
+    from pimper_torch.kernels import decimation  # compiled when it is imported
+
+    links = np.empty(len(points) + faces.size, np.int32)
+    lists = np.full(len(faces) + len(points), -1, np.int32)
+    off = np.tile(np.array([0, 1], np.float32), (len(points), 1))
+    decimation.link_corners(faces, links)
+    # Slices are perpendicular to the mesh's longest side and have equal numbers of vertices.
+    along = points[:, np.ptp(points, axis=0).argmax()]
+    cuts = np.quantile(along, np.arange(1, _SLICES) / _SLICES)
+    labels = np.searchsorted(cuts, along).astype(np.int8)
+    corners = labels[faces]
+    between = np.zeros(len(points), bool)
+    between[faces[(corners != corners[:, :1]).any(axis=1)]] = True
+    candidates = ~between
+
+    def thin_out(free: np.ndarray) -> None:
+        arguments = (free, candidates, faces, links, lists, off)
+        decimation.decimate(points, channels, reach, cosine, *arguments)
+
+    inner = [(labels == label) & ~between for label in range(_SLICES)]
+    list(side_by_side(thin_out, inner))
+    candidates |= between
+    thin_out(np.ones_like(between))
+    return lists, off
 
 
 def _nearest_faces(lists: np.ndarray, remaining: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.geometry.surfaces import barycentric_2d, face_normals, unit_face_normals
-from pimper_torch.records import Cameras, CoarseMesh, PatchSet, Surface, Templates
+from pimper_torch.records import Cameras, CoarseMesh, Mesh, PatchSet, Surface, Templates
 from pimper_torch.records.shapes import Faces, Pose, Scalar, Vertices, ViewMask
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.failures import skipped_patches
@@ -57,24 +57,12 @@ class Decompose(Stage):
             )
         patch_from_world = facet_frames(vertices, faces, cameras.cam_from_world[coarse.reference])
         corners = transform(patch_from_world, vertices[faces])[..., :2]
-        density = self.config.samples_per_pixel * scale
-        spacing = sample_spacing(vertices, cameras, coarse.reference, density)
-        area = face_normals(vertices, faces).norm(dim=-1) / 2
-        limit = self.config.num_views
         faced = views_facing(vertices, faces, cameras)
-        warped = (area * faced.clamp_max(limit)).sum()
-        spacing = torch.maximum(spacing, (warped / self.config.max_samples).sqrt())
-        enlarged = enlarge(corners, self.config.overlap_samples * spacing)
-        # The enlarged corner of a sliver is far away; no patch needs more than twice the overlap.
-        reach = 2 * self.config.overlap_samples * spacing
-        low = torch.maximum(enlarged.amin(dim=1), corners.amin(dim=1) - reach)
-        high = torch.minimum(enlarged.amax(dim=1), corners.amax(dim=1) + reach)
+        spacing = self._spacing(coarse, cameras, faced, scale)
+        overlap = self.config.overlap_samples * spacing
+        enlarged = enlarge(corners, overlap)
+        low, high = _extents(corners, enlarged, overlap)
         sides = ((high - low) / spacing).ceil().long() + 1
-        blocks = [
-            (torch.arange(len(faces), device=faces.device), faced.new_ones(cameras.num_views))
-        ]
-        if bool((faced > limit).any()):
-            blocks = view_blocks(coarse.mesh, cameras, spacing, limit)
 
         def templates(facets: Indices, raster: tuple[int, int], views: ViewMask) -> Templates:
             height, width = raster
@@ -93,15 +81,34 @@ class Decompose(Stage):
                 views=None if bool(views.all()) else views,
             )
 
+        most = self.config.bucket_entries
         buckets = tuple(
-            templates(block[facets], raster, views > 0)
-            for block, views in blocks
-            for facets, raster in group_by_size(
-                sides[block], max(1, self.config.bucket_entries // int(views.sum()))
-            )
+            templates(block[facets], raster, views)
+            for block, views in self._blocks(coarse.mesh, cameras, faced, spacing)
+            for facets, raster in group_by_size(sides[block], most // int(views.sum()))
         )
         patches = PatchSet(coarse=coarse, buckets=buckets)
         return patches if surface is None else transfer(patches, surface.mesh)
+
+    def _spacing(
+        self, coarse: CoarseMesh, cameras: Cameras, faced: Int[Tensor, " face"], scale: float
+    ) -> Scalar:
+        """Return the sample spacing with which views have at most the permitted samples."""
+        vertices, faces = coarse.mesh.vertices_world, coarse.mesh.faces
+        density = self.config.samples_per_pixel * scale
+        spacing = sample_spacing(vertices, cameras, coarse.reference, density)
+        area = face_normals(vertices, faces).norm(dim=-1) / 2
+        warped = (area * faced.clamp_max(self.config.num_views)).sum()
+        return torch.maximum(spacing, (warped / self.config.max_samples).sqrt())
+
+    def _blocks(
+        self, mesh: Mesh, cameras: Cameras, faced: Int[Tensor, " face"], spacing: Scalar
+    ) -> list[tuple[Indices, ViewMask]]:
+        """Return blocks of facets with their views, which are all if no facet has too many."""
+        if bool((faced > self.config.num_views).any()):
+            return view_blocks(mesh, cameras, spacing, self.config.num_views)
+        every = torch.arange(len(mesh.faces), device=faced.device)
+        return [(every, faced.new_ones(cameras.num_views, dtype=torch.bool))]
 
 
 def with_area(coarse: CoarseMesh) -> CoarseMesh:
@@ -174,6 +181,16 @@ def enlarge(corners: Float[Tensor, "patch 3 2"], distance: Scalar) -> Float[Tens
     inradius = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).abs() / perimeter
     scale = 1 + distance / inradius
     return incenter[:, None] + scale[:, None, None] * (corners - incenter[:, None])
+
+
+def _extents(
+    corners: Float[Tensor, "patch 3 2"], enlarged: Float[Tensor, "patch 3 2"], overlap: Scalar
+) -> tuple[Float[Tensor, "patch 2"], Float[Tensor, "patch 2"]]:
+    """Return the lowest and highest coordinates of enlarged triangles."""
+    # The enlarged corner of a sliver is far away; no patch needs more than twice the overlap.
+    low = torch.maximum(enlarged.amin(dim=1), corners.amin(dim=1) - 2 * overlap)
+    high = torch.minimum(enlarged.amax(dim=1), corners.amax(dim=1) + 2 * overlap)
+    return low, high
 
 
 def group_by_size(

@@ -58,14 +58,6 @@ def merged(
     offset = total / torch.where(precision > 0, precision, 1)
     determined = albedo[..., 1] > 0
     divisor = torch.where(determined, albedo[..., 1], 1)
-    rotated: Float[Tensor, "patch view 4"] | None = None
-    if lights is not None:
-        rotation = templates.patch_from_world[:, None].to(lights.lights)
-        if lights.frame == "camera":
-            rotation = rotation @ invert_rigid(cameras.cam_from_world).to(rotation)
-        ambient = lights.lights[:, :1].expand(*shape[:1], -1, 1)
-        vectors = (rotation[..., :3, :3] @ lights.lights[:, 1:, None])[..., 0]
-        rotated = torch.cat([ambient, vectors], dim=-1)
     return PatchPriors(
         normals_patch=normalize(vector, dim=-1),
         normal_information=_scattered(information, scatter, count),
@@ -74,9 +66,21 @@ def merged(
         albedo=albedo[..., 0] / divisor,
         albedo_variance=torch.where(determined, 1 / divisor, torch.inf),
         inlier=inlier,
-        lights_patch=rotated,
+        lights_patch=None if lights is None else _rotated(lights, cameras, templates),
         light_variance=None if lights is None else lights.variance.expand(shape[0], -1),
     )
+
+
+def _rotated(
+    prior: LightPrior, cameras: Cameras, templates: Templates
+) -> Float[Tensor, "patch view 4"]:
+    """Return the prior lights in the frames of patches."""
+    rotation = templates.patch_from_world[:, None].to(prior.lights)
+    if prior.frame == "camera":
+        rotation = rotation @ invert_rigid(cameras.cam_from_world).to(rotation)
+    ambient = prior.lights[:, :1].expand(len(rotation), -1, 1)
+    vectors = (rotation[..., :3, :3] @ prior.lights[:, 1:, None])[..., 0]
+    return torch.cat([ambient, vectors], dim=-1)
 
 
 def _scattered(information: Scalars, scatter: Scalars, count: Scalars) -> Scalars:

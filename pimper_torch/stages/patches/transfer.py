@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
-from pimper_torch.geometry.surfaces import face_normals, vertex_normals
+from pimper_torch.geometry.surfaces import carried_normals, face_normals
 from pimper_torch.geometry.visibility import Hits, RayCaster, ray_caster
 from pimper_torch.records import Mesh, PatchSet, Templates
 from pimper_torch.records.shapes import Vertices
@@ -26,10 +26,7 @@ def transfer(patches: PatchSet, surface: Mesh) -> PatchSet:
 
     Differentiable in the surface's vertices and normals and in the frames; hit faces are constant.
     """
-    normals = surface.normals_world
-    if normals is None:
-        normals = vertex_normals(surface.vertices_world, surface.faces)
-    caster = ray_caster(surface)
+    normals, caster = carried_normals(surface), ray_caster(surface)
 
     def transferred(templates: Templates) -> Templates:
         with torch.no_grad():
@@ -90,11 +87,4 @@ def _nearest(
 
     hit_below, hit_above = faces_outward(below), faces_outward(above)
     first = hit_below & (~hit_above | (below.distance <= above.distance))
-    return (
-        Hits(
-            face=torch.where(first, below.face, above.face),
-            distance=torch.where(first, below.distance, above.distance),
-            barycentric=torch.where(first[..., None], below.barycentric, above.barycentric),
-        ),
-        hit_below | hit_above,
-    )
+    return below.where(first, above), hit_below | hit_above

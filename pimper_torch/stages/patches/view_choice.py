@@ -41,7 +41,7 @@ def view_blocks(
         while waiting:
             block = waiting.pop()
             towards = exact.centers_world - centres[group[block]].mean(dim=0)
-            chosen = best_views(weight[block], normalize(towards, dim=1), count)
+            chosen = selected_views(weight[block], normalize(towards, dim=1), count)
             seen = weight[block] > 0
             possible = seen.sum(dim=1).clamp_max(count)
             fraction = seen[:, chosen].sum(dim=1)[possible > 0] / possible[possible > 0]
@@ -93,7 +93,7 @@ def view_weights(
     return weight.mT.contiguous()
 
 
-def best_views(weight: Weights, directions: ViewVectors, count: int) -> ViewMask:
+def selected_views(weight: Weights, directions: ViewVectors, count: int) -> ViewMask:
     r"""Return the views for a block of facets, selected one after the other.
 
     The next view is the one with the largest gain
@@ -112,7 +112,7 @@ def best_views(weight: Weights, directions: ViewVectors, count: int) -> ViewMask
 
     >>> front, side = [0.0, 0.0, -1.0], [0.6, 0.0, -0.8]
     >>> directions = torch.tensor([front, front, side])
-    >>> best_views(torch.tensor([[1.0, 0.9, 0.7]]), directions, 2)
+    >>> selected_views(torch.tensor([[1.0, 0.9, 0.7]]), directions, 2)
     tensor([ True, False,  True])
     """
     alike = torch.exp(4 * count * (directions @ directions.mT - 1))

@@ -14,11 +14,11 @@ from torch.nn.functional import interpolate, normalize
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.pyramids import (
     Sources,
+    build_pyramids,
     centers_in_patches,
     image_from_patch,
     kernel_geometry,
     look_up,
-    prepare,
     pyramid_level,
 )
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
@@ -180,9 +180,9 @@ class Warp(Stage):
 
         Args:
             patches: All patches, or a subset of buckets.
-            sources: As :func:`~pimper_torch.geometry.pyramids.prepare` returns; or computed.
+            sources: As :func:`~pimper_torch.geometry.pyramids.build_pyramids` returns; or computed.
         """
-        sources = sources or prepare(views, self.config.saturation_level)
+        sources = sources or build_pyramids(views, self.config.saturation_level)
         caster = ray_caster(patches.surface or patches.coarse.mesh)
         registered = partial(self._registered, cameras, sources, caster)
         buckets = tuple(side_by_side(registered, patches.buckets))

@@ -197,14 +197,14 @@ def tangent_step(manifold: Manifold, packed: Packed, slope: Shading, shading: Sh
     """
     columns = manifold.tangents(shading)
     descent = quadratics.coordinates(columns, slope)
-    step = quadratics.PackedCholesky(curvature_along(columns, packed), len(columns)).solve(descent)
+    step = quadratics.PackedCholesky(curvature_in(columns, packed), len(columns)).solve(descent)
     length = quadratics.dot(step, step).detach().sqrt()[:, None]
     limit = MAX_STEP * manifold.split(shading.mT)[0].detach()[:, None]
     step = step * torch.where(length > limit, limit / length.clamp_min(1e-30), 1)
     return manifold.retract((shading + quadratics.combination(columns, step)).mT).mT
 
 
-def curvature_along(columns: list[Tensor], packed: Packed) -> Float[Tensor, "patch smaller sample"]:
+def curvature_in(columns: list[Tensor], packed: Packed) -> Float[Tensor, "patch smaller sample"]:
     """Return ``B^T A B``, packed, its diagonal raised by 1e-9 of its trace to be invertible."""
     curvature = quadratics.congruence(packed, columns)
     slot = quadratics.diagonal(len(columns))

@@ -58,7 +58,7 @@ def split_shading(shading: Float[Tensor, "*batch 4"]) -> tuple[Scalars, Vectors]
     return albedo, _vectors([torch.where(directed, axis / length, 0) for axis in vector])
 
 
-def tangents(normals: Vectors) -> tuple[Vectors, Vectors]:
+def orthonormal_basis(normals: Vectors) -> tuple[Vectors, Vectors]:
     """Return two unit vectors that form a right-handed frame with each unit normal.
 
     Continuous except where ``n_z`` changes sign, which does not occur for viewer-facing normals.
@@ -82,7 +82,7 @@ def tangent_columns(shading: Float[Tensor, "*batch 4 sample"]) -> list[Tensor]:
         :math:`(0, t_1), (0, t_2)`, which rotate the normal by :math:`1/\rho` radians per unit.
     """
     _, normal = split_shading(shading.mT)
-    first, second = tangents(normal)
+    first, second = orthonormal_basis(normal)
     zero = torch.zeros_like(first[..., 0])
     return [
         torch.stack([zero + 1, *normal.unbind(dim=-1)], dim=-2),
@@ -156,7 +156,7 @@ class Cone:
     ) -> Float[Tensor, "*batch sample 3 3"]:
         """Return the manifold's part of second derivatives; see :meth:`Manifold.curvature`."""
         albedo, normal = self.split(shading.mT)
-        first, second = tangents(normal)
+        first, second = orthonormal_basis(normal)
         along, on_first, on_second = (
             (slope[..., 1:, :].mT * axis).sum(dim=-1) for axis in (normal, first, second)
         )

@@ -17,7 +17,7 @@ from pimper_torch.lighting.light_field import (
     rotate_lights,
 )
 from pimper_torch.lighting.lights import light_of_mesh
-from pimper_torch.records import PatchPriors, PatchViews, Record
+from pimper_torch.records import Observations, PatchPriors, PatchViews, Record
 from pimper_torch.records.shapes import PatchVectors, Scalar
 from pimper_torch.stages.photometry.factor_priors import RELATIVE_NOISE
 from pimper_torch.stages.photometry.photometry_config import FitLightConfig
@@ -86,6 +86,19 @@ class FitLight(Stage):
     def _field(self, seen: PatchViews, normals: list[Float[Tensor, "_ _ _ 3"]]) -> LightField:
         config = self.config
         return light_of_mesh(seen, normals, config.min_views, config.model, config.colours)
+
+
+def balanced(registered: Observations, field: LightField) -> Observations:
+    """Return radiance over each view's gain, and prior lights over its exposure, both constant."""
+    priors = registered.priors
+    if field.gain is None or field.exposure is None or bool((field.gain == 1).all()):
+        return registered
+    gain, exposure = field.gain.detach(), field.exposure.detach()
+    if priors is not None and priors.lights_patch is not None:
+        lights = priors.lights_patch / exposure[:, None].to(priors.lights_patch)
+        registered = registered.replace(priors=priors.replace(lights_patch=lights))
+    radiance = registered.radiance / gain[..., None, None].to(registered.radiance)
+    return registered.replace(radiance=radiance)
 
 
 def lights_in_patches(

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from pimper_torch.lighting.light_field import harmonics
 from pimper_torch.records import Observations, Record, Templates
 from pimper_torch.records.shapes import PatchMask, PatchVectors
 from pimper_torch.stages.photometry import bilinear
@@ -106,7 +107,7 @@ def refine_on_manifold(
     slope = b - apply_packed(A, factors.shading)
     moved = bilinear.tangent_step(problem.manifold, A, slope, factors.shading)
     albedo, normals = problem.manifold.split(moved.mT)
-    curvature = bilinear.curvature_along(problem.manifold.tangents(factors.shading), A)
+    curvature = bilinear.curvature_in(problem.manifold.tangents(factors.shading), A)
     return albedo, normals, _information(problem, factors, curvature)
 
 
@@ -140,6 +141,15 @@ def initial_shading(
     """Return shading vectors in the directions of ``basis``, with the least-squares albedo."""
     weight = seen.to(radiance.dtype)
     return fit_albedo(radiance[:, :, None], weight, lights, basis) * basis
+
+
+def exposed_lights(rows: FlatSamples, lights: Lights) -> Lights:
+    """Return lights scaled to the radiance of each view, for coarse normals and a common albedo."""
+    gray, basis = rows.radiance.mean(dim=2), harmonics(rows.normals).mT
+    predicted = lights @ initial_shading(gray, rows.seen, lights, basis) * rows.seen
+    square = predicted.square().sum(dim=2)
+    gain = (predicted * gray).sum(dim=2) / torch.where(square > 0, square, 1)
+    return lights * torch.where((square > 0) & (gain > 0), gain, 1)[..., None]
 
 
 def _information(

@@ -1,4 +1,4 @@
-"""Cast shadows of the point light of each view, by ray casting on the surface."""
+"""Samples in the light of each view, and cast shadows by ray casting on the surface."""
 
 import math
 from dataclasses import dataclass
@@ -8,10 +8,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
+from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.lighting.light_field import LightField
-from pimper_torch.records import Record
-from pimper_torch.records.shapes import Scalars, Vectors
+from pimper_torch.lighting.light_field import LightField, faces_light
+from pimper_torch.records import Observations, Record, Templates
+from pimper_torch.records.shapes import PatchMasks, PatchVectors, Scalars, Vectors
+from pimper_torch.stages.photometry.fit_light import lights_in_patches
+from pimper_torch.stages.photometry.sample_estimates import FlatSamples, flatten_samples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -26,6 +29,63 @@ class Shadows(Record):
 
     lit: Bool[Tensor, "*batch view"]
     sure: Bool[Tensor, "*batch view"]
+
+
+def lit_samples(
+    rows: FlatSamples,
+    templates: Templates,
+    registered: Observations,
+    normals: PatchVectors,
+    field: LightField,
+    caster: RayCaster | None,
+) -> tuple[Bool[Tensor, "patch view sample"], Float[Tensor, "patch view 4"]]:
+    """Return the samples under first-order light, and that light.
+
+    Args:
+        caster: Of the surface that casts shadows; ``None`` for no cast shadows.
+    """
+    illuminated, shadowed = _illuminated(templates, registered, normals, field, caster)
+    patch_from_world = templates.patch_from_world.to(normals)
+    lights, soft, point_light = lights_in_patches(field, patch_from_world)
+    lit = flatten_samples(illuminated, rows.index) & rows.seen
+    lit &= faces_light(point_light, rows.normals)
+    shaded = flatten_samples(shadowed, rows.index) | faces_light(-point_light, rows.normals)
+    # Directed soft light whose shading is strong compared with the point light.
+    directed, strength = (soft[..., 1:] != 0).any(dim=-1), point_light.norm(dim=-1)
+    strong = directed & (strength > 0) & (soft[..., 0] - soft[..., 3] > strength / 4)
+    by_soft = shaded & rows.seen & strong[..., None]
+    # The room's light in views where a patch is mostly in shadow of the lamp.
+    in_room = (by_soft.sum(dim=2) > lit.sum(dim=2))[..., None]
+    return torch.where(in_room, by_soft, lit), torch.where(in_room, soft, lights)
+
+
+@torch.no_grad()
+def _illuminated(
+    templates: Templates,
+    registered: Observations,
+    normals: PatchVectors,
+    field: LightField,
+    caster: RayCaster | None,
+) -> tuple[PatchMasks, PatchMasks]:
+    """Return the valid samples outside and inside cast shadows, except near shadow edges."""
+    if caster is None:
+        return registered.valid, torch.zeros_like(registered.valid)
+    world_from_patch = invert_rigid(templates.patch_from_world)
+    raster = templates.points_patch.shape
+    points_world = transform(world_from_patch, templates.points_patch.flatten(1, 2))
+    shadows = cast_shadows_on_rasters(
+        field,
+        caster,
+        points_world.reshape(raster),
+        rotate(world_from_patch, normals.flatten(1, 2)).reshape(raster),
+        templates.spacing,
+        registered.valid,
+        # The assumed error of the surface that casts the shadows is two samples.
+        tolerance=2 * templates.spacing.detach(),
+        guard=2 * float(templates.spacing[0].detach()),
+    )
+    lit, sure = shadows.lit.movedim(-1, 1), registered.valid & shadows.sure.movedim(-1, 1)
+    return lit & sure, ~lit & sure
 
 
 def cast_shadows(

@@ -19,7 +19,7 @@ _IF_LIGHT_MOVED = (
 )
 
 
-def patch_status(
+def photometric_status(
     observed: Bool[Tensor, " patch"],
     finite: Bool[Tensor, " patch"],
     seen: Bool[Tensor, "patch view sample"],

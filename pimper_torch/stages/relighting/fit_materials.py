@@ -58,7 +58,7 @@ def materials_under(
     metals = torch.cartesian_prod(torch.tensor(_METALLIC), roughness, values[0, 2:])
     shared = values = trial.improved(cluster, values, 0, metals)
     for count in range(2, _CLUSTERS + 1):
-        finer = clusters(surface.base_color, count)
+        finer = colour_clusters(surface.base_color, count)
         split = shared.repeat(count, 1)
         for index in range(count):
             split = trial.improved(finer, split, index, _around(split[index], 2.0))
@@ -141,7 +141,7 @@ def _around(value: Float[Tensor, " 3"], step: float) -> _Candidates:
     )
 
 
-def clusters(base_color: Float[Tensor, "vertex channel"], count: int) -> _Clusters:
+def colour_clusters(base_color: Float[Tensor, "vertex channel"], count: int) -> _Clusters:
     """Cluster vertices by their sRGB colour; a cluster may be empty."""
     colors = srgb_from_linear(base_color.double())
     sample = colors[:: -(-len(colors) // 4096)]

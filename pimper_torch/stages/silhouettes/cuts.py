@@ -16,14 +16,14 @@ from pimper_torch.geometry.opencv import (
     PERHAPS_BACKGROUND,
     PERHAPS_OBJECT,
     blind_holes,
-    closed,
+    closing,
     components_of,
     convex_hull_of,
-    dilated,
+    dilation,
     discs_at,
     grab_cut,
     grab_cut_halved,
-    opened,
+    opening,
     signed_distance,
     without_specks,
 )
@@ -339,7 +339,7 @@ def labels_from_hull(
     height, width = margin.shape
     longer = max(height, width)
     labels = torch.full(margin.shape, PERHAPS_BACKGROUND, dtype=torch.uint8)
-    region = cut | closed(margin > 0, max(1, round(_CLOSING * longer)))
+    region = cut | closing(margin > 0, max(1, round(_CLOSING * longer)))
     if agreement is not None:
         region &= ~_shows_plane(agreement)
     labels[region] = PERHAPS_OBJECT
@@ -364,7 +364,7 @@ def labels_from_soft(labels: Labels, mask: Mask, margin: Map) -> Labels:
 def off_plane_mask(agreement: Map) -> Mask:
     """Return the pixels that do not show the plane; unknown ones count as plane."""
     off_plane = _grainless(agreement < _NOT_PLANE)
-    return filled(closed(off_plane, round(1 / 50 * max(agreement.shape))), agreement)
+    return filled(closing(off_plane, round(1 / 50 * max(agreement.shape))), agreement)
 
 
 def occluder_mask(cut: Mask, agreement: Map) -> Mask:
@@ -374,8 +374,8 @@ def occluder_mask(cut: Mask, agreement: Map) -> Mask:
     such windows are excluded.
     """
     longer = max(cut.shape)
-    other = closed(agreement < _OFF_PLANE, round(1 / 200 * longer)) & ~cut
-    return opened(other, round(_DEEP * longer))
+    other = closing(agreement < _OFF_PLANE, round(1 / 200 * longer)) & ~cut
+    return opening(other, round(_DEEP * longer))
 
 
 def is_deep(margin: Map) -> Mask:
@@ -386,7 +386,7 @@ def is_deep(margin: Map) -> Mask:
 def is_inmost(margin: Map) -> Mask:
     """Return the pixels deep inside, and the middle of parts too thin to be deep."""
     longer = max(margin.shape)
-    middle = margin > _MIDDLE * dilated(margin, max(1, round(_DEEP * longer)))
+    middle = margin > _MIDDLE * dilation(margin, max(1, round(_DEEP * longer)))
     return is_deep(margin) | (middle & (margin > _THIN * longer))
 
 
@@ -398,7 +398,7 @@ def not_seen_through(object_px: Pixels, agreement: Map) -> Mask:
 
 def filled(cut: Mask, agreement: Map) -> Mask:
     """Fill holes through which the plane is not visible, such as the inside of a vessel."""
-    filled_cut = closed(cut, max(1, round(_CLOSING * max(cut.shape))))
+    filled_cut = closing(cut, max(1, round(_CLOSING * max(cut.shape))))
     return cut | blind_holes(filled_cut, agreement > _ON_PLANE, _THROUGH)
 
 
@@ -430,4 +430,4 @@ def _shows_plane(agreement: Map) -> Mask:
 
 
 def _grainless(mask: Mask) -> Mask:
-    return opened(mask, max(1, round(1 / 200 * max(mask.shape))))
+    return opening(mask, max(1, round(1 / 200 * max(mask.shape))))

@@ -8,7 +8,7 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from pimper_torch.geometry.supporting_plane import PLANE_TOLERANCE
-from pimper_torch.geometry.visual_hull import bounding_box, margins, visual_hull
+from pimper_torch.geometry.visual_hull import bounding_cube, margins, visual_hull
 from pimper_torch.kernels.compile import COARSE
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.records.scene import ViewPerPose, with_views
@@ -90,7 +90,7 @@ class FindSilhouettes(Stage):
             )
         _warn(rejected, scene.views.names, "its mask contradicts those of the others", _BY_HULL)
         others = silhouettes.replace(reliable=silhouettes.reliable & ~rejected)
-        cameras, box = scene.cameras.to(torch.float32), bounding_box(others, scene.cameras)
+        cameras, box = scene.cameras.to(torch.float32), bounding_cube(others, scene.cameras)
         hull = None
         if box is not None:
             hull = visual_hull(others, cameras, box.float(), num_voxels=NUM_VOXELS)

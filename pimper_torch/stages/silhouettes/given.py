@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.mask_polarity import around_and_inside
-from pimper_torch.geometry.opencv import shrunk, signed_distance
+from pimper_torch.geometry.opencv import area_resized, signed_distance
 from pimper_torch.geometry.pixels import grid_from_pixels, pixels_from_indices, scale_intrinsics
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.supporting_plane import well_tracked
-from pimper_torch.geometry.visual_hull import bounding_box
+from pimper_torch.geometry.visual_hull import bounding_cube
 from pimper_torch.records import Cameras, SilhouettePrior, Silhouettes, SparseScene, Views
 from pimper_torch.records.shapes import Maps, Mask, PerView, ViewMask
 from pimper_torch.runtime.errors import InputError, caution
@@ -211,7 +211,7 @@ class _Evidence:
             sized = zip(views.masks, views.sizes_px.tolist(), sizes.tolist(), strict=True)
             for name, (mask, (width, height), size) in zip(views.names, sized, strict=True):
                 # Keep masks of a single pixel.
-                small = shrunk(mask[None, :height, :width].cpu().float(), *size)[0] > 0
+                small = area_resized(mask[None, :height, :width].cpu().float(), *size)[0] > 0
                 if bool(small.any()):
                     borders[name] = signed_distance(small)
         elif soft := soft_masks_of(views, sizes):
@@ -401,7 +401,7 @@ def _denied(borders: Maps, cameras: Cameras, count: int) -> tuple[Places, Places
     """
     masks, views = borders > 0, range(len(borders))
     given = Silhouettes(inside=masks.float(), reliable=masks.flatten(1).any(dim=1), source="masks")
-    box = bounding_box(given, cameras)
+    box = bounding_cube(given, cameras)
     if box is None or not bool(given.reliable.all()):
         return None
 

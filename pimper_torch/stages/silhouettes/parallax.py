@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from pimper_torch.geometry.opencv import shrunk, warped, window_means
+from pimper_torch.geometry.opencv import area_resized, warped, window_means
 from pimper_torch.geometry.pixels import pixel_centers, scale_intrinsics
 from pimper_torch.geometry.supporting_plane import Fixation, Plane
 from pimper_torch.radiometry.response import srgb_from_linear
@@ -57,7 +57,7 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPic
     factors = (wide / width, high / height)
 
     def layers_of(image: Float[Tensor, "channel _ _"]) -> tuple[Tensor, Tensor, Tensor]:
-        small = shrunk(image, wide, high)
+        small = area_resized(image, wide, high)
         white = torch.quantile(small.mean(dim=0).flatten()[::7], 0.99).clamp_min(1e-6)
         radiance = (small / white).clamp(0, 1).expand(3, -1, -1)
         colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)

@@ -3,7 +3,7 @@
 import torch
 
 from pimper_torch.geometry.contours import Contours, contour_rays
-from pimper_torch.geometry.visual_hull import bounding_box, visual_hull
+from pimper_torch.geometry.visual_hull import bounding_cube, visual_hull
 from pimper_torch.records import Cameras, Silhouettes
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.ledger import leave_out
@@ -28,7 +28,7 @@ class TraceContours(Stage):
         """
         if silhouettes.source == "everything":
             return Contours.none(silhouettes, cameras)
-        box = bounding_box(silhouettes, cameras)
+        box = bounding_cube(silhouettes, cameras)
         hull = None
         if box is not None:  # voxels need no more than single precision
             fraction = _DISAGREEING[silhouettes.source]

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pimper_torch.geometry.pyramids import Sources, prepare
+from pimper_torch.geometry.pyramids import Sources, build_pyramids
 from pimper_torch.geometry.template_normals import transferred_normals
 from pimper_torch.records import (
     Cameras,
@@ -76,7 +76,7 @@ class Sweep(Stage):
             sources: Image pyramids of the photographs, as for ``Warp``; computed if not given.
         """
         buckets = zip(photometric.patches.buckets, seen.buckets, photometric.buckets, strict=True)
-        pyramids, coarse = sources or prepare(views), photometric.patches.coarse
+        pyramids, coarse = sources or build_pyramids(views), photometric.patches.coarse
 
         def of_bucket(bucket: tuple[Templates, Observations, Photometry]) -> Heights:
             heights = self._sweep(cameras, pyramids, coarse, views.poses, *bucket)

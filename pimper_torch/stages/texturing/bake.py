@@ -1,7 +1,7 @@
 """Textures of a simplified mesh, sampled from the surface that it approximates."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
@@ -9,12 +9,12 @@ from torch.nn.functional import avg_pool2d, normalize
 from pimper_torch.geometry import surfaces
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.surfaces import carried_normals
-from pimper_torch.geometry.tangents import frames, tangents
+from pimper_torch.geometry.tangents import frames, vertex_tangents
 from pimper_torch.geometry.visibility import Hits, RayCaster
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale, base_color
 from pimper_torch.records import Mesh, Relighting, TexturedMesh
-from pimper_torch.records.shapes import Mask, Vertices
+from pimper_torch.records.shapes import Mask, Scalar, Vertices
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.stages.stage import Stage
 from pimper_torch.stages.texturing.atlas import Atlas, unwrapped
@@ -63,7 +63,7 @@ def textured(
     normals = carried_normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
     shape = surfaces.vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
-    tangent = tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
+    tangent = vertex_tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
     values = torch.cat([carried_normals(full), colors, uncertainty[:, None]], dim=1)
     caster, texel_faces = RayCaster(full.vertices_world, full.faces), _texel_faces(atlas)
@@ -75,15 +75,8 @@ def textured(
     def bake(texels: Int[Tensor, " texel"]) -> tuple[Tensor, Tensor]:
         """Return the values of texels, and whether rays hit the surface."""
         hits = texel_faces.take(texels)
-        points = hits.interpolate(mesh.vertices_world, mesh.faces)
-        outward = hits.interpolate(shape, mesh.faces)
-        # Rays outward, then rays inward.
-        met = caster.cast(points.repeat(2, 1), torch.cat([outward, -outward]), reach)
-        same_side = (face_normals[met.face] * outward.repeat(2, 1)).sum(dim=1) > 0
-        met = met.replace(face=met.face.where(same_side, -1))
-        distances = met.distance.where(same_side, torch.inf).chunk(2)
-        row = torch.arange(len(points))
-        met = met.take(torch.where(distances[0] <= distances[1], row, row + len(points)))
+        at, outward = (hits.interpolate(one, mesh.faces) for one in (mesh.vertices_world, shape))
+        met = _nearest_hits(caster, at, outward, face_normals, reach)
         rows = met.interpolate(values, full.faces)
         axes = frames(hits, normals, tangent, mesh.faces)
         columns = [_relative(rows[:, :3], axes), rows[:, 3:], hits.interpolate(carried, mesh.faces)]
@@ -92,14 +85,7 @@ def textured(
     (texels,) = torch.nonzero(texel_faces.face >= 0, as_tuple=True)
     blocks = side_by_side(bake, torch.split(texels, 250_000), tracked=False)
     baked, met = (torch.cat(parts) for parts in zip(*blocks, strict=True))
-    raster = baked.new_zeros(len(texel_faces.face), baked.shape[1])
-    raster[texels] = baked
-    measured = torch.zeros_like(texel_faces.face, dtype=torch.bool)
-    measured[texels] = met
-    size = (atlas.height, atlas.width)
-    raster = raster[_nearest(measured.reshape(size))[0]]
-    raster[(texel_faces.face >= 0) & ~measured, 6] = INPAINTED
-    raster = raster.reshape(*size, -1)
+    raster = _filled_raster(baked, met, texels, atlas)
     return TexturedMesh(
         mesh=mesh,
         vertex=atlas.vertex,
@@ -112,6 +98,42 @@ def textured(
         reflectance=None if reflectance is None else raster[..., 7:],
         charts=atlas.charts,
     )
+
+
+def _nearest_hits(
+    caster: RayCaster,
+    points: Vertices,
+    outward: Vertices,
+    face_normals: Vertices,
+    reach: Scalar,
+) -> Hits:
+    """Return the nearer hits of rays outward and inward on surface of similar orientation."""
+
+    def along(direction: Vertices) -> Hits:
+        met = caster.cast(points, direction, reach)
+        similar = (face_normals[met.face] * outward).sum(dim=1) > 0
+        distance = met.distance.where(similar, torch.inf)
+        return met.replace(face=met.face.where(similar, -1), distance=distance)
+
+    ahead, behind = along(outward), along(-outward)
+    return ahead.where(ahead.distance <= behind.distance, behind)
+
+
+def _filled_raster(
+    baked: Float[Tensor, "texel channel"],
+    met: Bool[Tensor, " texel"],
+    texels: Int[Tensor, " texel"],
+    atlas: Atlas,
+) -> Float[Tensor, "height width channel"]:
+    """Return the values of all texels; where rays missed, those of the nearest texel with a hit."""
+    size = (atlas.height, atlas.width)
+    raster = baked.new_zeros(atlas.height * atlas.width, baked.shape[1])
+    raster[texels] = baked
+    measured = torch.zeros(len(raster), dtype=torch.bool)
+    measured[texels] = met
+    raster = raster[_nearest(measured.reshape(size))[0]]
+    raster[texels[~met], 6] = INPAINTED
+    return raster.reshape(*size, -1)
 
 
 def halved(asset: TexturedMesh) -> TexturedMesh:
