@@ -2,14 +2,13 @@
 
 import warnings
 
-import pytest
 import torch
 from probes import small_scene
 from torch import nn
 
 from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.records import Silhouettes
-from pimper_torch.runtime.errors import PimperWarning, caution
+from pimper_torch.runtime.errors import caution
 from pimper_torch.stages.meshing.repair import Repair
 from pimper_torch.stages.stage import Given, Then
 
@@ -45,10 +44,3 @@ def iterations(messages):
 
 def test_passes_warn_once_with_the_last_figures():
     assert iterations([["9 of 10", "no contours"], ["5 of 10"], ["3 of 10"]]) == ["3 of 10"]
-
-
-def test_outside_passes_a_caution_is_emitted_immediately(pytestconfig):
-    with pytest.warns(PimperWarning, match="now") as caught:
-        caution("now")
-    if not pytestconfig.getoption("jaxtyping_packages"):  # which adds frames to the stack
-        assert caught[0].filename == __file__

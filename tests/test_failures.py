@@ -1,7 +1,6 @@
 """A failed patch, view or solver is skipped with a warning and does not affect the others."""
 
 import warnings
-from contextlib import contextmanager
 from functools import partial
 
 import pytest
@@ -14,8 +13,7 @@ from pimper_torch.export.reports import summary_report
 from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.records import Failure, PatchStatus, Silhouettes
 from pimper_torch.runtime.errors import OutOfMemoryError, PimperWarning, ReconstructionError
-from pimper_torch.runtime.failures import collecting as collecting_entries
-from pimper_torch.runtime.failures import distinct, skipped, solved_or, warn_of
+from pimper_torch.runtime.failures import failures_of, skipped, skipping, solved_or, warn_of
 from pimper_torch.stages.fusion import estimate
 from pimper_torch.stages.patches.decompose import Decompose
 from pimper_torch.stages.patches.patches_config import DecomposeConfig
@@ -34,15 +32,6 @@ NO_MEMORY = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 1
 FAILURE = Failure(stage="fuse", what="solver", name="it", reason="NaN", done="Kept")
 
 
-@contextmanager
-def collecting(*arguments):
-    """Collect failures, without removals by guards."""
-    failures = []
-    with collecting_entries(*arguments) as entries:
-        yield failures
-    failures += [entry for entry in entries if isinstance(entry, Failure)]
-
-
 def test_each_kind_of_failure_gives_one_warning_with_its_count():
     failures = [
         Failure(stage="sweep", what="patch", name=str(name), reason="NaN", done="Kept")
@@ -52,7 +41,7 @@ def test_each_kind_of_failure_gives_one_warning_with_its_count():
         warn_of(failures)
     (warning,) = caught
     assert "sweep: 9 failed (patch 2, 11, 20, 21, 22, ...): NaN. Kept." in str(warning.message)
-    assert [each.name for each in distinct(failures)][:3] == ["2", "11", "20"]
+    assert [each.name for each in failures_of(failures)][:3] == ["2", "11", "20"]
 
 
 def test_outside_a_chain_a_failure_warns_immediately():
@@ -62,7 +51,7 @@ def test_outside_a_chain_a_failure_warns_immediately():
 
 def test_earlier_failures_are_warned_of_before_a_fatal_error():
     def broken(error):
-        with collecting():
+        with skipping():
             skipped(FAILURE)
             raise error
 
@@ -81,12 +70,12 @@ def test_a_fallback_replaces_singular_equations():
         raise SingularSystemError("singular")
 
     given = {"stage": "fuse", "name": "the fusion", "done": "Kept"}
-    with collecting() as failures:
+    with skipping() as entries:
         assert solved_or(singular, lambda: 3, **given) == 3
-    assert failures[0].reason == "SingularSystemError: singular"
-    with pytest.raises(ReconstructionError, match="solver the fusion"), collecting("fail"):
+    assert failures_of(entries)[0].reason == "SingularSystemError: singular"
+    with pytest.raises(ReconstructionError, match="solver the fusion"), skipping("fail"):
         solved_or(singular, lambda: 3, **given)
-    with pytest.raises(ZeroDivisionError), collecting():  # a programming error
+    with pytest.raises(ZeroDivisionError), skipping():  # a programming error
         solved_or(lambda: 1 / 0, lambda: 3, **given)
 
 
@@ -139,7 +128,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("reason", FAULTS)
 def test_an_unusable_view_is_removed_and_the_others_are_unchanged(scene, reason):
-    with collecting() as failures:
+    with skipping() as entries:
         found = sound(FAULTS[reason](scene, 2))
     others = [0, 1, 3, 4, 5]
     assert found.views.names == tuple(scene.views.names[view] for view in others)
@@ -149,10 +138,10 @@ def test_an_unusable_view_is_removed_and_the_others_are_unchanged(scene, reason)
     assert torch.equal(found.observed, scene.observed[:, others])
     assert len(found.lenses) == 5
     found.check("test")
-    (failure,) = failures
+    (failure,) = failures_of(entries)
     assert (failure.what, failure.name) == ("view", scene.views.names[2])
     assert reason in failure.reason
-    with pytest.raises(ReconstructionError, match=reason), collecting("fail"):
+    with pytest.raises(ReconstructionError, match=reason), skipping("fail"):
         sound(FAULTS[reason](scene, 2))
 
 
@@ -165,11 +154,11 @@ def test_points_that_are_not_finite_are_removed(scene):
     points[[3, 5]] = torch.nan
     kept = torch.ones(len(points), dtype=torch.bool)
     kept[[3, 5]] = False
-    with collecting() as failures:
+    with skipping() as entries:
         found = sound(scene.replace(points_world=points))
     assert torch.equal(found.points_world, scene.points_world[kept])
     assert torch.equal(found.observed, scene.observed[kept])
-    assert [each.what for each in failures] == ["points"]
+    assert [each.what for each in failures_of(entries)] == ["points"]
 
 
 def test_too_few_views_are_refused_with_the_reason_of_each(scene):
@@ -181,10 +170,10 @@ def test_too_few_views_are_refused_with_the_reason_of_each(scene):
 
 
 def test_an_empty_silhouette_does_not_constrain_the_surface(scene):
-    with collecting() as failures:
+    with skipping() as entries:
         found = FindSilhouettes()(with_empty_mask(scene, 2))
     assert found.reliable.tolist() == [True, True, False, True, True, True]
-    assert [each.name for each in failures] == [scene.views.names[2]]
+    assert [each.name for each in failures_of(entries)] == [scene.views.names[2]]
 
 
 # --- patches -----------------------------------------------------------------------------------
@@ -237,16 +226,16 @@ def test_a_solution_that_is_not_finite_affects_only_its_patch(given, expected, m
     monkeypatch.setattr(factor_solve, "SOLVERS", {**factor_solve.SOLVERS, name: spoiled})
     with (
         pytest.raises(ReconstructionError, match=r"factorize: patch \d+ failed"),
-        collecting("fail"),
+        skipping("fail"),
     ):
         streamed(given)
-    with collecting() as failures:
+    with skipping() as entries:
         found = streamed(given)
-    lost = {int(each.name) for each in failures}
+    lost = {int(each.name) for each in failures_of(entries)}
     facets = torch.cat([bucket.facet for bucket in given[2].buckets])
     status = torch.cat([bucket.status for bucket in found.photometric.buckets])
     assert lost == set(facets[status == int(PatchStatus.FAILED)].tolist()) != set()
-    assert all(each.stage == "factorize" for each in failures)
+    assert all(each.stage == "factorize" for each in failures_of(entries))
     for index, (one, other) in enumerate(zip(by_bucket(found), by_bucket(expected), strict=True)):
         kept = [int(facet) not in lost for facet in given[2].buckets[index].facet]
         assert all(part.isfinite().all() for part in one)
@@ -266,9 +255,9 @@ def test_heights_that_are_not_finite_become_invalid(given, expected, monkeypatch
         return found.replace(offset=offset)
 
     monkeypatch.setattr(Sweep, "_sweep", spoiled)
-    with collecting() as failures:
+    with skipping() as entries:
         found = streamed(given)
-    assert {each.stage for each in failures} == {"sweep"}
+    assert {each.stage for each in failures_of(entries)} == {"sweep"}
     for one, other in zip(found.buckets, expected.buckets, strict=True):
         assert not one.offset[0].any()
         assert not one.information[0].any()
@@ -336,12 +325,12 @@ def test_a_facet_without_area_is_skipped_and_the_others_are_unchanged(given):
     flat = torch.cat([faces[:7], faces[7:8, [0, 0, 1]], faces[7:]])
     bad = coarse.replace(mesh=coarse.mesh.replace(faces=flat), points=None, support=None)
     decompose = Decompose(DecomposeConfig(bucket_entries=12_000))
-    with collecting() as failures:
+    with skipping() as entries:
         found = decompose(bad, cameras)
-    assert [(each.stage, each.name) for each in failures] == [("decompose", "7")]
+    assert [(each.stage, each.name) for each in failures_of(entries)] == [("decompose", "7")]
     assert torch.equal(found.coarse.mesh.faces, faces)
     for one, other in zip(found.buckets, patches.buckets, strict=True):
         assert torch.equal(one.facet, other.facet)
         assert torch.equal(one.depth, other.depth)
-    with pytest.raises(ReconstructionError, match="patch 7 failed"), collecting("fail"):
+    with pytest.raises(ReconstructionError, match="patch 7 failed"), skipping("fail"):
         decompose(bad, cameras)

@@ -8,10 +8,10 @@ import torch
 
 import pimper_torch
 from pimper_torch.records import Failure, Removal
-from pimper_torch.runtime.failures import collecting, distinct, skipped
-from pimper_torch.runtime.journal import noted
-from pimper_torch.runtime.ledger import GUARDS, closing_line, leave_out, left_out_of, listening
+from pimper_torch.runtime.failures import skipped, skipping
+from pimper_torch.runtime.ledger import GUARDS, RemovedElements, closing_line, leave_out
 from pimper_torch.runtime.parallel import side_by_side
+from pimper_torch.runtime.stream import collected
 
 FAILED = Failure(stage="warp", what="patch", name="3", reason="numbers", done="Left out")
 
@@ -22,21 +22,21 @@ def entry(guard, count, total, names=()):
 
 
 def test_a_mask_is_counted_and_names_are_those_of_its_photographs():
-    with collecting() as entries:
+    with skipping() as entries:
         leave_out("silhouettes.empty", torch.tensor([True, False, True]), names=("a", "b", "c"))
         leave_out("extract.borders", torch.tensor([False, True, False, False]))
         leave_out("sfm.missing", 1, total=8, names=["d"])
         leave_out("sfm.diagnosis", bool("why"))
-    assert left_out_of(entries) == (
+    assert entries == [
         entry("silhouettes.empty", 2, 3, ("a", "c")),
         entry("extract.borders", 1, 4),
         entry("sfm.missing", 1, 8, ("d",)),
         entry("sfm.diagnosis", 1, 1),
-    )
+    ]
 
 
 def test_outside_a_run_no_removal_is_recorded():
-    with noted() as entries:
+    with collected(Removal, passed_on=True) as entries:
         leave_out("extract.borders", torch.ones(3, dtype=torch.bool))
     assert entries == []
 
@@ -52,17 +52,15 @@ def test_removals_of_threads_are_summed_per_guard_and_call(threads, monkeypatch)
             skipped(FAILED)
         return number
 
-    with collecting() as entries:
+    with skipping() as entries:
         leave_out("warp", 5, total=10)
         for _ in range(2):
             assert list(side_by_side(work, range(6))) == list(range(6))
-    passes = (entry("photometry.robust", 15, 60), entry("warp", 15, 60))
-    assert left_out_of(entries) == (entry("warp", 5, 10), *passes, *passes)
-    assert distinct(entries) == (FAILED,)
+    one_pass = [FAILED, entry("photometry.robust", 15, 60), entry("warp", 15, 60)]
+    assert entries == [entry("warp", 5, 10), *one_pass, *one_pass]
 
 
 def test_a_listener_receives_masks_and_positions_from_threads():
-    heard = []
     vertices = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [0, 0, 3]])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     mask = torch.tensor([True, False])
@@ -72,15 +70,15 @@ def test_a_listener_receives_masks_and_positions_from_threads():
         leave_out("repair", mask[:1], at=vertices[:1])
         leave_out("sfm.tracks", 1, total=3)
 
-    with listening(lambda *entry: heard.append(entry)):
+    with collected(RemovedElements) as heard:
         list(side_by_side(work, [0]))
     leave_out("extract.pieces", mask)
-    (pieces, cut, centres), (_, _, points), (_, nothing, nowhere) = heard
-    assert (pieces.count, pieces.total) == (1, 2)
-    assert cut is mask
-    assert centres.tolist() == [[1, 1, 0], [0, 1, 1]]
-    assert points.tolist() == [[0, 0, 0]]
-    assert nothing is nowhere is None
+    pieces, folds, tracks = heard
+    assert (pieces.removal.count, pieces.removal.total) == (1, 2)
+    assert pieces.mask is mask
+    assert pieces.places().tolist() == [[1, 1, 0], [0, 1, 1]]
+    assert folds.places().tolist() == [[0, 0, 0]]
+    assert tracks.mask is tracks.places() is None
 
 
 def test_the_closing_line_names_photographs_and_removals_above_five_percent():

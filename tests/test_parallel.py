@@ -5,8 +5,10 @@ from contextvars import ContextVar
 import pytest
 import torch
 
+from pimper_torch.runtime.events import Progress
 from pimper_torch.runtime.parallel import num_workers, over_rows, side_by_side
-from pimper_torch.runtime.progress import listening, track
+from pimper_torch.runtime.progress import track
+from pimper_torch.runtime.stream import collected
 
 COLOUR: ContextVar[str] = ContextVar("colour", default="none")
 
@@ -82,11 +84,10 @@ def test_at_most_one_result_per_worker_is_pending(two_threads):
 
 
 def test_progress_counts_items_and_ignores_their_inner_progress(two_threads):
-    progress = []
-    with listening(lambda done, total: progress.append((done, total))):
+    with collected(Progress) as progress:
         list(side_by_side(lambda _: list(track(range(7))), range(3)))
         list(side_by_side(lambda _: None, range(3), tracked=False))
-    assert progress == [(1, 3), (2, 3), (3, 3)]
+    assert progress == [Progress(done=done, total=3) for done in (1, 2, 3)]
 
 
 @pytest.mark.parametrize(("rows", "size", "parts"), [(40_000, 1, 2), (100, 1, 1), (100, 400, 2)])

@@ -8,21 +8,23 @@ import torch
 
 from pimper_torch.chains.running import called
 from pimper_torch.records import Mesh, StageReport
-from pimper_torch.runtime import journal, reporting
-from pimper_torch.runtime.journal import aside, current
+from pimper_torch.runtime import reporting
 from pimper_torch.runtime.progress import report
 from pimper_torch.runtime.reporting import (
     SilentObserver,
-    accounted,
-    gathered,
-    recorded,
+    add_counts,
+    aside,
+    observed,
     seconds_of,
     stage,
+    table_of,
 )
+from pimper_torch.runtime.stream import emit
 
 
 def tetrahedron() -> Mesh:
     report(1, 1)
+    add_counts({"openings": 0})
     faces = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
     return Mesh(vertices_world=torch.eye(4)[:, :3].contiguous(), faces=faces)
 
@@ -47,18 +49,18 @@ class Listener(SilentObserver):
 
 def test_stages_are_reported_in_order_with_their_figures():
     listener = Listener()
-    with recorded(listener) as reports:
+    with observed(listener) as table:
         called("second", tetrahedron)
         called("first", tetrahedron)
-    assert [entry.name for entry in reports] == ["second", "first", "between stages"]
-    assert reports[0].figures == {"vertices": 4, "faces": 4}
-    assert all(entry.seconds >= 0 and entry.peak_memory_mb > 10 for entry in reports)
+    assert [entry.name for entry in table.reports] == ["second", "first", "between stages"]
+    assert table.reports[0].figures == {"vertices": 4, "faces": 4, "openings": 0}
+    assert all(entry.seconds >= 0 and entry.peak_memory_mb > 10 for entry in table.reports)
     assert listener.heard[:3] == ["started second", "1/1", "finished second"]
 
 
 def test_failed_and_nested_stages_have_no_report():
     listener = Listener()
-    with recorded(listener):
+    with observed(listener):
         with pytest.raises(ValueError, match="on purpose"):
             called("broken", broken)
         called("outer", lambda: called("inner", tetrahedron))
@@ -71,11 +73,11 @@ def test_threads_have_separate_reports():
     listeners = {"first": Listener(), "second": Listener()}
 
     def call(stage):
-        with recorded(listeners[stage]) as reports:
+        with observed(listeners[stage]) as table:
             inside.wait()
             called(stage, tetrahedron)
             inside.wait()
-        names[stage] = [entry.name for entry in reports]
+        names[stage] = [entry.name for entry in table.reports]
 
     threads = [threading.Thread(target=call, args=(stage,)) for stage in listeners]
     for thread in threads:
@@ -99,25 +101,24 @@ class Clock:
 
 def test_times_of_stages_sum_to_the_time_of_the_call(monkeypatch):
     clock = Clock()
-    for module in (journal, reporting):
-        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(reporting, "time", clock)
     kept = StageReport(name="kept", seconds=1e6, peak_memory_mb=0.0, figures={}, kept=True)
-    with recorded(SilentObserver()) as reports:
+    with observed(SilentObserver()) as table:
         with stage("read"), aside("keep"):  # counts as time of the stage
             clock.sleep(1)
         for _ in range(2):
-            with recorded(SilentObserver()):
+            with observed(SilentObserver()):
                 with aside("keep"):
                     clock.sleep(2)
                 called("first", tetrahedron)
-                current().note(kept)
+                emit(kept)
                 clock.sleep(4)
-        so_far = accounted()
+        so_far = table.so_far()
         clock.sleep(8)
-    lines = [(line.name, 0 if line.kept else line.seconds) for line in gathered(reports)]
+    lines = [(line.name, 0 if line.kept else line.seconds) for line in table_of(table.reports)]
     again = [("first", 0), ("kept", 0)] * 2
     assert lines == [("read", 1), *again, ("keep", 4), ("between stages", 16)]
-    assert seconds_of(reports) == clock.now - 100
+    assert seconds_of(table.reports) == clock.now - 100
     assert seconds_of(so_far) == clock.now - 108
 
 
@@ -142,6 +143,6 @@ print(before, risen, peak_memory_mb())
 
 
 def test_a_value_other_than_a_record_reports_no_figures():
-    with recorded(SilentObserver()) as reports:
+    with observed(SilentObserver()) as table:
         called("stage", lambda: "nothing of ours")
-    assert reports[0].figures == {}
+    assert table.reports[0].figures == {}

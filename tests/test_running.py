@@ -8,7 +8,7 @@ from torch import nn
 import pimper_torch as pt
 from pimper_torch.chains.running import ChainRun
 from pimper_torch.runtime.errors import PimperWarning, caution
-from pimper_torch.runtime.reporting import SilentObserver, recorded
+from pimper_torch.runtime.reporting import SilentObserver, observed
 from pimper_torch.store import Store
 
 
@@ -72,9 +72,9 @@ def test_the_record_of_a_sequence_and_of_keywords_is_read_by_a_later_run(tmp_pat
     found, kept = [], []
     for files in (pt.MeshFiles(), pt.MeshFiles(), pt.MeshFiles(watertight=True)):
         run = ChainRun(names={stage: "simplify"}, store=Store(folder=tmp_path))
-        with recorded(SilentObserver()) as reports:
+        with observed(SilentObserver()) as table:
             found.append(run(stage, mesh, files=files))
-        kept.append(next(report.kept for report in reports if report.name == "simplify"))
+        kept.append(next(report.kept for report in table.reports if report.name == "simplify"))
     assert kept == [False, True, False]
     assert torch.equal(found[0].mesh.vertices_world, found[1].mesh.vertices_world)
     assert found[0].closed is None

@@ -4,7 +4,7 @@
     python benchmarks/studies/guards.py FOLDER --without extract.borders [--sets NAME ...]
     python benchmarks/studies/guards.py FOLDER --table
 
-Every set is rendered once into FOLDER, run with a listener of the ledger, and compared with the
+Every set is rendered once into FOLDER, run with a listener of removals, and compared with the
 truth. Data is valid, and its removal wrong, in these cases: a photograph that was not degraded;
 faces, facets and points near the true surface; pixels of the object. A warning is wrong if the
 cameras are good. Features and matches are only counted. Results are kept, one JSON per run, under
@@ -43,7 +43,9 @@ from pimper_torch.io.photographs import load_views
 from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.records import Estimate, Reconstruction, Removal
 from pimper_torch.runtime.errors import PimperError
-from pimper_torch.runtime.ledger import GUARDS, listening
+from pimper_torch.runtime.events import Event
+from pimper_torch.runtime.ledger import GUARDS, RemovedElements
+from pimper_torch.runtime.stream import Emit, listening
 
 # A position is correct within this fraction of the object's diagonal: five times the error of
 # accurate surfaces. Cameras are good within these errors; all choices.
@@ -101,17 +103,21 @@ CHANGES: dict[str, dict[str, object]] = {
 
 @dataclass
 class Heard:
-    """A listener of the ledger: entries, positions of removed elements, and masks of pixels."""
+    """A listener of removals: entries, positions of removed elements, and masks of pixels."""
 
     entries: list[tuple[Removal, Tensor | None, Tensor | None]] = field(default_factory=list)
 
-    def __call__(self, entry: Removal, mask: Tensor | None, places: Tensor | None) -> None:
+    def __call__(self, event: Event, outside: Emit) -> bool:
         """Keep an entry with a sample of its positions."""
+        if not isinstance(event, RemovedElements):
+            return outside(event)
+        entry, mask, places = event.removal, event.mask, event.places()
         if mask is not None and places is not None and entry.count:
             taken = places.detach()[mask.flatten()]
             places = taken[:: math.ceil(len(taken) / SAMPLES)].double().cpu()
         pixels = mask.cpu() if mask is not None and mask.ndim == 3 and entry.count else None
         self.entries.append((entry, places if entry.count else None, pixels))
+        return True
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,11 @@ from pimper_torch.records import (
 )
 from pimper_torch.runtime.config import nearest
 from pimper_torch.runtime.errors import ConfigError, InputError, OnFailure
-from pimper_torch.runtime.failures import collecting, distinct, warn_of
+from pimper_torch.runtime.events import Event
+from pimper_torch.runtime.failures import failures_of, skipping, warn_of
 from pimper_torch.runtime.file_names import view_named
 from pimper_torch.runtime.ledger import left_out_of
-from pimper_torch.runtime.reporting import Observer, SilentObserver, gathered, recorded, stage
+from pimper_torch.runtime.reporting import Observer, SilentObserver, observed, stage, table_of
 from pimper_torch.stages.coarse.depth_points import DepthPoints
 from pimper_torch.stages.meshing.finish import Simplify
 from pimper_torch.stages.relighting.held_out import JudgeTextures, Relight
@@ -190,11 +191,13 @@ class Chain(Stage):
         for reference in self.references():
             view_named(reference, names)  # an unknown name fails before structure from motion
         compile_ahead()
-        with collecting(self.on_failure) as entries, recorded(self.observer) as reports:
+        with skipping(self.on_failure) as entries, observed(self.observer) as table:
             prepared = prepare(self, self.running(), views, sparse_model, mesh)
             self.show(prepared.scene, prepared.coarse)
         return prepared.replace(
-            reports=tuple(reports), failures=distinct(entries), left_out=left_out_of(entries)
+            reports=table_of(table.reports),
+            failures=failures_of(entries),
+            left_out=left_out_of(entries),
         )
 
     def steps(
@@ -223,10 +226,10 @@ class Chain(Stage):
                 "needed: give them to `prepare`."
             )
         passes = self.passes(self.running(), prepared)
-        entries: list[object] = [*prepared.failures, *prepared.left_out]
+        entries: list[Event] = [*prepared.failures, *prepared.left_out]
         before = prepared.reports
         while True:
-            with collecting(self.on_failure, entries), recorded(self.observer) as reports:
+            with skipping(self.on_failure, entries), observed(self.observer) as table:
                 step = next(passes, None)
                 if step is not None:
                     self.notify(step)
@@ -235,8 +238,8 @@ class Chain(Stage):
             if step.last:
                 warn_of(entries)
             yield step.replace(
-                reports=gathered([*before, *reports]),
-                failures=distinct(entries),
+                reports=table_of([*before, *table.reports]),
+                failures=failures_of(entries),
                 left_out=left_out_of(entries),
             )
             before = ()
@@ -267,7 +270,7 @@ class Chain(Stage):
             del step  # the next pass needs its memory
             step = next(steps)
             reports += step.reports
-        with collecting(self.on_failure) as entries, recorded(self.observer) as last:
+        with skipping(self.on_failure) as entries, observed(self.observer) as table:
             extracted = self.running()(self.extract, step.surface)
             warn_of(entries)
         return Reconstruction(
@@ -277,8 +280,8 @@ class Chain(Stage):
             silhouettes=step.silhouettes,
             coarse=step.coarse,
             patches=step.heights,
-            report=gathered([*reports, *last]),
-            failures=(*step.failures, *distinct(entries)),
+            report=table_of([*reports, *table.reports]),
+            failures=(*step.failures, *failures_of(entries)),
             left_out=(*step.left_out, *left_out_of(entries)),
         )
 
@@ -291,7 +294,7 @@ class Chain(Stage):
         result = result.to("cpu")
         scene, held_out, silhouettes = result.scene, result.held_out, result.silhouettes
         run = self.running()
-        with collecting(self.on_failure) as entries, recorded(self.observer) as reports:
+        with skipping(self.on_failure) as entries, observed(self.observer) as table:
             finished = run(self.simplify, result.mesh, files or MeshFiles())
             relighting = run(self.relight, finished.few, scene, silhouettes, held_out)
             asset = run(self.texture, result.mesh, finished.few, relighting)
@@ -303,8 +306,8 @@ class Chain(Stage):
             finished=finished,
             relighting=relighting,
             asset=asset,
-            report=gathered([*result.report, *reports]),
-            failures=(*result.failures, *distinct(entries)),
+            report=table_of([*result.report, *table.reports]),
+            failures=(*result.failures, *failures_of(entries)),
             left_out=(*result.left_out, *left_out_of(entries)),
         )
 

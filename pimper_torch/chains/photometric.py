@@ -17,7 +17,7 @@ from pimper_torch.records import (
 from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
-from pimper_torch.runtime.reporting import add_counts, part
+from pimper_torch.runtime.reporting import add_counts, timed
 from pimper_torch.stages.photometry.fit_light import Illumination
 from pimper_torch.stages.stage import Stage
 
@@ -79,12 +79,12 @@ class Photometric(Stage):
 
         def of_bucket(templates: Templates) -> SweptPatches:
             bucket = patches.replace(buckets=(templates,))
-            with part("warp"):
+            with timed("warp"):
                 seen = warp(views, cameras, bucket, sources)  # samples J
             add_counts(seen.figures())
-            with part("factorize"):
+            with timed("factorize"):
                 photometric = factorize(seen, light)  # J = L N: lights, albedo and normals
-            with part("sweep"):
+            with timed("sweep"):
                 return sweep(views, cameras, seen, photometric, sources)
 
         results = list(side_by_side(of_bucket, patches.buckets))

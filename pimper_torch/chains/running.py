@@ -14,7 +14,7 @@ from torch.utils import _pytree as pytree
 from pimper_torch.kernels.compile import all_compiled, load
 from pimper_torch.records import Record
 from pimper_torch.runtime.errors import held
-from pimper_torch.runtime.journal import HASH, aside
+from pimper_torch.runtime.reporting import HASH, aside
 from pimper_torch.runtime.reporting import stage as reported_stage
 from pimper_torch.stages.stage import Stage
 from pimper_torch.store import Store, digest, kept

@@ -27,11 +27,11 @@ def run(job: "_Job", output: Output) -> None:
     from pimper_torch.runtime.reporting import stage
     from pimper_torch.single_view.factorization.estimate_gamma import gamma_of_photographs
 
-    with output.observer(), stage("read"), held() as messages:
+    with output.observer(), stage("read"), held() as cautions:
         views = load_views(job.photos, encoding=LINEAR, max_size_px=job.max_size_px)
-    for message in messages:
-        if CONTRADICTED not in message:  # profiles of the files do not matter here
-            caution(message)
+    for each in cautions:
+        if CONTRADICTED not in each.message:  # profiles of the files do not matter here
+            caution(each.message)
     mask = None if job.mask is None else read_mask(job.mask, job.max_size_px)
     estimate = gamma_of_photographs(views, mask=mask, rank=job.rank)
     output.emit(f"{estimate}{advice(estimate)}")

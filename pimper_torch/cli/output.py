@@ -14,7 +14,7 @@ from pimper_torch.runtime.errors import ConfigError
 
 if TYPE_CHECKING:
     from pimper_torch.cli.doctor.forecast import Forecast
-    from pimper_torch.runtime.reporting import Observer
+    from pimper_torch.runtime.reporting import Observer, RunTable
 
 Level = Literal["error", "warning", "info", "debug"]
 _LEVELS: tuple[Level, ...] = get_args(Level)
@@ -90,20 +90,20 @@ class Output:
         print_message("error", message)
 
     @contextmanager
-    def observer(self, forecast: "Forecast | None" = None) -> Iterator["Observer"]:
+    def observer(self, forecast: "Forecast | None" = None) -> Iterator["RunTable"]:
         """Display the stages of the ``with`` block: a bar or a line per stage, or events.
 
         Args:
             forecast: Estimates the time left.
 
         Yields:
-            The observer of the stages.
+            The reports of the stages, and their observer.
         """
         from rich.console import Console
 
         from pimper_torch.cli.bars import Bars, Events
         from pimper_torch.cli.doctor.forecast import Forecast
-        from pimper_torch.runtime.reporting import SilentObserver, recorded
+        from pimper_torch.runtime.reporting import SilentObserver, observed
 
         forecast = forecast or Forecast()
         display: AbstractContextManager[Observer] = nullcontext(SilentObserver())
@@ -111,8 +111,8 @@ class Output:
             display = nullcontext(Events(self.event, 0.5, forecast))
         elif self.shows("info"):
             display = Bars(Console(stderr=True), forecast, None if self.shows("debug") else 3)
-        with display as observer, recorded(observer):
-            yield observer
+        with display as observer, observed(observer) as table:
+            yield table
 
 
 def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:

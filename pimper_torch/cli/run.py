@@ -29,9 +29,11 @@ from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
 from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
 from pimper_torch.runtime.config import bytes_of
-from pimper_torch.runtime.errors import ConfigError, caution, cautioned
+from pimper_torch.runtime.errors import ConfigError, caution
+from pimper_torch.runtime.events import Caution
 from pimper_torch.runtime.ledger import closing_line
-from pimper_torch.runtime.reporting import accounted, reported, stage
+from pimper_torch.runtime.reporting import stage, stage_report
+from pimper_torch.runtime.stream import collected
 from pimper_torch.scale import given
 from pimper_torch.scale.find_scale import find_scale
 from pimper_torch.scale.scale import Scale
@@ -57,9 +59,10 @@ def carry_out(job: Job, output: Output) -> None:
 
 def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
     common = job.common
-    imports = reported("import", time.perf_counter() - output.began)
+    imports = stage_report("import", time.perf_counter() - output.began)
     lock, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
-    with lock, output.observer(forecast) as observer:
+    warned = collected(Caution, passed_on=True)
+    with lock, output.observer(forecast) as table, warned as cautions:
         with stage("read") as figures:
             views = _read(job)
             figures["photographs"] = views.num_views
@@ -69,22 +72,22 @@ def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
         forecast.plan = _plan(job, views)
         folder, limit = common.cache or job.out / STAGES, bytes_of(common.max_kept)
         store = Store(folder=folder, max_bytes=limit, fresh=common.fresh)
-        chain = make_chain(job.config, observer, store)
+        chain = make_chain(job.config, table.observer, store)
         chain.needed = tuple(given.measured_in(job.inputs.bars, job.inputs.distances))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
         chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
         if viewer is not None:
             viewer.add_pass(RESULT, result.mesh)
-        result = result.replace(report=(imports, *accounted()))
+        result = result.replace(report=(imports, *table.so_far()))
         with stage("scale") as figures:
             result, scale = sized(job, bars, result)
             if scale is not None:
                 figures["scale"] = scale.factor
         result = chain.finish(result, job.common.files)
         with stage("write"):
-            _write(job, result, scale)
-        result = result.replace(report=(imports, *accounted()))
+            _write(job, result, scale, cautions)
+        result = result.replace(report=(imports, *table.so_far()))
     if scale is not None:
         output.remark(scale_message(scale))
     _conclude(output, job, result)
@@ -149,7 +152,7 @@ def _examine(job: Job, views: Views) -> None:
             caution(f"{job.photos}: {finding}", stacklevel=2)
 
 
-def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
+def _write(job: Job, result: Reconstruction, scale: Scale | None, cautions: list[Caution]) -> None:
     names = ("masks", "sparse", "mesh", "silhouettes", "normals", "depth")
     paths: dict[str, Path | None] = {name: getattr(job.inputs, name) for name in names}
     about: dict[str, object] = {
@@ -162,7 +165,7 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None) -> None:
         "device": job.common.device,
         "torch": str(torch.__version__),
         "scale": None if scale is None else scale.report(),
-        "warnings": list(dict.fromkeys(cautioned())),
+        "warnings": list(dict.fromkeys(each.message for each in cautions)),
     }
     write_result(
         result,

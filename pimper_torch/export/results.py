@@ -26,7 +26,7 @@ from pimper_torch.records import Reconstruction, TexturedMesh
 from pimper_torch.runtime.config import read_mapping, to_yaml
 from pimper_torch.runtime.mapped import each
 from pimper_torch.runtime.progress import part
-from pimper_torch.runtime.reporting import reported
+from pimper_torch.runtime.reporting import stage_report
 from pimper_torch.scale.given import MILLIMETRES
 from pimper_torch.stages.sfm.sparse_scene import write_model
 from pimper_torch.viz.maps import normal_colors, view_maps
@@ -128,7 +128,7 @@ def write_result(
             if "obj" in files.formats:
                 write_asset_obj(asset, staging / "asset.obj", placement)
         _write_all(written, config, staging)
-        writing = reported("write", time.perf_counter() - began)
+        writing = stage_report("write", time.perf_counter() - began)
         timed = result.replace(report=(*result.report, writing))
         summary = {
             **reports.summary_report(timed, about or {}),

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from pimper_torch.records import Record
 from pimper_torch.records.shapes import Points, Vectors
-from pimper_torch.runtime.renamed import renamed_fields
 
 
 def harmonics(normals: Vectors) -> Float[Tensor, "*batch 4"]:
@@ -61,7 +60,6 @@ def rotate_lights(
 _MIN_COSINE = 0.05
 
 
-@renamed_fields(closeness="inverse_distance")
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class LightField(Record):
     r"""The light at every point of the scene, in every view.

@@ -53,6 +53,3 @@ from pimper_torch.records.views import Views as Views
 from pimper_torch.runtime.events import Failure as Failure
 from pimper_torch.runtime.events import Removal as Removal
 from pimper_torch.runtime.events import StageReport as StageReport
-from pimper_torch.runtime.renamed import renamed_names
-
-__getattr__ = renamed_names(__name__, {"LeftOut": "Removal", "Lens": "CameraModel"})

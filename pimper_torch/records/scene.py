@@ -12,7 +12,6 @@ from pimper_torch.records.record import Record
 from pimper_torch.records.shapes import Faces, PerVertex, Points, VertexMask, Vertices
 from pimper_torch.records.value_checks import Faults, faults_in, mean, not_finite, out_of_range
 from pimper_torch.records.views import Cameras, Views
-from pimper_torch.runtime.renamed import renamed_fields
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -43,7 +42,6 @@ def no_sessions() -> Int[Tensor, "0"]:
     return torch.zeros(0, dtype=torch.long)
 
 
-@renamed_fields(doubt="diagnosis", series="sessions")
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SparseScene(Record):
     """Cameras, undistorted photographs and a sparse cloud with its tracks.

@@ -1,1 +1,1 @@
-"""Infrastructure of runs: settings, errors, journal, reports, memory, and kept records."""
+"""Infrastructure of runs: settings, errors, events, reports, memory, and kept records."""

@@ -6,10 +6,10 @@ Every message gives the location, the value, the requirement, and advice.
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Literal
 
-from pimper_torch.runtime.journal import current, writing
+from pimper_torch.runtime.events import Caution
+from pimper_torch.runtime.stream import collected, emit
 
 OnFailure = Literal["skip", "fail"]
 """Whether a failed patch, view or solver is skipped, or ends the run."""
@@ -48,42 +48,29 @@ class PimperWarning(UserWarning):
 
 
 def caution(message: str, stacklevel: int = 1) -> None:
-    """Warn immediately or, inside :func:`held`, record the message for the owner of the block.
+    """Warn immediately or, inside :func:`held`, leave that to the owner of the block.
 
     Args:
         stacklevel: As for :func:`warnings.warn`, counted from the caller.
     """
-    journal = current()
-    journal.note(message)
-    if not journal.quiet:
+    if not emit(Caution(message=message)):
         warnings.warn(message, PimperWarning, stacklevel=stacklevel + 1)
 
 
-def cautioned() -> list[str]:
-    """Return the messages of :func:`caution` so far in this call."""
-    return [event for event in current().so_far() if isinstance(event, str)]
-
-
 @contextmanager
-def held() -> Iterator[list[str]]:
-    """Hold back the cautions of the ``with`` block.
+def held() -> Iterator[list[Caution]]:
+    """Hold back and yield the cautions of the ``with`` block.
 
     If the block raises an error, the warnings are given first.
-
-    Yields:
-        A list, filled with the messages at the end of the block.
     """
-    messages, events = list[str](), current().so_far()
-    before = len(events)
+    cautions: list[Caution] = []
     try:
-        with writing(replace(current(), events=events, quiet=True)):
-            yield messages
+        with collected(Caution, into=cautions):
+            yield cautions
     except BaseException:
-        for message in [event for event in events[before:] if isinstance(event, str)]:
-            caution(message)
+        for each in cautions:
+            caution(each.message)
         raise
-    messages += [event for event in events[before:] if isinstance(event, str)]
-    events[before:] = [event for event in events[before:] if not isinstance(event, str)]
 
 
 def some(names: Sequence[str], most: int = 8) -> str:

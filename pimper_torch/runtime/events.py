@@ -1,6 +1,10 @@
-"""Events of a run that its result lists: failures, removals by guards, reports of stages."""
+"""Events of a run, which :mod:`~pimper_torch.runtime.stream` passes to listeners.
+
+The result of a run lists failures, removals by guards, and reports of stages.
+"""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
@@ -18,6 +22,13 @@ class Event:
     def replace(self: AnyEvent, **changes: object) -> AnyEvent:
         """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Caution(Event):
+    """A warning about a result that is returned anyway."""
+
+    message: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +64,28 @@ class Removal(Event):
     total: int
     reason: str
     names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress(Event):
+    """Number of finished steps of a stage, and of all its steps."""
+
+    done: int
+    total: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageStarted(Event):
+    """The start of a stage, which its report follows unless it fails."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counts(Event):
+    """Counts to add to the figures of the running stage."""
+
+    counts: Mapping[str, int | float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,10 +4,10 @@ Only failures caused by data are skipped: numbers that are not finite, equations
 and unusable input of one patch or view. Other errors are bugs or a lack of memory, and end the run.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import groupby
+from operator import attrgetter
 from typing import TypeVar
 
 import torch
@@ -20,40 +20,52 @@ from pimper_torch.runtime.errors import (
     ReconstructionError,
     caution,
 )
-from pimper_torch.runtime.events import Failure, Removal
-from pimper_torch.runtime.journal import current, writing
+from pimper_torch.runtime.events import Event, Failure, Removal
+from pimper_torch.runtime.stream import Emit, collected, emit, listening
 
 Result = TypeVar("Result")
 
 # Torch's messages for failed allocations on the CPU; CUDA has its own error class.
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "out of memory")
 
+_KIND = attrgetter("stage", "what", "done")
+
+
+def _fatal(event: Event, outside: Emit) -> bool:
+    if isinstance(event, Failure):
+        raise ReconstructionError(
+            f"{event.stage}: {event.what} {event.name} failed: {event.reason}. Failures end this "
+            f"run (`on_failure` is fail); with skip it would continue: {event.done}."
+        )
+    return outside(event)
+
 
 @contextmanager
-def collecting(
-    on_failure: OnFailure = "skip", events: list[object] | None = None
-) -> Iterator[list[object]]:
-    """Collect the events of the ``with`` block, such as failures and entries of guards.
+def skipping(
+    on_failure: OnFailure = "skip", entries: list[Event] | None = None
+) -> Iterator[list[Event]]:
+    """Collect the failures and the entries of guards in the ``with`` block.
 
     If the block raises an error, warnings of the earlier failures come first.
 
     Args:
         on_failure: ``"fail"`` raises an error instead of skipping.
-        events: Earlier events, to which new ones are appended.
+        entries: Earlier entries, to which new ones are appended.
 
     Yields:
-        The list of events, for :func:`warn_of` at the end.
+        The list of entries, for :func:`warn_of` at the end.
 
     Raises:
         OutOfMemoryError: Instead of other errors for failed allocations.
     """
-    outer, events = current(), [] if events is None else events
-    before, fail = len(events), on_failure == "fail"
+    entries = [] if entries is None else entries
+    fail = on_failure == "fail"
+    policy: AbstractContextManager[None] = listening(_fatal) if fail else nullcontext()
     try:
-        with writing(replace(outer, events=events, collects=True, fail=fail)):
-            yield events
+        with collected(Failure, Removal, into=entries), policy:
+            yield entries
     except BaseException as error:
-        warn_of(events)
+        warn_of(entries)
         failed = isinstance(error, RuntimeError) and any(text in str(error) for text in _NO_MEMORY)
         if failed or isinstance(error, MemoryError | torch.OutOfMemoryError):
             raise OutOfMemoryError(
@@ -62,29 +74,11 @@ def collecting(
                 "(`decompose.samples_per_pixel`), or close other programs."
             ) from error
         raise
-    for event in events[before:]:
-        if not isinstance(event, Failure | Removal):
-            outer.note(event)
 
 
-def skipped(*failures: Failure, error: BaseException | None = None) -> None:
-    """Record failures that were skipped; outside of :func:`collecting`, warn immediately.
-
-    Raises:
-        ReconstructionError: The journal requires that failures end the run.
-    """
-    journal = current()
-    if failures and journal.fail:
-        first = failures[0]
-        raise ReconstructionError(
-            f"{first.stage}: {first.what} {first.name} failed: {first.reason}. Failures end this "
-            f"run (`on_failure` is fail); with skip it would continue: {first.done}."
-        ) from error
-    if not journal.collects:
-        warn_of(failures)
-        return
-    for failure in failures:
-        journal.note(failure)
+def skipped(*failures: Failure) -> None:
+    """Record failures that were skipped; outside of :func:`skipping`, warn immediately."""
+    warn_of([failure for failure in failures if not emit(failure)])
 
 
 def skipped_patches(
@@ -101,18 +95,17 @@ def skipped_patches(
 
 def skipped_solver(stage: str, name: str, error: BaseException, done: str) -> None:
     """Record equations without a solution; see :func:`skipped`."""
-    reason = reason_of(error)
-    skipped(Failure(stage=stage, what="solver", name=name, reason=reason, done=done), error=error)
+    skipped(Failure(stage=stage, what="solver", name=name, reason=reason_of(error), done=done))
 
 
-def distinct(entries: Sequence[object]) -> tuple[Failure, ...]:
+def failures_of(entries: Iterable[Event]) -> tuple[Failure, ...]:
     """Return the distinct failures, in an order that does not depend on threads."""
-    return tuple(sorted({event for event in entries if isinstance(event, Failure)}, key=_order))
+    return tuple(sorted({entry for entry in entries if isinstance(entry, Failure)}, key=_order))
 
 
-def warn_of(entries: Sequence[object]) -> None:
+def warn_of(entries: Iterable[Event]) -> None:
     """Warn once for each kind of failure, with the number and the first names."""
-    for (stage, what, done), group in groupby(distinct(entries), key=_kind):
+    for (stage, what, done), group in groupby(failures_of(entries), key=_KIND):
         failures = list(group)
         names = list(dict.fromkeys(failure.name for failure in failures))
         listed = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
@@ -145,10 +138,6 @@ def reason_of(error: BaseException) -> str:
     return f"{type(error).__name__.lstrip('_')}: {text}" if text else type(error).__name__
 
 
-def _kind(failure: Failure) -> tuple[str, str, str]:
-    return failure.stage, failure.what, failure.done
-
-
 def _order(failure: Failure) -> tuple[object, ...]:
     number = int(failure.name) if failure.name.isdigit() else -1
-    return (*_kind(failure), number, failure.name, failure.reason)
+    return (*_KIND(failure), number, failure.name, failure.reason)

@@ -1,13 +1,12 @@
 """Module paths of version 0.10, which work for one more version with a warning."""
 
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
-
-from pimper_torch.runtime.renamed import renamed
 
 # Former paths and present ones, in the package; the longest one that matches counts. A folder
 # without a present path only held others.
@@ -61,6 +60,12 @@ _FORMER = {
     "runtime.stage": "stages.stage",
     "runtime.store": "store",
 }
+
+
+def renamed(old: str, new: str) -> str:
+    """Warn that a name has changed, and return the new one."""
+    warnings.warn(f"`{old}` is now `{new}`.", DeprecationWarning, stacklevel=3)
+    return new
 
 
 class FormerModules(MetaPathFinder, Loader):

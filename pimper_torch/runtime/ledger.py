@@ -1,19 +1,18 @@
-"""The ledger of guards: every check that removes data, or warns, records it here.
+"""Guards: every check that removes data, or warns, reports it here.
 
 :attr:`~pimper_torch.records.Reconstruction.left_out` lists the entries of a call of a chain in
 order; a guard that acts in several passes has one entry per pass.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.runtime.errors import some
-from pimper_torch.runtime.events import Removal, What
-from pimper_torch.runtime.journal import Journal, current, writing
+from pimper_torch.runtime.events import Event, Removal, What
+from pimper_torch.runtime.stream import emit
 
 GUARDS: dict[str, tuple[What, str]] = {
     "sfm.static_background": ("features", "on the static background"),
@@ -70,13 +69,31 @@ GUARDS: dict[str, tuple[What, str]] = {
 """All guards, in the order of the chain: the removed elements, or a warning, and the reason."""
 
 Places = Float[Tensor, "place 3"] | tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]
-Listener = Callable[[Removal, Tensor | None, Tensor | None], None]
-"""Receives an entry, the mask of removed elements, and their positions in the world."""
 
 # Fraction up to which the closing message is silent; chosen by hand. Pixels are not listed, because
 # most facets face away from most views; warnings have their own messages.
 _NEGLIGIBLE = 0.05
 _SILENT = ("pixels", "warning")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemovedElements(Event):
+    """The elements of a removal, for listeners.
+
+    Records kept by an earlier run (:mod:`pimper_torch.store`) repeat only the removal.
+
+    Attributes:
+        mask: Removed ones among all elements, if known.
+        at: Positions of all elements in the world, if known.
+    """
+
+    removal: Removal
+    mask: Bool[Tensor, "..."] | None
+    at: Places | None
+
+    def places(self) -> Float[Tensor, "place 3"] | None:
+        """Return the positions, for faces those of their centres."""
+        return self.at[0][self.at[1]].mean(dim=1) if isinstance(self.at, tuple) else self.at
 
 
 def leave_out(
@@ -87,7 +104,7 @@ def leave_out(
     names: Sequence[str] = (),
     at: Places | None = None,
 ) -> None:
-    """Record the elements that a guard removes; a count of zero is also recorded.
+    """Report the elements that a guard removes; a count of zero is also reported.
 
     Args:
         guard: One of :data:`GUARDS`.
@@ -96,50 +113,31 @@ def leave_out(
         names: Names of photographs: of all with a mask, otherwise of the removed ones.
         at: World positions of the elements of the mask: points, or vertices and faces.
     """
-    journal = current()
-    if not journal.collects and journal.masks is None:
-        return
     mask = taken if isinstance(taken, Tensor) else None
     if mask is not None:
         taken, total = int(mask.count_nonzero()), mask.numel()
         if names:
             names = [name for name, removed in zip(names, mask.tolist(), strict=True) if removed]
     what, reason = GUARDS[guard]
-    entry = Removal(
+    removal = Removal(
         guard=guard, what=what, count=int(taken), total=total, reason=reason, names=tuple(names)
     )
-    if journal.collects:
-        journal.note(entry)
-    if journal.masks is not None:
-        journal.masks(entry, mask, at[0][at[1]].mean(dim=1) if isinstance(at, tuple) else at)
+    emit(removal)
+    emit(RemovedElements(removal=removal, mask=mask, at=at))
 
 
-def listening(listener: Listener) -> AbstractContextManager[Journal]:
-    """Pass every entry of the ``with`` block and its threads to a listener, with masks.
-
-    Not of records kept by an earlier run (:mod:`pimper_torch.store`), which have no masks.
-    """
-    return writing(replace(current(), masks=listener))
-
-
-@contextmanager
-def added_up() -> Iterator[None]:
-    """Add up the entries of each guard in the ``with`` block, whose threads process parts."""
-    events = current().so_far()
-    before = len(events)
-    yield
-    sums: dict[tuple[str, str, str], Removal] = {}
-    for entry in left_out_of(events[before:]):
-        key = entry.guard, entry.what, entry.reason
-        if key in sums:
-            count, total = sums[key].count + entry.count, sums[key].total + entry.total
-            entry = entry.replace(count=count, total=total, names=sums[key].names + entry.names)
-        sums[key] = entry
-    others = [entry for entry in events[before:] if not isinstance(entry, Removal)]
-    events[before:] = [*others, *(sums[key] for key in sorted(sums))]  # independent of threads
+def sums_of(removals: Iterable[Removal]) -> list[Removal]:
+    """Return one entry for each guard, which adds up those of parts, in alphabetic order."""
+    sums: dict[str, Removal] = {}
+    for entry in removals:
+        if (earlier := sums.get(entry.guard)) is not None:
+            count, total = earlier.count + entry.count, earlier.total + entry.total
+            entry = entry.replace(count=count, total=total, names=earlier.names + entry.names)
+        sums[entry.guard] = entry
+    return [sums[guard] for guard in sorted(sums)]
 
 
-def left_out_of(entries: Sequence[object]) -> tuple[Removal, ...]:
+def left_out_of(entries: Iterable[Event]) -> tuple[Removal, ...]:
     """Return the entries of guards, in order."""
     return tuple(entry for entry in entries if isinstance(entry, Removal))
 

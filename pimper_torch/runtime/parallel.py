@@ -8,27 +8,30 @@ depends on its batch, not on the number or timing of workers.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from contextvars import copy_context
-from dataclasses import replace
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextvars import ContextVar, copy_context
 from functools import cache
 from itertools import pairwise
 from typing import TypeVar
 
 import torch
 
-from pimper_torch.runtime.journal import current, writing
-from pimper_torch.runtime.ledger import added_up
+from pimper_torch.runtime.events import Event, Progress, Removal
+from pimper_torch.runtime.ledger import left_out_of, sums_of
 from pimper_torch.runtime.mapped import drop_pages
-from pimper_torch.runtime.progress import listening, report
+from pimper_torch.runtime.progress import report
+from pimper_torch.runtime.stream import collected, emit
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+# Whether this thread is one of several, so that its calls must not start more.
+_is_worker: ContextVar[bool] = ContextVar("is_worker", default=False)
+
 
 def num_workers() -> int:
     """Return the number of batches processed in parallel: the number of torch's threads."""
-    return 1 if current().worker else torch.get_num_threads()
+    return 1 if _is_worker.get() else torch.get_num_threads()
 
 
 def side_by_side(
@@ -45,14 +48,23 @@ def side_by_side(
     Raises:
         BaseException: The error of the first item, in order, that failed.
     """
+    events: list[Event] = []
+
+    def apart(item: Item) -> Result:
+        with collected(Removal, Progress, into=events):
+            return work(item)
+
     workers = min(num_workers(), len(items))
-    results = _in_threads(work, items, workers) if workers > 1 else _one_by_one(work, items)
-    with nullcontext() if current().worker else added_up():
+    results = _in_threads(apart, items, workers) if workers > 1 else _one_by_one(apart, items)
+    try:
         for done, result in enumerate(results, start=1):
             yield result
             drop_pages()
             if tracked:
                 report(done, len(items))
+    finally:
+        for removal in sums_of(left_out_of(events)):
+            emit(removal)
 
 
 def over_rows(
@@ -82,7 +94,7 @@ def _idle(workers: int) -> ThreadPoolExecutor:
 
 def _one_by_one(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
     for item in items:
-        with listening(None), _threads(1):
+        with _threads(1):
             result = work(item)
         yield result
 
@@ -93,8 +105,8 @@ def _in_threads(
     grad = torch.is_grad_enabled()
 
     def in_worker(item: Item) -> Result:
-        journal = replace(current(), worker=True, progress=None)
-        with torch.set_grad_enabled(grad), writing(journal):
+        _is_worker.set(True)
+        with torch.set_grad_enabled(grad):
             return work(item)
 
     waiting: deque[Future[Result]] = deque()

@@ -1,24 +1,21 @@
-"""Progress of a stage, for display by the caller.
+"""Progress of a stage, for display by the caller: :class:`~pimper_torch.runtime.events.Progress`.
 
-Stages iterate over batches with :func:`track`; a caller that displays a bar uses :func:`listening`.
+Stages iterate over batches with :func:`track`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
-from pimper_torch.runtime.journal import Journal, current, writing
+from pimper_torch.runtime.events import Event, Progress
+from pimper_torch.runtime.stream import Emit, emit, listening
 
 Item = TypeVar("Item")
-Listener = Callable[[int, int], None]
 
 
 def report(done: int, total: int) -> None:
-    """Inform the listener, if any, that ``done`` of ``total`` steps are finished."""
-    listener = current().progress
-    if listener is not None:
-        listener(done, total)
+    """Inform listeners, if any, that ``done`` of ``total`` steps are finished."""
+    emit(Progress(done=done, total=total))
 
 
 def track(items: Sequence[Item]) -> Iterator[Item]:
@@ -28,23 +25,19 @@ def track(items: Sequence[Item]) -> Iterator[Item]:
         report(done, len(items))
 
 
-def listening(listener: Listener | None) -> AbstractContextManager[Journal]:
-    """Send reports of the ``with`` block to ``listener(done, total)``; ``None`` ignores them."""
-    return writing(replace(current(), progress=listener))
-
-
 @contextmanager
 def part(place: int, count: int) -> Iterator[None]:
     """Report the progress of the ``with`` block as part ``place`` of ``count`` equal parts.
 
     Parts nest, so a stage of several steps with their own reports has one bar.
     """
-    outer = current().progress
 
-    def inside(done: int, total: int) -> None:
-        if outer is not None:
-            outer(place * total + done, count * total)
+    def within(event: Event, outside: Emit) -> bool:
+        if isinstance(event, Progress):
+            done, total = place * event.total + event.done, count * event.total
+            event = Progress(done=done, total=total)
+        return outside(event)
 
-    with listening(inside):
+    with listening(within):
         yield
     report(place + 1, count)

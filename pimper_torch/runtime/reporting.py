@@ -4,12 +4,17 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field
 from threading import Lock
 from typing import Protocol, runtime_checkable
 
-from pimper_torch.runtime.events import StageReport
-from pimper_torch.runtime.journal import HASH, KEEP, Journal, current, writing
+from pimper_torch.runtime.events import Counts, Event, Progress, StageReport, StageStarted
+from pimper_torch.runtime.stream import Emit, emit, listening
+
+# Lines of a run's table for the time outside of stages: hashing their inputs, writing and reading
+# records, and the rest.
+HASH, KEEP, BETWEEN = "hash", "keep", "between stages"
+ASIDE = HASH, KEEP, BETWEEN
 
 _counting = Lock()
 
@@ -37,12 +42,7 @@ class SilentObserver:
     started = progressed = finished = _hear
 
 
-# Line of a run's table for the time outside of stages and of its other lines.
-BETWEEN = "between stages"
-ASIDE = HASH, KEEP, BETWEEN
-
-
-def reported(
+def stage_report(
     name: str, seconds: float, figures: dict[str, int | float] | None = None
 ) -> StageReport:
     """Return the report of a stage or line that has just ended."""
@@ -56,54 +56,68 @@ def seconds_of(reports: Iterable[StageReport]) -> float:
     return sum(report.seconds for report in reports if not report.kept)
 
 
-def gathered(reports: Sequence[StageReport]) -> tuple[StageReport, ...]:
+def table_of(reports: Sequence[StageReport]) -> tuple[StageReport, ...]:
     """Return the reports with the lines outside of stages added up, at the end."""
     groups = [[report for report in reports if report.name == name] for name in ASIDE]
     lines = [group[-1].replace(seconds=seconds_of(group)) for group in groups if group]
     return (*(report for report in reports if report.name not in ASIDE), *lines)
 
 
+@dataclass(slots=True, kw_only=True)
+class RunTable:
+    """Reports of the stages of a ``with`` block, and of lines outside of them.
+
+    Attributes:
+        observer: Receives the stages, except those of a nested block with its own observer.
+        began: Start of the block, in seconds of :func:`time.perf_counter`.
+        running: Names of stages that the observer received and that have not finished.
+    """
+
+    observer: Observer
+    began: float
+    reports: list[StageReport] = field(default_factory=list)
+    running: list[str] = field(default_factory=list)
+
+    def hear(self, event: Event, outside: Emit) -> bool:
+        """Tell the observer of an event, and add a report."""
+        if isinstance(event, StageStarted):
+            self.running.append(event.name)
+            self.observer.started(event.name)
+        elif isinstance(event, Progress):
+            self.observer.progressed(event.done, event.total)
+        elif isinstance(event, StageReport):
+            self.reports.append(event)
+            if event.name in self.running:
+                self.running.remove(event.name)
+                self.observer.finished(event)
+            outside(event)
+        else:
+            return outside(event)
+        return True
+
+    def between(self) -> StageReport:
+        """Return the line of the seconds so far that no other line accounts for."""
+        seconds = time.perf_counter() - self.began - seconds_of(self.reports)
+        return stage_report(BETWEEN, seconds)
+
+    def so_far(self) -> tuple[StageReport, ...]:
+        """Return the lines within the block; their seconds add up to those of the block so far."""
+        return table_of([*self.reports, self.between()])
+
+
 @contextmanager
-def recorded(observer: Observer) -> Iterator[list[StageReport]]:
-    """Collect the reports of the stages in the ``with`` block; see :func:`stage`.
+def observed(observer: Observer) -> Iterator[RunTable]:
+    """Show the stages in the ``with`` block to an observer; see :func:`stage`.
 
     A nested block outside of a stage is part of the outer block.
 
     Yields:
-        A list, filled at the end of the block with the reports, and those of lines outside stages.
+        The table of the block's reports, which is complete at the end of the block.
     """
-    events, reports = current().so_far(), list[StageReport]()
-    before = len(events)
-    journal = replace(
-        current(),
-        events=events,
-        observer=observer,
-        progress=observer.progressed,
-        began=time.perf_counter(),
-        aside={},
-    )
-    with writing(journal):
-        yield reports
-    stages = _reports(events[before:])
-    reports += _lines(journal, stages)
-    events += reports[len(stages) :]
-
-
-def accounted() -> tuple[StageReport, ...]:
-    """Return all lines of the call so far; their seconds add up to those of the call."""
-    journal = current()
-    return () if journal.observer is None else gathered(_lines(journal, journal.so_far()))
-
-
-def _reports(events: Iterable[object]) -> list[StageReport]:
-    return [event for event in events if isinstance(event, StageReport)]
-
-
-def _lines(journal: Journal, events: Iterable[object]) -> list[StageReport]:
-    """Return the reports and the lines outside of stages; they add up to the call's seconds."""
-    lines = [*_reports(events), *(reported(name, time) for name, time in journal.aside.items())]
-    rest = time.perf_counter() - journal.began - seconds_of(lines)
-    return [*lines, reported(BETWEEN, rest)]
+    table = RunTable(observer=observer, began=time.perf_counter())
+    with listening(table.hear):
+        yield table
+        emit(table.between())
 
 
 @contextmanager
@@ -113,24 +127,37 @@ def stage(name: str) -> Iterator[dict[str, int | float]]:
     Yields:
         The figures of the report, for the caller to fill.
     """
-    metrics: dict[str, int | float] = {}
-    journal, began = current(), time.perf_counter()
-    if journal.observer is None:
-        yield metrics
+    figures: dict[str, int | float] = {}
+    began = time.perf_counter()
+
+    def within(event: Event, outside: Emit) -> bool:
+        if isinstance(event, StageStarted | StageReport):
+            return False
+        if not isinstance(event, Counts):
+            return outside(event)
+        with _counting:
+            for key, count in event.counts.items():
+                figures[key] = figures.get(key, 0) + count
+        return True
+
+    if not emit(StageStarted(name=name)):
+        yield figures
         return
-    events = journal.so_far()
-    before = len(events)
-    journal.observer.started(name)
-    with writing(replace(journal, observer=None, figures=metrics)):
-        yield metrics
-    report = reported(name, time.perf_counter() - began, metrics)
-    events[before:] = [event for event in events[before:] if not isinstance(event, StageReport)]
-    events.append(report)
-    journal.observer.finished(report)
+    with listening(within):
+        yield figures
+    emit(stage_report(name, time.perf_counter() - began, figures))
 
 
 @contextmanager
-def part(name: str) -> Iterator[None]:
+def aside(line: str) -> Iterator[None]:
+    """Add the seconds of the ``with`` block to a line of the table, unless a stage is running."""
+    began = time.perf_counter()
+    yield
+    emit(stage_report(line, time.perf_counter() - began))
+
+
+@contextmanager
+def timed(name: str) -> Iterator[None]:
     """Add the seconds of the ``with`` block to the figures of its stage, from any thread."""
     began = time.perf_counter()
     yield
@@ -139,10 +166,7 @@ def part(name: str) -> Iterator[None]:
 
 def add_counts(counts: Mapping[str, int | float]) -> None:
     """Add counts to the figures of the running stage, from any thread."""
-    metrics = current().figures
-    with _counting:
-        for name, count in counts.items():
-            metrics[name] = metrics.get(name, 0) + count
+    emit(Counts(counts=counts))
 
 
 def peak_memory_mb() -> float:

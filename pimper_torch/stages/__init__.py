@@ -22,7 +22,7 @@ _FORMER = {
 
 def __getattr__(name: str) -> object:
     if name in _FORMER:
-        from pimper_torch.runtime.renamed import renamed
+        from pimper_torch.runtime.former_modules import renamed
 
         renamed(f"pimper_torch.stages.{name}", f"pimper_torch.{name}")
         return getattr(sys.modules["pimper_torch"], name)

@@ -14,17 +14,19 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from pimper_torch.records import Failure, Record, Removal, StageReport
+from pimper_torch.records import Record
 from pimper_torch.records.stored import as_json, load_with_metadata, of_json, save_record
 from pimper_torch.runtime.errors import InputError, OutputError, caution
+from pimper_torch.runtime.events import Caution, Event, Failure, Removal, StageReport, StageStarted
 from pimper_torch.runtime.failures import skipped
-from pimper_torch.runtime.journal import KEEP, aside, current, noted
 from pimper_torch.runtime.mapped import copied
+from pimper_torch.runtime.reporting import KEEP, aside
+from pimper_torch.runtime.stream import collected, emit
 from pimper_torch.store.digest import digest
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
-_Events = tuple[str | Failure | Removal | StageReport, ...]
+_Events = tuple[Caution | Failure | Removal | StageReport, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,10 +146,10 @@ def kept(
     if stored is not None:
         record, about = stored
         for event in of_json(about["events"], _Events, "events", {}):
-            _replay(event)
+            _repeat(event)
         return record, about["seconds"]
     began = time.perf_counter()
-    with noted() as events:
+    with collected(Caution, Failure, Removal, StageReport, passed_on=True) as events:
         record = realigned(make())
     seconds = time.perf_counter() - began
     if store and key:
@@ -159,15 +161,12 @@ def kept(
     return record, seconds
 
 
-def _replay(event: str | Failure | Removal | StageReport) -> None:
-    journal = current()
-    if isinstance(event, str):
-        caution(event)
+def _repeat(event: Event) -> None:
+    if isinstance(event, Caution):
+        caution(event.message)
     elif isinstance(event, Failure):
         skipped(event)
-    elif isinstance(event, Removal) and journal.collects:
-        journal.note(event)
-    elif isinstance(event, StageReport) and journal.observer is not None:
-        journal.observer.started(event.name)
-        journal.note(event.replace(kept=True))
-        journal.observer.finished(event.replace(kept=True))
+    elif not isinstance(event, StageReport):
+        emit(event)
+    elif emit(StageStarted(name=event.name)):
+        emit(event.replace(kept=True))

@@ -16,7 +16,8 @@ from torch.testing import assert_close
 from pimper_torch.io.photographs import load_views
 from pimper_torch.radiometry import LINEAR, linear_from_srgb
 from pimper_torch.runtime.errors import InputError, PimperWarning
-from pimper_torch.runtime.progress import listening
+from pimper_torch.runtime.events import Progress
+from pimper_torch.runtime.stream import collected
 from pimper_torch.stages.sfm.lenses import choose_lenses
 
 
@@ -122,10 +123,9 @@ def test_small_photographs_are_not_resized(photos):
 
 
 def test_reading_reports_progress(photos):
-    heard = []
-    with listening(lambda done, total: heard.append((done, total))):
+    with collected(Progress) as heard:
         load_views(photos)
-    assert heard == [(1, 3), (2, 3), (3, 3)]
+    assert heard == [Progress(done=done, total=3) for done in (1, 2, 3)]
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,8 @@ from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import OutputError
-from pimper_torch.runtime.progress import listening
+from pimper_torch.runtime.events import Progress
+from pimper_torch.runtime.stream import collected
 from pimper_torch.stages.meshing.finish import written_channels
 from pimper_torch.viz.report.vertex_layers import surface_layers
 
@@ -51,9 +52,9 @@ def names(folder: Path):
 
 
 def test_a_result_has_exactly_the_listed_files(reconstruction, tmp_path):
-    heard = []
-    with listening(lambda done, total: heard.append(done / total)):
+    with collected(Progress) as events:
         write_result(reconstruction, Config(), tmp_path / "deep" / "out", about={"preset": "paper"})
+    heard = [event.done / event.total for event in events]
     assert heard == sorted(heard)  # one progress bar, filled once
     assert 0 < heard[0] < heard[-1] == 1
     out = tmp_path / "deep" / "out"

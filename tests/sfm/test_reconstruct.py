@@ -11,7 +11,8 @@ from torch.testing import assert_close
 from pimper_torch.geometry.pixels import scale_intrinsics
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperWarning, ReconstructionError
-from pimper_torch.runtime.progress import listening
+from pimper_torch.runtime.events import Progress
+from pimper_torch.runtime.stream import collected
 from pimper_torch.stages.sfm import reconstruct, registration, retrieval, track_observations
 from pimper_torch.stages.sfm.features import workspace
 from pimper_torch.stages.sfm.reconstruct import Reconstruct, find_model, structure_from_motion
@@ -196,9 +197,9 @@ def test_eight_photographs_of_the_skull_are_registered():
 
     views = load_views(str(files("pimper_torch").joinpath("data/skull")))
     chosen = [views.names.index(f"{number}.jpg") for number in (35, 36, 37, 38, 53, 54, 55, 56)]
-    progress: list[tuple[int, int]] = []
-    with listening(lambda done, total: progress.append((done, total))):
+    with collected(Progress) as events:
         scene = Reconstruct(ReconstructConfig(threads=2))(views.take(chosen))
+    progress = [(event.done, event.total) for event in events]
     # Two photographs per thread: two steps of extraction, then one tile of pairs; the guided
     # pairs one by one; then the mapper, from its third view. No background search.
     guided = progress[3][1]

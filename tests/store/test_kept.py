@@ -4,11 +4,13 @@ import pytest
 import torch
 
 from pimper_torch.chains.running import called
-from pimper_torch.records import Cameras, Failure, StageReport
+from pimper_torch.records import Cameras, Failure
 from pimper_torch.runtime.errors import PimperWarning, caution
-from pimper_torch.runtime.failures import collecting, skipped
+from pimper_torch.runtime.events import Caution, Removal
+from pimper_torch.runtime.failures import skipped, skipping
 from pimper_torch.runtime.ledger import leave_out
-from pimper_torch.runtime.reporting import SilentObserver, recorded
+from pimper_torch.runtime.reporting import SilentObserver, observed
+from pimper_torch.runtime.stream import collected
 from pimper_torch.store import Store, digest, kept
 
 
@@ -24,7 +26,7 @@ FAILURE = Failure(stage="warp", what="patch", name="3", reason="numbers", done="
 
 
 def found(store):
-    """Return the record, its messages, and whether it was computed."""
+    """Return the record, its messages, and whether it was computed, and reported as kept."""
     made = []
 
     def make():
@@ -36,25 +38,22 @@ def found(store):
 
     with (
         pytest.warns(PimperWarning, match="doubtful"),
-        collecting() as events,
-        recorded(SilentObserver()),
+        skipping(),
+        observed(SilentObserver()) as table,
+        collected(Caution, Failure, Removal, passed_on=True) as told,
     ):
         record, _ = kept(store, "key", Cameras, lambda: called("stage", make))
-    told = [event for event in events if not isinstance(event, StageReport)]
-    reports = [event.replace(kept=False) for event in events if event not in told]
-    names = [event.name for event in events if event not in told and event.kept]
-    return record, told, [(one.name, one.figures) for one in reports], bool(made), names
+    (report,) = (report for report in table.reports if report.name == "stage")
+    return record, told, bool(made), report.kept
 
 
 def test_stored_records_replay_cautions_failures_guards_and_reports(tmp_path):
     first, second = (found(Store(folder=tmp_path)) for _ in range(2))
     assert digest(first[0]) == digest(second[0])
+    assert [type(event) for event in first[1]] == [Caution, Failure, Removal]
     assert first[1] == second[1]
-    assert len(first[1]) == 3
-    assert ("stage", {}) in first[2]
-    assert ("stage", {}) in second[2]
-    assert (first[3], second[3]) == (True, False)
-    assert (first[4], second[4]) == ([], ["stage"])
+    assert first[2:] == (True, False)
+    assert second[2:] == (False, True)
 
 
 def test_a_record_without_a_key_is_recomputed(tmp_path):

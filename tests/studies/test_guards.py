@@ -10,7 +10,8 @@ from guards import CHANGES, PATCHES, Heard, Judge, table
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.presets.load_config import load_config
 from pimper_torch.records import Mesh
-from pimper_torch.runtime.ledger import GUARDS, leave_out, listening
+from pimper_torch.runtime.ledger import GUARDS, leave_out
+from pimper_torch.runtime.stream import listening
 
 SQUARE = Mesh(
     vertices_world=torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),

@@ -3,7 +3,6 @@
 Problems and solvers are those of :mod:`pimper_torch.stages.photometry`.
 """
 
-from pimper_torch.runtime.renamed import renamed_names
 from pimper_torch.single_view.factorization.ambiguity import Ambiguity
 from pimper_torch.single_view.factorization.bas_relief import BasRelief
 from pimper_torch.single_view.factorization.low_rank import (
@@ -14,8 +13,6 @@ from pimper_torch.single_view.factorization.low_rank import (
     random_left,
     singular_left,
 )
-
-__getattr__ = renamed_names(__name__, {"Free": "FreeManifold", "Restarted": "RestartResult"})
 
 __all__ = [
     "Ambiguity",

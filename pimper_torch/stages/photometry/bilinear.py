@@ -27,7 +27,6 @@ from torch import Tensor
 from pimper_torch.kernels.twin_constants import MAX_STEP, MIN_DEVIATION
 from pimper_torch.linalg.robust import Loss, Squares, robust_deviation
 from pimper_torch.records import Convergence, Record, StopCause
-from pimper_torch.runtime.renamed import renamed_fields
 from pimper_torch.stages.photometry import quadratics
 from pimper_torch.stages.photometry.cone import Cone, Manifold
 
@@ -43,7 +42,6 @@ Packed = Float[Tensor, "patch packed sample"]
 REWEIGHT_EVERY = 3
 
 
-@renamed_fields(anchor="prior_mean")
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Bilinear(Record):
     """A batch of factorization problems, the samples of each patch flattened and padded.
