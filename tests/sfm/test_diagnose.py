@@ -2,8 +2,9 @@ import pytest
 import torch
 from sparse_models import observed, views_of
 
+from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.runtime.errors import PimperWarning
-from pimper_torch.stages.sfm.camera_in_place import follows_camera_in_place, mapped
+from pimper_torch.stages.sfm.camera_in_place import follows_camera_in_place
 from pimper_torch.stages.sfm.diagnose import count_views_with_depth, diagnose, following_fraction
 from pimper_torch.stages.sfm.reconstruct import Reconstruct
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene, write_model
@@ -90,6 +91,12 @@ def test_an_object_has_depth_and_a_background_only_if_alone(generator):
 
 def random_pixels(generator, count=500):
     return 600 * torch.rand(count, 2, generator=generator, dtype=torch.float64)
+
+
+def mapped(matrix, pixels):
+    """Return pixels mapped by a homography."""
+    projective = homogeneous(pixels) @ matrix.mT
+    return projective[:, :2] / projective[:, 2:]
 
 
 def follows(first, second, generator):

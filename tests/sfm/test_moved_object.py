@@ -3,7 +3,7 @@ from itertools import combinations
 import torch
 
 from pimper_torch.stages.sfm.moved_object import (
-    clusters,
+    correlation_clustering,
     find_moved_object,
     object_votes,
     sessions_of,
@@ -106,6 +106,6 @@ def test_clusters_exclude_views_with_negative_affinity():
     weight = torch.zeros(5, 5, dtype=torch.float64)
     for first, second, value in [(0, 1, 9.0), (3, 4, 9.0), (1, 2, 5.0), (2, 3, 4.0), (0, 3, -20.0)]:
         weight[first, second] = weight[second, first] = value
-    assert clusters(weight).tolist() == [0, 0, 0, 1, 1]
+    assert correlation_clustering(weight).tolist() == [0, 0, 0, 1, 1]
     weight[0, 2] = weight[2, 0] = -6.0
-    assert clusters(weight).tolist() == [0, 0, 1, 1, 1]
+    assert correlation_clustering(weight).tolist() == [0, 0, 1, 1, 1]

@@ -12,7 +12,7 @@ from pimper_torch.stages.sfm.diagnose import MatchConsistency, count_views_with_
 from pimper_torch.stages.sfm.features import Workspace
 from pimper_torch.stages.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
-from pimper_torch.stages.sfm.registration import register
+from pimper_torch.stages.sfm.registration import register_photographs
 from pimper_torch.stages.sfm.static_background import StaticBackground
 
 SETTINGS = ReconstructConfig(guided_pairs=1, starts=2, seed=5, threads=1)
@@ -112,7 +112,7 @@ def test_the_mapper_restarts_until_all_views_are_registered(
     scripted, space, models, misplaced, guided, seeds
 ):
     answers = scripted(models, misplaced)
-    assert register(space, SETTINGS).complete
+    assert register_photographs(space, SETTINGS).complete
     assert answers.matched == [
         (False, all_pairs(5)),
         NEIGHBOURS,
@@ -124,7 +124,7 @@ def test_the_mapper_restarts_until_all_views_are_registered(
 def test_two_view_points_are_used_last_and_the_best_model_is_kept(scripted, space):
     some = [[0, 1, 2], [0, 1, 2, 4], EVERY, [0, 1, 2]]
     answers = scripted(some, [{}, {}, {"a.jpg": 0.1, "d.jpg": 0.2}, {}])
-    found = register(space, SETTINGS)
+    found = register_photographs(space, SETTINGS)
     assert answers.mapped == [(5, False), (5, False), (6, False), (5, True)]
     # Four well-placed views are better than five of which two are misplaced.
     assert found.missing == ("d.jpg",)
@@ -134,7 +134,7 @@ def test_two_view_points_are_used_last_and_the_best_model_is_kept(scripted, spac
 def test_without_starts_the_first_model_is_kept(scripted, space):
     answers = scripted([[0, 1, 2]])
     settings = replace(SETTINGS, guided_pairs=0, starts=0)
-    assert register(space, settings).missing == ("d.jpg", "ü.tif")
+    assert register_photographs(space, settings).missing == ("d.jpg", "ü.tif")
     assert answers.matched == [(False, all_pairs(5))]
 
 
@@ -142,14 +142,14 @@ def test_a_model_without_views_of_enough_points_is_rejected(scripted, space, mon
     scripted(4 * [[0, 1]])
     monkeypatch.setattr(registration, "count_views_with_depth", count_views_with_depth)
     monkeypatch.setattr(registration, "MIN_POINTS", 1000)
-    found = register(space, SETTINGS)
+    found = register_photographs(space, SETTINGS)
     assert found.models == ()
     assert found.missing == tuple(space.files)
 
 
 def test_a_plain_model_with_enough_inliers_skips_the_background_search(scripted, space):
     answers = scripted([EVERY], inlier_ratio=[0.95], rest=BACKGROUND, around=MOVED)
-    found = register(space, SETTINGS)
+    found = register_photographs(space, SETTINGS)
     assert answers.asked == []
     assert not found.background
     assert found.around == ()
@@ -157,17 +157,17 @@ def test_a_plain_model_with_enough_inliers_skips_the_background_search(scripted,
 
 def test_linked_sessions_are_used_if_they_have_clearly_more_inliers(scripted, space):
     answers = scripted([EVERY, EVERY], inlier_ratio=[0.7, 0.98], around=MOVED)
-    assert register(space, SETTINGS).around == MOVED
+    assert register_photographs(space, SETTINGS).around == MOVED
     assert answers.databases == ["database.db", "other.db"]
     assert (space.folder / "other.db").read_bytes() == b"features and matches"
     scripted([EVERY, EVERY], inlier_ratio=[0.85, 0.94], around=MOVED)
-    assert register(space, SETTINGS).around == ()
+    assert register_photographs(space, SETTINGS).around == ()
 
 
 def test_a_model_that_loses_photographs_is_not_preferred(scripted, space):
     some = [EVERY, *4 * [[0, 1, 2]]]
     scripted(some, inlier_ratio=[0.7, *4 * [0.5]], around=MOVED)
-    found = register(space, SETTINGS)
+    found = register_photographs(space, SETTINGS)
     assert not found.missing
     assert found.around == ()
 
@@ -177,7 +177,7 @@ def test_a_background_is_removed_if_the_plain_model_is_unreliable(scripted, spac
     doubts = ["follows a camera in its place", ""]
     monkeypatch.setattr(registration, "diagnose", lambda model, count: doubts.pop(0))
     with pytest.warns(PimperWarning, match="5 of 10 features are static"):
-        found = register(space, SETTINGS)
+        found = register_photographs(space, SETTINGS)
     assert len(found.background) == 5
     assert found.inlier_ratio == 1
 
@@ -186,7 +186,7 @@ def test_likely_pairs_of_many_photographs_are_matched_first(scripted, space, mon
     answers = scripted([[0, 1, 2, 4], EVERY], [{"c 1.png": 0.1}, {}])
     monkeypatch.setattr(registration, "MOST_PAIRED", 4)
     monkeypatch.setattr(registration, "pairs_to_match", lambda space: NEIGHBOURS[1])
-    found = register(space, SETTINGS)
+    found = register_photographs(space, SETTINGS)
     assert found.complete
     apart = [pair for pair in all_pairs(5) if {2, 3} & set(pair)]
     assert answers.matched == [(False, NEIGHBOURS[1]), NEIGHBOURS, (False, apart), (True, apart)]

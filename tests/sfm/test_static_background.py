@@ -4,7 +4,7 @@ import torch
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.stages.sfm.epipolar import fundamental_matrix, sampson_errors, shared_geometry
-from pimper_torch.stages.sfm.matching import pixels_of
+from pimper_torch.stages.sfm.matching import match_ends
 from pimper_torch.stages.sfm.static_background import moving_matches
 from tests.sfm.captured import Captured, orbit, seen_of_ball, turntable
 
@@ -43,7 +43,7 @@ def test_distant_points_under_a_shifting_camera_are_not_background(generator):
     near = seen_of_ball(generator, 600, cameras)
     far, _ = project(far, cameras.cam_from_world, cameras.intrinsics)
     scene = Captured(generator, torch.cat([near, far], dim=1))
-    ends = [pixels_of(scene.keypoints, pair, rows) for pair, rows in scene.pairs.items()]
+    ends = [match_ends(scene.keypoints, pair, rows) for pair, rows in scene.pairs.items()]
     still = [((first - second).norm(dim=1) < 1).sum() for first, second in ends]
     assert min(still) > 100  # the distant ones are static
     rest = scene.rest()

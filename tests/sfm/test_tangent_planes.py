@@ -5,7 +5,7 @@ from pimper_torch.stages.sfm.track_observations import (
     evenly,
     plane_homographies,
     plane_normals,
-    tangents,
+    tangent_planes,
 )
 from tests.sfm import ball
 
@@ -28,7 +28,7 @@ def test_an_isolated_or_edge_on_point_faces_the_cameras(generator):
 def test_steps_are_in_the_plane_and_about_a_pixel_of_the_reference(generator):
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(300, generator)
-    planes = tangents(points, torch.ones(len(points), 6, dtype=torch.bool), cameras)
+    planes = tangent_planes(points, torch.ones(len(points), 6, dtype=torch.bool), cameras)
     first, second = planes.steps_world.unbind(dim=1)
     assert (first * second).sum(-1).abs().max() < 1e-12
     moved, _ = project(
@@ -48,7 +48,7 @@ def test_the_reference_is_a_view_that_sees_the_point_and_never_a_candidate(gener
     points = ball.points_on_the_ball(300, generator)
     observed = torch.rand(len(points), 6, generator=generator) < 0.4
     observed[:, 3] = True
-    planes = tangents(points, observed, cameras)
+    planes = tangent_planes(points, observed, cameras)
     each = torch.arange(len(points))
     assert observed[each, planes.reference].all()
     assert not planes.candidates[each, planes.reference].any()
@@ -63,7 +63,7 @@ def test_views_behind_the_plane_or_without_the_point_are_not_candidates(generato
     by_side = cameras.centers_world[:, 0].argsort()
     observed = torch.zeros(len(points), 6, dtype=torch.bool)
     observed[:, by_side[-1]] = True
-    planes = tangents(points, observed, cameras)
+    planes = tangent_planes(points, observed, cameras)
     assert not planes.candidates[:-1, by_side[:2]].any()
     assert planes.candidates[:-1, by_side[2:-1]].all()
     assert not planes.candidates[-1].any()
@@ -72,7 +72,7 @@ def test_views_behind_the_plane_or_without_the_point_are_not_candidates(generato
 def test_homographies_map_steps_of_the_plane_to_pixels(generator):
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_ball(20, generator)
-    planes = tangents(points, torch.ones(20, 6, dtype=torch.bool), cameras)
+    planes = tangent_planes(points, torch.ones(20, 6, dtype=torch.bool), cameras)
     place = torch.tensor([3.0, -2.0, 1.0]).double()
     homogeneous = plane_homographies(planes, cameras, 2, torch.arange(20)) @ place
     expected, _ = project(

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from pimper_torch.geometry.projection import project
-from pimper_torch.stages.sfm.track_observations import log_pictures, observe_points, tangents
+from pimper_torch.stages.sfm.track_observations import log_pictures, observe_points, tangent_planes
 from tests.sfm import ball
 
 
@@ -11,7 +11,7 @@ def scene():
     generator = torch.Generator().manual_seed(3)
     cameras = ball.cameras_on_an_arc()
     points = ball.points_on_the_wall(150, generator)
-    planes = tangents(points, torch.ones(len(points), 6, dtype=torch.bool), cameras)
+    planes = tangent_planes(points, torch.ones(len(points), 6, dtype=torch.bool), cameras)
     pixels, _ = project(points, cameras.cam_from_world, cameras.intrinsics)
     return cameras, planes, pixels
 

@@ -64,7 +64,7 @@ def center_errors(found, scene):
 
 def compare(views, scene):
     """Return median errors of the cameras, without and with masks of the object."""
-    with pytest.warns(PimperWarning, match="features lie still .* are left out"):
+    with pytest.warns(PimperWarning, match="features are static .* and removed"):
         without = Reconstruct(QUICK)(views.replace(masks=None))
     masked = Reconstruct(QUICK)(views)  # a warning would be an error
     assert without.unregistered == masked.unregistered == ()

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_torch.geometry.quarter_turns import turned_pose
 from pimper_torch.geometry.rigid import invert_rigid, rigid, transform
-from pimper_torch.stages.sfm.upright import level_up, upright
+from pimper_torch.stages.sfm.upright import level_up, rotate_upright
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_up_is_the_normal_of_the_supporting_plane(generator):
     table[:, 1] = -0.5
     above = 0.3 * torch.randn(300, 3, generator=generator).double().clamp(-1.5, 1.5)
     points, frame = torch.cat([above, table]), any_frame(generator)
-    found = upright(model_of(cameras.replace(cam_from_world=leaning), points, frame))
+    found = rotate_upright(model_of(cameras.replace(cam_from_world=leaning), points, frame))
     assert_close(found.points_world[300:, 1].std(), torch.tensor(0.0).double(), atol=1e-9, rtol=0)
     assert bool((found.points_world[:300, 1].mean() > found.points_world[300:, 1]).all())
     assert bool((invert_rigid(found.cam_from_world)[:, 1, 3] > found.points_world[300, 1]).all())
@@ -102,7 +102,7 @@ def test_a_wall_is_not_mistaken_for_the_ground(generator):
     wall = torch.rand(300, 3, generator=generator).double() * 2 - 1
     wall[:, 2] = -0.2
     frame = any_frame(generator)
-    found = upright(model_of(cameras, wall, frame))
+    found = rotate_upright(model_of(cameras, wall, frame))
     assert_close(found.points_world[:, 2].std(), torch.tensor(0.0).double(), atol=1e-3, rtol=0)
 
 
@@ -110,7 +110,7 @@ def test_cameras_are_on_the_side_of_z_and_a_model_is_only_rotated(generator):
     cameras = standing(9, span_deg=60.0)
     points, frame = torch.randn(50, 3, generator=generator), any_frame(generator)
     model = model_of(cameras, points, frame)
-    found = upright(model)
+    found = rotate_upright(model)
     eyes = invert_rigid(found.cam_from_world)[:, :3, 3]
     assert bool((eyes[:, 2] - found.points_world[:, 2].mean() > 0).all())
     assert_close(eyes.norm(dim=1), invert_rigid(model.cam_from_world)[:, :3, 3].norm(dim=1))
@@ -119,5 +119,5 @@ def test_cameras_are_on_the_side_of_z_and_a_model_is_only_rotated(generator):
         for each in (model, found)
     ]
     assert_close(*seen)
-    again = upright(found)
+    again = rotate_upright(found)
     assert_close(again.points_world, found.points_world, atol=1e-6, rtol=0)

@@ -13,11 +13,8 @@ A plane that turns with the object, such as a table, also moves by homographies,
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex128, Float
 from torch import Tensor
-
-from pimper_torch.geometry.pixels import homogeneous
-from pimper_torch.records.shapes import Matrix3
 
 # Zoom, and roll in radians, of a touched tripod or a cropped image: a choice.
 _MAX_ZOOM, _MAX_ROLL = 1.3, 0.35
@@ -45,8 +42,7 @@ def follows_camera_in_place(
     none = torch.zeros(len(first), dtype=torch.bool)
     if len(first) < 2:
         return none
-    first, second = first.double(), second.double()
-    x, y = (torch.view_as_complex(pixels.contiguous()) for pixels in (first, second))
+    x, y = (torch.view_as_complex(pixels.double().contiguous()) for pixels in (first, second))
     # With probability 0.99 one pair is of the background if that has 15 % of the matches.
     start, stop = torch.randint(len(x), (2, 200), generator=generator)
     scale = (y[stop] - y[start]) / (x[stop] - x[start])  # not finite if both are one match
@@ -59,39 +55,27 @@ def follows_camera_in_place(
     error = (scale[:, None] * x[sample] + shift[:, None] - y[sample]).abs()
     best = int((error < 2 * max_error_px).sum(dim=1).argmax())
     follows = (scale[best] * x + shift[best] - y).abs() < 2 * max_error_px
+    x, y = (pixels - torch.view_as_complex(centre.double()) for pixels in (x, y))
     for _ in range(10):
         if follows.sum() < 8:
             break
-        matrix = least_squares_map(first[follows], second[follows], centre)
-        follows = (mapped(matrix, first) - second).norm(dim=1) < max_error_px
+        follows = _residuals(x, y, follows).abs() < max_error_px
     return follows
 
 
-def least_squares_map(
-    first: Float[Tensor, "match 2"], second: Float[Tensor, "match 2"], centre: Float[Tensor, " 2"]
-) -> Matrix3:
-    """Fit a similarity with a perspective row about a centre; float64.
+def _residuals(
+    x: Complex128[Tensor, " match"], y: Complex128[Tensor, " match"], fitted: Bool[Tensor, " match"]
+) -> Complex128[Tensor, " match"]:
+    """Fit a similarity with a perspective row to some matches, and return the residuals of all.
 
-    The residuals are multiplied by the denominators, which are about 1 for small turns.
+    The fitted residuals are multiplied by the denominators, which are about 1 for small turns.
     """
-    size = first.std().clamp_min(1e-9)
-    x, y = (first - centre) / size, (second - centre) / size
-    ones, zeros = torch.ones_like(x[:, :1]), torch.zeros_like(x[:, :1])
-    u, v = x[:, :1], x[:, 1:]
-    linear = [torch.cat([u, -v, ones, zeros], dim=1), torch.cat([v, u, zeros, ones], dim=1)]
-    rows = torch.cat(
-        [torch.cat([terms, -y[:, axis, None] * x], dim=1) for axis, terms in enumerate(linear)]
-    )
-    a, b, u0, v0, p, q = torch.linalg.lstsq(rows, y.mT.reshape(-1, 1), driver="gelsd").solution[
-        :, 0
-    ]
-    elements = torch.stack([a, -b, u0, b, a, v0, p, q, torch.ones_like(a)])
-    scaling = torch.diag(torch.stack([1 / size, 1 / size, torch.ones_like(size)]))
-    scaling[:2, 2] = -centre / size
-    return torch.linalg.solve(scaling, elements.reshape(3, 3) @ scaling)
-
-
-def mapped(matrix: Matrix3, pixels: Float[Tensor, "pixel 2"]) -> Float[Tensor, "pixel 2"]:
-    """Return pixels mapped by a homography; float64."""
-    projective = homogeneous(pixels.double()) @ matrix.mT
-    return projective[:, :2] / projective[:, 2:]
+    size = torch.view_as_real(x[fitted]).std().clamp_min(1e-9)
+    x, y = x / size, y / size
+    ones = torch.ones_like(x)
+    columns = torch.stack([x, 1j * x, ones, 1j * ones, -x.real * y, -x.imag * y], dim=1)
+    rows, right = torch.cat([columns.real, columns.imag]), torch.cat([y.real, y.imag])
+    used = fitted.repeat(2)
+    elements = torch.linalg.lstsq(rows[used], right[used, None], driver="gelsd").solution[:, 0]
+    numerator = columns[:, :4] @ elements[:4].to(x)
+    return size * (numerator / (1 + x.real * elements[4] + x.imag * elements[5]) - y)

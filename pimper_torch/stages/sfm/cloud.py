@@ -7,6 +7,7 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from pimper_torch.geometry.projection import project
+from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.geometry.undistortion import pinholes_for
 from pimper_torch.records import Views
 from pimper_torch.records.shapes import Points
@@ -40,8 +41,7 @@ def cloud_tracks(views: Views, model: SparseModel) -> SparseModel:
     pixels, depth = project(points, model.cam_from_world, pinholes_for(model.lenses))
     sizes = torch.tensor([[[lens.width, lens.height]] for lens in model.lenses])
     inside = ((pixels > 0) & (pixels < sizes)).all(dim=-1) & (depth > 0)
-    rotations, shifts = model.cam_from_world[:, :3, :3], model.cam_from_world[:, :3, 3]
-    centers = -(rotations.mT @ shifts[..., None])[..., 0]
+    centers = invert_rigid(model.cam_from_world)[:, :3, 3]
     visible = torch.stack([visible_from(points, center) for center in centers])
     point, view = torch.nonzero((visible & inside).mT, as_tuple=True)
     expected = model.replace(

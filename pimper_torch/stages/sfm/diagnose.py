@@ -16,6 +16,7 @@ the correct model, because its sides look alike.
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
@@ -178,11 +179,8 @@ def following_fraction(model: SparseModel) -> float:
         fractions = []
         for view in range(model.num_views):
             if view != reference:
-                others = points[view]
-                shared = torch.nonzero(torch.isin(points[reference], others))[:, 0]
-                order = others.argsort()
-                matched = order[torch.searchsorted(others[order], points[reference][shared])]
-                ends = pixels[view][matched], pixels[reference][shared]
+                both = np.intersect1d(points[view], points[reference], return_indices=True)
+                ends = pixels[view][both[1]], pixels[reference][both[2]]
                 follows = follows_camera_in_place(*ends, centre, max_error_px, generator)
                 enough = int(follows.sum()) >= MIN_MATCHES
                 fractions.append(float(follows.double().mean()) if enough else 0.0)
@@ -211,16 +209,23 @@ class MatchConsistency:
     misplaced: Mapping[str, float]
 
 
-def verify_model(
-    model: SparseModel, files: Sequence[str], pairs: Sequence[VerifiedPair], max_error_px: float
-) -> MatchConsistency:
-    """Compute the agreement of a model with verified matches."""
-    view_of = {files.index(name): view for view, name in enumerate(model.names)}
-    inside = [
+def pairs_in(
+    model: SparseModel, names: Sequence[str], pairs: Sequence[VerifiedPair]
+) -> list[VerifiedPair]:
+    """Return the pairs of a model's photographs, with numbers of its views instead of ``names``."""
+    view_of = {names.index(name): view for view, name in enumerate(model.names)}
+    return [
         pair.replace(views=(view_of[pair.views[0]], view_of[pair.views[1]]))
         for pair in pairs
         if all(number in view_of for number in pair.views)
     ]
+
+
+def verify_model(
+    model: SparseModel, files: Sequence[str], pairs: Sequence[VerifiedPair], max_error_px: float
+) -> MatchConsistency:
+    """Compute the agreement of a model with verified matches."""
+    inside = pairs_in(model, files, pairs)
     agrees = match_errors(model, inside) <= max_error_px
     counts = [pair.num_matches for pair in inside]
     agreeing = {

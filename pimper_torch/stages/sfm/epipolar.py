@@ -17,7 +17,13 @@ from pimper_torch.geometry.pixels import homogeneous
 from pimper_torch.records import Cameras
 from pimper_torch.records.shapes import Matrix3
 from pimper_torch.records.sparse_model import SparseModel
-from pimper_torch.stages.sfm.matching import PhotographPair, VerifiedPair
+from pimper_torch.stages.sfm.matching import (
+    Keypoints,
+    PhotographPair,
+    Rows,
+    VerifiedPair,
+    match_ends,
+)
 
 Matched = Float[Tensor, "match 2"]
 Ends = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ 2"]]  # of matches, in two photographs
@@ -65,6 +71,18 @@ def shared_geometry(static: Ends, moving: Ends, max_error_px: float) -> Matrix3:
         tiny = torch.finfo(gradient.dtype).tiny
         weight = balanced / (gradient.clamp_min(tiny) * (1 + (error / max_error_px).square()))
     return geometry
+
+
+def violating(
+    keypoints: Keypoints, pair: PhotographPair, static: Rows, moving: Rows, max_error_px: float
+) -> list[Bool[Tensor, " _"]]:
+    """Return the matches of each motion that no geometry explains together with the other's.
+
+    They are few in a rigid scene, and many if two rigid bodies move (motion segmentation).
+    """
+    ends = match_ends(keypoints, pair, static), match_ends(keypoints, pair, moving)
+    shared = shared_geometry(ends[0], ends[1], max_error_px)
+    return [sampson_errors(shared, *end) > max_error_px for end in ends]
 
 
 def epipolar_geometry(cameras: Cameras, views: PhotographPair) -> Matrix3:

@@ -116,14 +116,12 @@ def verified_pairs(space: Workspace) -> list[VerifiedPair]:
     with quiet(), loaded().Database.open(space.database) as database:
         images = image_ids(database, space)
         pixels = [read_pixels(database, image) for image in images]
-        geometries = read_geometries(database, images)
-    rows = {pair: indices(g.inlier_matches) for pair, g in geometries.items()}
-    return pairs_of(pixels, rows)
+        return pairs_of(pixels, read_verified(database, images))
 
 
 def pairs_of(keypoints: Keypoints, matches: Matches) -> list[VerifiedPair]:
     """Return matches as pixels, float64, of the pairs with any."""
-    ends = {pair: pixels_of(keypoints, pair, rows) for pair, rows in matches.items() if len(rows)}
+    ends = {pair: match_ends(keypoints, pair, rows) for pair, rows in matches.items() if len(rows)}
     return [
         VerifiedPair(views=pair, first=first.double(), second=second.double())
         for pair, (first, second) in ends.items()
@@ -241,45 +239,26 @@ def read_features(database: Any, image: int) -> Features:  # noqa: ANN401 - pyco
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Matched:
-    """Photographs and matches in COLMAP's database before verification."""
+class Verifier:
+    """Photographs and matches of COLMAP's database, and verification of a subset, in parallel.
+
+    Uses its own database: COLMAP's function for a single pair would hold Python's lock.
+
+    Attributes:
+        pairs: Matches before verification.
+        geometries: Geometries of all pairs verified so far.
+    """
 
     ids: tuple[int, ...]
     cameras: tuple[Any, ...]
     keypoints: Keypoints
     pairs: Matches
-
-
-def read_matched(database: Any) -> Matched:  # noqa: ANN401 - pycolmap has no types before it is loaded
-    """Read features and matches."""
-    images = sorted(database.read_all_images(), key=lambda image: image.name)
-    ids = tuple(image.image_id for image in images)
-    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-    return Matched(
-        ids=ids,
-        cameras=tuple(cameras[image.camera_id] for image in images),
-        keypoints=[read_pixels(database, image) for image in ids],
-        pairs={pair: indices(rows) for pair, rows in _pairs(database.read_all_matches(), ids)},
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verifier:
-    """COLMAP's verification of pairs with a subset of their matches, in parallel.
-
-    Uses its own database: COLMAP's function for a single pair would hold Python's lock.
-
-    Attributes:
-        geometries: Geometries of all verified pairs so far.
-    """
-
-    matched: Matched
     settings: ReconstructConfig
     geometries: dict[PhotographPair, Any] = field(default_factory=dict)
 
     def __call__(self, pairs: Matches) -> dict[PhotographPair, Rows]:
         """Return the verified matches of each pair."""
-        pycolmap, matched, settings = loaded(), self.matched, self.settings
+        pycolmap, settings = loaded(), self.settings
         options = pycolmap.TwoViewGeometryOptions()
         options.min_num_inliers = MIN_MATCHES
         options.ransac.max_error = settings.max_error_px
@@ -289,13 +268,13 @@ class Verifier:
         options.ransac.max_num_trials = 1000
         verifying = pycolmap.GeometricVerifierOptions()
         verifying.num_threads = settings.num_threads
-        ids = {pair: tuple(matched.ids[view] for view in pair) for pair in pairs}
+        ids = {pair: tuple(self.ids[view] for view in pair) for pair in pairs}
         with scratch() as folder:
             path = folder / "pairs.db"
             with pycolmap.Database.open(path) as database:
-                for camera in {camera.camera_id: camera for camera in matched.cameras}.values():
+                for camera in {camera.camera_id: camera for camera in self.cameras}.values():
                     database.write_camera(camera, use_camera_id=True)
-                views = zip(matched.ids, matched.cameras, matched.keypoints, strict=True)
+                views = zip(self.ids, self.cameras, self.keypoints, strict=True)
                 for image, camera, pixels in views:
                     record = pycolmap.Image(
                         name=str(image), camera_id=camera.camera_id, image_id=image
@@ -311,9 +290,29 @@ class Verifier:
         return {pair: indices(geometry.inlier_matches) for pair, geometry in geometries.items()}
 
 
+def read_verifier(database: Any, settings: ReconstructConfig) -> Verifier:  # noqa: ANN401 - pycolmap is untyped
+    """Read features and matches."""
+    images = sorted(database.read_all_images(), key=lambda image: image.name)
+    ids = tuple(image.image_id for image in images)
+    cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    return Verifier(
+        ids=ids,
+        cameras=tuple(cameras[image.camera_id] for image in images),
+        keypoints=[read_pixels(database, image) for image in ids],
+        pairs={pair: indices(rows) for pair, rows in _pairs(database.read_all_matches(), ids)},
+        settings=settings,
+    )
+
+
 def read_geometries(database: Any, images: Sequence[int]) -> dict[PhotographPair, Any]:  # noqa: ANN401
     """Read the geometries of verified pairs, keyed by indices into ``images``."""
     return dict(_pairs(database.read_two_view_geometries(), images))
+
+
+def read_verified(database: Any, images: Sequence[int]) -> Matches:  # noqa: ANN401
+    """Read the verified matches of the pairs with any, keyed by indices into ``images``."""
+    geometries = read_geometries(database, images).items()
+    return {pair: indices(g.inlier_matches) for pair, g in geometries if len(g.inlier_matches)}
 
 
 def _pairs(listed: Any, images: Sequence[int]) -> Iterator[tuple[PhotographPair, Any]]:  # noqa: ANN401
@@ -329,7 +328,7 @@ def read_pixels(database: Any, image: int) -> Float[Tensor, "feature 2"]:  # noq
     return torch.from_numpy(np.array(database.read_keypoints(image))[:, :2].copy())
 
 
-def pixels_of(
+def match_ends(
     keypoints: Keypoints, pair: PhotographPair, rows: Rows
 ) -> tuple[Float[Tensor, "match 2"], Float[Tensor, "match 2"]]:
     """Return the pixels of a pair's matches in both photographs."""
@@ -344,7 +343,7 @@ def add_votes(
         votes[view].index_add_(0, rows[:, side], cast[:, side].to(votes[view]))
 
 
-def indices(rows: Any) -> Int[Tensor, "match 2"]:  # noqa: ANN401 - see read_matched
+def indices(rows: Any) -> Int[Tensor, "match 2"]:  # noqa: ANN401 - pycolmap is untyped
     """Convert COLMAP's matches to rows of a tensor."""
     return torch.from_numpy(np.array(rows).astype(np.int64)).reshape(-1, 2)
 

@@ -21,8 +21,8 @@ from pimper_torch.records.sparse_model import SparseModel, select_views
 from pimper_torch.runtime.errors import caution, some
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.stages.sfm import matching
-from pimper_torch.stages.sfm.diagnose import FEWEST_VIEWS, JOINING, agreement
-from pimper_torch.stages.sfm.epipolar import sampson_errors, shared_geometry
+from pimper_torch.stages.sfm.diagnose import FEWEST_VIEWS, JOINING, agreement, pairs_in
+from pimper_torch.stages.sfm.epipolar import violating
 from pimper_torch.stages.sfm.matching import Keypoints, Matches, PhotographPair, Rows
 from pimper_torch.stages.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
@@ -73,10 +73,8 @@ def find_moved_object(
     seconds = {}
     for pair, second in verify(frequent).items():
         if len(second) >= max(_MIN_SECOND, _MIN_FRACTION * len(frequent[pair])):
-            ends = [matching.pixels_of(keypoints, pair, rows) for rows in (verified[pair], second)]
-            shared = shared_geometry(ends[0], ends[1], max_error_px)
-            far = [(sampson_errors(shared, *end) > max_error_px).double().mean() for end in ends]
-            if float(torch.stack(far).amax()) > 0.2:  # no geometry explains both
+            far = violating(keypoints, pair, verified[pair], second, max_error_px)
+            if max(float(x.double().mean()) for x in far) > 0.2:  # no geometry explains both
                 seconds[pair] = second
     if len(seconds) < 3:  # a thing that was moved between two photographs is in few
         return one_session
@@ -84,24 +82,22 @@ def find_moved_object(
     sessions = sessions_of(len(keypoints), verified, seconds, votes)
     if int(sessions.max()) == 0:
         return one_session
-    object_matches, others = {}, {}
+    object_matches, others, around = {}, {}, {}
     for pair, rows in verified.items():
+        second = seconds.get(pair, rows[:0])
         if sessions[pair[0]] != sessions[pair[1]]:
             counts = _counts(votes, pair, rows)
-            if counts[0] <= counts[1]:
+            if pair in seconds:
+                object_matches[pair] = second if counts[0] <= counts[1] else rows
+            elif counts[0] <= counts[1]:  # otherwise the pair stays unchanged
                 cast = [votes[view][outside[pair][:, side]] for side, view in enumerate(pair)]
                 others[pair] = outside[pair][torch.stack(cast).amin(dim=0) >= 0]
-            elif pair in seconds:
-                object_matches[pair] = rows  # without a second geometry the pair stays unchanged
-    object_matches |= verify({pair: rows for pair, rows in others.items() if pair not in seconds})
-    object_matches |= {pair: seconds[pair] for pair in others if pair in seconds}
+        both = torch.cat([rows, second])
+        around[pair] = both[_total(votes, pair, both) < 0]
+    object_matches |= verify(others)
     tying = {pair: rows for pair, rows in object_matches.items() if len(rows) >= MIN_MATCHES}
-    dropped = [pair for pair in object_matches if pair not in tying]
-    matches = {
-        pair: torch.cat([rows, seconds.get(pair, rows[:0])]) for pair, rows in verified.items()
-    }
-    around = {pair: rows[_total(votes, pair, rows) < 0] for pair, rows in matches.items()}
-    return MovedObject(sessions=sessions, tying=tying, dropped=tuple(dropped), around=around)
+    dropped = tuple(pair for pair in object_matches if pair not in tying)
+    return MovedObject(sessions=sessions, tying=tying, dropped=dropped, around=around)
 
 
 def object_votes(
@@ -153,10 +149,10 @@ def sessions_of(
             weight[pair] = min(smaller, _ENOUGH)
         else:
             weight[pair] = 0.001 * len(rows)  # these may be of one body alone
-    return clusters(weight + weight.mT)
+    return correlation_clustering(weight + weight.mT)
 
 
-def clusters(weight: Float[Tensor, "view view"]) -> Int[Tensor, " view"]:
+def correlation_clustering(weight: Float[Tensor, "view view"]) -> Int[Tensor, " view"]:
     """Merge the two groups that attract most until all repel; number groups by first member."""
     weight = weight.clone()
     group = torch.arange(len(weight))
@@ -191,30 +187,23 @@ def link_sessions(database: Path, settings: ReconstructConfig) -> tuple[matching
         Matches of the surroundings, within sessions and between; empty if nothing was moved.
     """
     with quiet(), loaded().Database.open(database) as stored:
-        matched = matching.read_matched(stored)
-        geometries = {
-            pair: geometry
-            for pair, geometry in matching.read_geometries(stored, matched.ids).items()
-            if len(geometry.inlier_matches) >= MIN_MATCHES
-        }
-        verified = {pair: matching.indices(g.inlier_matches) for pair, g in geometries.items()}
+        verifier = matching.read_verifier(stored, settings)
+        verified = matching.read_verified(stored, verifier.ids)
         outside = {
-            pair: rows[~matching.among(rows, verified[pair])]
-            for pair, rows in matched.pairs.items()
-            if pair in verified
+            pair: verifier.pairs[pair][~matching.among(verifier.pairs[pair], rows)]
+            for pair, rows in verified.items()
         }
-        verifier = matching.Verifier(matched=matched, settings=settings)
-        sizes = torch.tensor([(camera.width, camera.height) for camera in matched.cameras]).float()
+        sizes = torch.tensor([(camera.width, camera.height) for camera in verifier.cameras]).float()
         moved = find_moved_object(
-            matched.keypoints, sizes, verified, outside, verifier, settings.max_error_px
+            verifier.keypoints, sizes, verified, outside, verifier, settings.max_error_px
         )
         for pair, rows in moved.tying.items():
             if not torch.equal(rows, verified[pair]):
-                ids = matched.ids[pair[0]], matched.ids[pair[1]]
+                ids = verifier.ids[pair[0]], verifier.ids[pair[1]]
                 stored.update_two_view_geometry(*ids, verifier.geometries[pair])
         for pair in moved.dropped:
-            stored.delete_two_view_geometry(matched.ids[pair[0]], matched.ids[pair[1]])
-    return tuple(matching.pairs_of(matched.keypoints, moved.around))
+            stored.delete_two_view_geometry(verifier.ids[pair[0]], verifier.ids[pair[1]])
+    return tuple(matching.pairs_of(verifier.keypoints, moved.around))
 
 
 def sessions_in(
@@ -229,20 +218,16 @@ def sessions_in(
     Args:
         around: Matches of the surroundings, with numbers of photographs.
     """
-    view_of = {names.index(name): view for view, name in enumerate(model.names)}
     weight = torch.zeros(model.num_views, model.num_views, dtype=torch.float64)
-    for pair in around:
-        if all(number in view_of for number in pair.views):
-            first, second = (view_of[number] for number in pair.views)
-            fraction = agreement(model, pair.replace(views=(first, second)), 4.0)
-            votes = (2 * fraction - 1) * min(pair.num_matches, _ENOUGH)
-            weight[first, second] = weight[second, first] = votes
-    group = clusters(weight)
+    for pair in pairs_in(model, names, around):
+        votes = (2 * agreement(model, pair, 4.0) - 1) * min(pair.num_matches, _ENOUGH)
+        weight[pair.views] = weight[pair.views[::-1]] = votes
+    group = correlation_clustering(weight)
     member = torch.nn.functional.one_hot(group).double()
     points = model.observed.double() @ member
     small = member.sum(dim=0) < FEWEST_VIEWS
     apart = (member.mT @ weight @ member < 0) | small | small[:, None]
-    return clusters(torch.where(apart, -torch.inf, points.mT @ points))[group]
+    return correlation_clustering(torch.where(apart, -torch.inf, points.mT @ points))[group]
 
 
 def with_sessions(

@@ -19,10 +19,10 @@ from pimper_torch.stages.sfm.moved_object import sessions_in, with_sessions
 from pimper_torch.stages.sfm.poses import expand_to_photographs, mean_images
 from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.stages.sfm.refine_tracks import refine_tracks
-from pimper_torch.stages.sfm.registration import register
+from pimper_torch.stages.sfm.registration import register_photographs
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene, model_of_scene, with_model_points
 from pimper_torch.stages.sfm.triangulation import lacks_points, triangulate
-from pimper_torch.stages.sfm.upright import upright
+from pimper_torch.stages.sfm.upright import rotate_upright
 from pimper_torch.stages.stage import Stage
 from pimper_torch.store import Store, digest, kept, opened
 from pimper_torch.store.digest import code
@@ -35,8 +35,8 @@ class Reconstruct(Stage):
     features on the CPU, matches pairs and maps. Points are then refined in all views by aligning
     patches, and cameras and points are adjusted again, see
     :func:`~pimper_torch.stages.sfm.refine_tracks.refine_tracks`. In the world frame y is up, see
-    :func:`~pimper_torch.stages.sfm.upright.upright`; its scale is arbitrary. A given model keeps
-    its frame and scale.
+    :func:`~pimper_torch.stages.sfm.upright.rotate_upright`; its scale is arbitrary. A given model
+    keeps its frame and scale.
 
     Not differentiable.
 
@@ -154,7 +154,7 @@ def structure_from_motion(views: Views, config: ReconstructConfig) -> SparseMode
     model = _registered_model(views, config)
     model = refine_tracks(registered_views(views, model), model, config.track_iterations)
     release_memory()
-    return upright(model)
+    return rotate_upright(model)
 
 
 def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
@@ -175,7 +175,7 @@ def _registered_model(views: Views, config: ReconstructConfig) -> SparseModel:
                 "Check that they are not black, blank or fully masked out, and expose longer."
             )
         release_memory()
-        result = register(space, config)
+        result = register_photographs(space, config)
     release_memory()
     # The largest of several models must contain most photographs, unless there are sessions.
     min_fraction = 0.0 if result.around else 0.6

@@ -102,7 +102,7 @@ def _align(views: Views, model: SparseModel) -> tuple[SparseModel, Bool[Tensor, 
         cam_from_world=model.cam_from_world,
         sizes_px=views.sizes_px.cpu(),
     )
-    planes = tracks.tangents(model.points_world, model.observed, cameras)
+    planes = tracks.tangent_planes(model.points_world, model.observed, cameras)
     aligned = tracks.observe_points(pictures, cameras, planes)
     del pictures  # as large as the photographs
     often = torch.bincount(aligned.point, minlength=len(model.points_world)) >= 3

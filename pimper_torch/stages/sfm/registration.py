@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
+import torch
+
 from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.records.shapes import Matrix3
 from pimper_torch.records.sparse_model import SparseModel, drop_weak_views
@@ -39,7 +41,7 @@ from pimper_torch.stages.sfm.matching import (
 from pimper_torch.stages.sfm.moved_object import link_sessions
 from pimper_torch.stages.sfm.reconstruct_config import MIN_POINTS, ReconstructConfig
 from pimper_torch.stages.sfm.retrieval import pairs_to_match
-from pimper_torch.stages.sfm.static_background import log_static_features, remove_static_features
+from pimper_torch.stages.sfm.static_background import remove_static_features
 
 
 def map_views(space: Workspace, seed: int, *, pairs_count: bool = False) -> list[SparseModel]:
@@ -135,7 +137,7 @@ class Registration:
         return self.spread[0] >= FEWEST_VIEWS, placed, len(model.points_world)
 
 
-def register(space: Workspace, settings: ReconstructConfig) -> Registration:
+def register_photographs(space: Workspace, settings: ReconstructConfig) -> Registration:
     """Match pairs and map; test other hypotheses only if that fails.
 
     These are a static background behind a turning object, whose features are removed, and an object
@@ -174,10 +176,11 @@ def register(space: Workspace, settings: ReconstructConfig) -> Registration:
     if rival.inlier_ratio <= plain.inlier_ratio + _MARGIN:
         return plain
     if background.detected:
-        static, total = log_static_features(background)
+        static = torch.cat(background.features)
+        leave_out("sfm.static_background", static)
         caution(
-            f"{static} of {total} features are static while others move. They are treated as the "
-            "static background of a turning object, and removed.",
+            f"{int(static.sum())} of {len(static)} features are static while others move. They are "
+            "treated as the static background of a turning object, and removed.",
             stacklevel=2,
         )
     else:

@@ -10,23 +10,21 @@ A background that shifts, because the tripod was touched, is not detected. A mod
 is unreliable, see :mod:`pimper_torch.stages.sfm.diagnose`.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.records import Record
 from pimper_torch.records.shapes import Matrix3
-from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.progress import track
 from pimper_torch.stages.sfm import matching
-from pimper_torch.stages.sfm.epipolar import sampson_errors, shared_geometry
+from pimper_torch.stages.sfm.epipolar import violating
 from pimper_torch.stages.sfm.matching import Keypoints, PhotographPair, Rows
 from pimper_torch.stages.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
@@ -86,22 +84,11 @@ def remove_static_features(database: Path, settings: ReconstructConfig) -> Stati
         database: With features, matches and verified pairs. Unchanged without a static background.
     """
     with quiet(), loaded().Database.open(database) as opened:
-        matched = matching.read_matched(opened)
-        verifier = matching.Verifier(matched=matched, settings=settings)
-        limit = settings.max_error_px
-        background = find_static_background(matched.keypoints, matched.pairs, verifier, limit)
+        verifier, limit = matching.read_verifier(opened, settings), settings.max_error_px
+        background = find_static_background(verifier.keypoints, verifier.pairs, verifier, limit)
         if background.detected:
-            geometries = matching.read_geometries(opened, matched.ids) | verifier.geometries
-            _keep_moving(opened, matched, background, geometries)
+            _keep_moving(opened, verifier, background)
     return background
-
-
-def log_static_features(background: StaticBackground) -> tuple[int, int]:
-    """Log the number of static features; return it and the number of all features."""
-    static = sum(int(x.sum()) for x in background.features)
-    total = sum(map(len, background.features))
-    leave_out("sfm.static_background", static, total=total)
-    return static, total
 
 
 def find_static_background(
@@ -114,34 +101,34 @@ def find_static_background(
     unless one geometry explains static and moving matches together: then the scene is rigid and no
     feature is static. Pairs of identical photographs have no moving matches and do not vote.
     """
+    lengths = {pair: _lengths_px(keypoints, pair, rows) for pair, rows in pairs.items()}
+    static = {pair: rows[lengths[pair] < _STATIC_PX] for pair, rows in pairs.items()}
+    # Less exactly detected static features do not count as moving.
+    moving = {pair: rows[lengths[pair] >= 4 * _STATIC_PX] for pair, rows in pairs.items()}
+    smaller = {pair: min(len(static[pair]), len(moving[pair])) for pair in pairs}
+    order = sorted(pairs, key=smaller.__getitem__, reverse=True)
+    informative = [pair for pair in order if smaller[pair] >= MIN_MATCHES]
     votes = [torch.zeros(len(x), dtype=torch.long) for x in keypoints]  # for static
     num_moving = num_violating = moving_pairs = 0
-    split = {pair: _split(keypoints, pair, rows) for pair, rows in pairs.items()}
-    smaller = {pair: min(map(len, parts)) for pair, parts in split.items()}
-    order = sorted(split, key=smaller.__getitem__, reverse=True)
-    informative = [pair for pair in order if smaller[pair] >= MIN_MATCHES]
     # The first pairs, with most matches of both kinds, must contradict one geometry. Otherwise no
     # more are verified.
     for start in track(range(0, len(informative), 24)):
         group = informative[start : start + 24]
-        for pair, moving in verify({pair: split[pair][1] for pair in group}).items():
-            if len(moving) < MIN_MATCHES:
+        for pair, rows in verify({pair: moving[pair] for pair in group}).items():
+            if len(rows) < MIN_MATCHES:
                 continue
-            static_rows = split[pair][0]
-            static, ends = (matching.pixels_of(keypoints, pair, x) for x in (static_rows, moving))
-            geometry = shared_geometry(static, ends, max_error_px)
+            far = violating(keypoints, pair, static[pair], rows, max_error_px)
             moving_pairs += 1
-            num_moving += len(moving)
-            num_violating += int((sampson_errors(geometry, *ends) > max_error_px).sum())
-            matching.add_votes(votes, pair, static_rows, torch.ones_like(static_rows))
-            matching.add_votes(votes, pair, moving, -torch.ones_like(moving))
+            num_moving += len(rows)
+            num_violating += int(far[1].sum())
+            matching.add_votes(votes, pair, static[pair], torch.ones_like(static[pair]))
+            matching.add_votes(votes, pair, rows, -torch.ones_like(rows))
         if num_moving and num_violating <= _CONTRADICTION * num_moving:
             break
-    num_static = sum(len(static) for static, _ in split.values())
     fraction = num_violating / max(num_moving, 1)
     return StaticBackground(
         features=tuple((vote > 0) & (fraction > _CONTRADICTION) for vote in votes),
-        static_fraction=num_static / max(sum(map(len, pairs.values())), 1),
+        static_fraction=sum(map(len, static.values())) / max(sum(map(len, pairs.values())), 1),
         moving_pairs=moving_pairs,
         violating_fraction=fraction,
     )
@@ -152,27 +139,22 @@ def moving_matches(
 ) -> Bool[Tensor, " match"]:
     """Return the matches that are not static and have no static feature."""
     touched = background.features[pair[0]][rows[:, 0]] | background.features[pair[1]][rows[:, 1]]
-    first, second = matching.pixels_of(keypoints, pair, rows)
-    return ~touched & ((first - second).norm(dim=-1) >= _STATIC_PX)
+    return ~touched & (_lengths_px(keypoints, pair, rows) >= _STATIC_PX)
 
 
-def _split(keypoints: Keypoints, pair: PhotographPair, rows: Rows) -> tuple[Rows, Rows]:
-    """Return a pair's static matches, and those that clearly move."""
-    first, second = matching.pixels_of(keypoints, pair, rows)
-    length = (first - second).norm(dim=-1)
-    # Less exactly detected static features do not count as moving.
-    return rows[length < _STATIC_PX], rows[length >= 4 * _STATIC_PX]
+def _lengths_px(keypoints: Keypoints, pair: PhotographPair, rows: Rows) -> Float[Tensor, " match"]:
+    first, second = matching.match_ends(keypoints, pair, rows)
+    return (first - second).norm(dim=-1)
 
 
 def _keep_moving(
     database: Any,  # noqa: ANN401 - pycolmap is untyped
-    matched: matching.Matched,
+    verifier: matching.Verifier,
     background: StaticBackground,
-    geometries: Mapping[PhotographPair, Any],
 ) -> None:
-    descriptors = [database.read_descriptors(image) for image in matched.ids]
+    descriptors = [database.read_descriptors(image) for image in verifier.ids]
     database.clear_descriptors()
-    for image, static, old in zip(matched.ids, background.features, descriptors, strict=True):
+    for image, static, old in zip(verifier.ids, background.features, descriptors, strict=True):
         moves = (~static).numpy()
         database.update_keypoints(image, np.array(database.read_keypoints(image))[moves])
         kept = loaded().FeatureDescriptors(old.type, old.data[moves])
@@ -180,14 +162,15 @@ def _keep_moving(
     number = [torch.cumsum(~static, dim=0) - 1 for static in background.features]
 
     def moving(pair: PhotographPair, rows: Rows) -> np.ndarray:
-        rows = rows[moving_matches(matched.keypoints, pair, rows, background)]
+        rows = rows[moving_matches(verifier.keypoints, pair, rows, background)]
         ends = [number[view][rows[:, side]] for side, view in enumerate(pair)]
         return torch.stack(ends, dim=1).numpy().astype(np.uint32)
 
+    geometries = matching.read_geometries(database, verifier.ids) | verifier.geometries
     database.clear_matches()
     database.clear_two_view_geometries()
-    for pair, rows in matched.pairs.items():
-        ids = matched.ids[pair[0]], matched.ids[pair[1]]
+    for pair, rows in verifier.pairs.items():
+        ids = verifier.ids[pair[0]], verifier.ids[pair[1]]
         database.write_matches(*ids, moving(pair, rows))
         if geometry := geometries.get(pair):
             inliers = moving(pair, matching.indices(geometry.inlier_matches))

@@ -59,7 +59,7 @@ class Tangents(Record):
     candidates: Seen
 
 
-def tangents(points_world: Points, observed: Seen, cameras: Cameras) -> Tangents:
+def tangent_planes(points_world: Points, observed: Seen, cameras: Cameras) -> Tangents:
     """Fit a plane at every point, and choose the views in which to search for it."""
     at_once = max(1, 2**22 // cameras.num_views)  # 100 MB of rays
     points, observers_of = torch.split(points_world, at_once), torch.split(observed, at_once)

@@ -14,6 +14,7 @@ from pimper_torch.geometry.local_frame import local_origin, to_local
 from pimper_torch.records import SparseScene, Views
 from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.errors import InputError, caution
+from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.stages.sfm import epipolar, features, matching
@@ -22,7 +23,7 @@ from pimper_torch.stages.sfm.colmap import model_of, observation_errors, reconst
 from pimper_torch.stages.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 from pimper_torch.stages.sfm.refine_tracks import refine_tracks
 from pimper_torch.stages.sfm.retrieval import pairs_to_match
-from pimper_torch.stages.sfm.static_background import log_static_features, remove_static_features
+from pimper_torch.stages.sfm.static_background import remove_static_features
 
 # Observed points of the median view below which points are triangulated, and below which depth maps
 # are also used. In a model of COLMAP's or our own a view has at least 30; the other is half of it.
@@ -66,7 +67,8 @@ def triangulate(
         release_memory()
         if sum(count > 0 for count in counts) >= 2:
             matching.match_pairs(space, pairs_to_match(space), settings)
-            log_static_features(remove_static_features(space.database, settings))
+            background = remove_static_features(space.database, settings)
+            leave_out("sfm.static_background", torch.cat(background.features))
         verified = matching.verified_pairs(space)
         require_agreement(given, verified, settings.max_error_px, where)
         offset = local_origin(given.cam_from_world, cloud)

@@ -25,7 +25,7 @@ _ROLL = math.radians(3.0)
 _WITHIN = math.cos(math.radians(30.0))
 
 
-def upright(model: SparseModel) -> SparseModel:
+def rotate_upright(model: SparseModel) -> SparseModel:
     """Rotate a model about its origin: y up, and z towards most cameras.
 
     Args:
