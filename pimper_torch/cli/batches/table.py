@@ -50,7 +50,7 @@ def _row(outcome: Outcome, out: Path) -> dict[str, object]:
 
 def _page(rows: Sequence[Mapping[str, object]], out: Path) -> str:
     package = resources.files("pimper_torch")
-    style = package / "result" / "report" / "page.css"
+    style = package / "viz" / "report" / "page.css"
     page = Template((package / "cli" / "batches" / "table.html").read_text(encoding="utf-8"))
     statuses = [str(row["status"]) for row in rows]
     reasons = _reasons(rows, out)
