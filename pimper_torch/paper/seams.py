@@ -18,7 +18,7 @@ from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.topology import face_counts, face_edges
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import PatchSet, Record
-from pimper_torch.records.patches import Depths
+from pimper_torch.records.heights import Depths
 from pimper_torch.records.shapes import Faces
 
 Transforms = Float[Tensor, "face 4"]
