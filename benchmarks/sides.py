@@ -22,7 +22,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.records import Cameras, Mesh
-from pimper_torch.viz.render import bounding_box, crop, shade
+from pimper_torch.viz.render import crop, image_bounds, shade
 
 
 def main() -> None:
@@ -80,7 +80,7 @@ def square_round(
     points: Float[Tensor, "point 3"], camera: Cameras
 ) -> tuple[Float[Tensor, " 2"], Float[Tensor, " 2"]]:
     """Return the corners, in pixels, of a square that a camera sees points in."""
-    low, high = bounding_box(camera, points, 0.03)
+    low, high = image_bounds(camera, points, 0.03)
     half = (high - low).max() / 2
     return (low + high) / 2 - half, (low + high) / 2 + half
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from pimper_torch.cli.batches.objects import Object, read_objects
 from pimper_torch.cli.batches.plan import planned_batch, runs_at_once
 from pimper_torch.cli.batches.table import SIGNS, write_table
-from pimper_torch.cli.batches.task import STOPPED, Outcome, Task, carry_out, lost
+from pimper_torch.cli.batches.task import STOPPED, Outcome, Task, lost, outcome_of
 from pimper_torch.export.result_folder.files import prepare_file
 from pimper_torch.export.result_folder.stages import locked
 from pimper_torch.runtime.config import require
@@ -127,7 +127,7 @@ def _run_all(executor: Executor, tasks: Sequence[Task], settle: Callable[[Outcom
     STOPPED.difference_update(task.out.parent for task in tasks)
     try:
         for task in tasks:
-            futures[executor.submit(carry_out, task)] = task
+            futures[executor.submit(outcome_of, task)] = task
         for future in as_completed(futures):
             try:
                 outcome = future.result()
