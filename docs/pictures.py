@@ -23,7 +23,7 @@ from pimper_torch.cli.options import bundled_photographs
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.records import Cameras, Mesh, Views
 from pimper_torch.viz.maps import normal_colors, view_maps
-from pimper_torch.viz.render import bounding_box, frame, shade
+from pimper_torch.viz.render import crop_to, image_bounds, shade
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
@@ -85,9 +85,9 @@ def draw_stages() -> None:
         view = step.coarse.reference
         camera = step.scene.cameras.take([view])
         surface = Mesh(vertices_world=step.surface.vertices_world, faces=step.surface.faces)
-        around = frame(camera, step.coarse.mesh.vertices_world, PANEL_PX, MARGIN)
+        around = crop_to(camera, step.coarse.mesh.vertices_world, PANEL_PX, MARGIN)
         if not passes:
-            low, high = bounding_box(camera, step.coarse.mesh.vertices_world, MARGIN)
+            low, high = image_bounds(camera, step.coarse.mesh.vertices_world, MARGIN)
             corners = int(low[0]), int(low[1]), int(high[0]), int(high[1])
             shown = [
                 photograph(step.scene.views, view).crop(corners),

@@ -109,19 +109,19 @@ def meanings(documented: object) -> dict[str, str]:
     listed = re.search(r"^(?:Args|Attributes):\n((?: .*\n|\n)*)", f"{text}\n", re.MULTILINE)
     entries = re.split(r"^ {4}(\w+): ", listed[1] if listed else "", flags=re.MULTILINE)[1:]
     pairs = zip(entries[::2], entries[1::2], strict=True)
-    return {name: plain(" ".join(meaning.split())) for name, meaning in pairs}
+    return {name: without_markup(" ".join(meaning.split())) for name, meaning in pairs}
 
 
 def summary(documented: object) -> str:
     """Return the paragraphs of a docstring above its sections."""
     text = inspect.cleandoc(documented.__doc__ or "")
-    return plain(re.split(r"\n\n\w+:\n", text)[0])
+    return without_markup(re.split(r"\n\n\w+:\n", text)[0])
 
 
-def plain(text: str) -> str:
+def without_markup(text: str) -> str:
     """Remove reStructuredText markup from a text.
 
-    >>> plain("The ``encoding`` of :func:`~pimper_torch.io.photographs.load_views`.")
+    >>> without_markup("The ``encoding`` of :func:`~pimper_torch.io.photographs.load_views`.")
     'The `encoding` of `load_views`.'
     """
     return re.sub(r":\w+:`~?(?:\w+\.)*(\w+)`", r"`\1`", text).replace("``", "`")

@@ -60,7 +60,9 @@ class Output:
         if self.as_json:
             elapsed = round(time.perf_counter() - self.began, 3)
             # JSON is ASCII, so any encoding of standard output works.
-            line = json.dumps(plain({"event": event, "elapsed": elapsed, **about}), allow_nan=False)
+            line = json.dumps(
+                json_value({"event": event, "elapsed": elapsed, **about}), allow_nan=False
+            )
             sys.stdout.write(line + "\n")
             sys.stdout.flush()
 
@@ -141,12 +143,12 @@ def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:
     return Output(as_json="--json" in arguments, level=chosen), rest
 
 
-def plain(value: object) -> object:
+def json_value(value: object) -> object:
     """Return a value as JSON types: paths as text, and numbers that are not finite as null."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [json_value(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if isinstance(value, str | int | float | bool | None) else str(value)

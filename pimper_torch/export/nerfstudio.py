@@ -88,7 +88,7 @@ def write_nerfstudio(result: Result, folder: Path) -> None:
     :class:`~pimper_torch.runtime.errors.PimperWarning` names the option for it.
     """
     vertices, albedo = result.mesh.vertices_world, result.mesh.albedo
-    cameras, chosen = result.mesh_cameras, thinned(len(vertices))
+    cameras, chosen = result.mesh_cameras, point_subset(len(vertices))
     unit = depth_unit(float(transform(cameras.cam_from_world, vertices)[..., 2].max()))
     if unit != _DEPTH_UNIT:
         caution(
@@ -124,6 +124,6 @@ def depth_unit(farthest: float) -> float:
     return 10.0 ** max(math.ceil(lowest), min(round(math.log10(_DEPTH_UNIT)), math.floor(highest)))
 
 
-def thinned(count: int) -> Int[Tensor, " point"]:
+def point_subset(count: int) -> Int[Tensor, " point"]:
     """Return the indices of at most 100,000 of ``count`` points, evenly spaced."""
     return torch.linspace(0, count - 1, min(count, 100_000), dtype=torch.float64).round().long()

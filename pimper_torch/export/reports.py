@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.rigid import rotate
 from pimper_torch.io.version import installed_version
-from pimper_torch.paper.seams import by_facet
+from pimper_torch.paper.seams import per_facet
 from pimper_torch.records import Failure, Reconstruction, Relighting
 
 Report = dict[str, object]  # a JSON object
@@ -95,7 +95,7 @@ def _normal_matrices(result: Reconstruction) -> Float[Tensor, "patch 4 4"]:
         normals = rotate(templates.patch_from_world.mT, bucket.normals_patch.flatten(1, 2)).double()
         shading = torch.cat([torch.ones_like(normals[..., :1]), normals], dim=-1)
         sums.append(shading.mT @ (weight.flatten(1)[..., None] * shading))
-    return by_facet(photometric.patches, sums)
+    return per_facet(photometric.patches, sums)
 
 
 def world_lights(
@@ -115,9 +115,9 @@ def world_lights(
         directed = rotate(world_from_patch, bucket.lights_patch[..., 1:4])
         rotated = torch.cat([bucket.lights_patch[..., :1], directed], dim=-1)
         lights.append(templates.among_all(rotated))
-    facets = by_facet(patches, (templates.facet for templates in patches.buckets))
-    determined = by_facet(patches, (bucket.determined for bucket in buckets))
-    return facets, by_facet(patches, lights), determined
+    facets = per_facet(patches, (templates.facet for templates in patches.buckets))
+    determined = per_facet(patches, (bucket.determined for bucket in buckets))
+    return facets, per_facet(patches, lights), determined
 
 
 def summary_report(result: Reconstruction, about: Mapping[str, object]) -> Report:

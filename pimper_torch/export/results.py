@@ -12,7 +12,7 @@ from PIL import Image
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.export import reports
 from pimper_torch.export.result_folder.folders import written_whole
-from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
+from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.io.assets.mesh_files import MeshFiles as MeshFiles
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.usd import write_usdz
@@ -22,7 +22,7 @@ from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.io.thumbnails import thumbnails
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale
-from pimper_torch.records import Reconstruction, TexturedMesh
+from pimper_torch.records import FinishedMesh, Reconstruction, Relighting, TexturedMesh
 from pimper_torch.runtime.config import read_mapping, to_yaml
 from pimper_torch.runtime.mapped import each
 from pimper_torch.runtime.progress import part
@@ -104,57 +104,83 @@ def write_result(
     if result.finished is None:
         result = CoarseToFine().finish(result, files)
     with written_whole(folder, "result", overwrite=overwrite) as staging:
-        ready, asset, relighting = result.finished, result.asset, result.relighting
-        assert ready is not None
-        assert asset is not None
-        assert relighting is not None
+        ready, asset, _ = _completed(result)
         written = result.replace(mesh=ready.mesh)
         with part(0, _PARTS):
-            mesh, measured = ready.mesh, None
-            if ready.closed is not None:
-                mesh, measured = ready.closed.mesh, ready.closed.measured
-            offset = written.scene.offset_world
-            write_ply(mesh, staging / "mesh.ply", offset, measured)
-            write_glb(mesh, staging / "mesh.glb", offset, measured)
-            if "stl" in files.formats:
-                write_stl(mesh, staging / "mesh.stl", offset)
-            if "obj" in files.formats:
-                write_obj(mesh, staging / "mesh.obj", offset, measured)
+            _write_meshes(ready, files, written.scene.offset_world, staging)
         with part(1, _PARTS):
             placement = _placement(written, asset, files, folder.absolute().name, about or {})
-            write_asset(asset, staging / "asset.glb", placement, files.texture)
-            if "usdz" in files.formats:
-                write_usdz(asset, staging / "asset.usdz", placement)
-            if "obj" in files.formats:
-                write_asset_obj(asset, staging / "asset.obj", placement)
+            _write_assets(asset, files, placement, staging)
         _write_all(written, config, staging)
         writing = stage_report("write", time.perf_counter() - began)
         timed = result.replace(report=(*result.report, writing))
-        summary = {
-            **reports.summary_report(timed, about or {}),
-            **({ready.how: ready.counts} if ready.how else {}),
-            **({"caps": ready.caps} if ready.caps else {}),
-            "asset": asset.summary,
-            "relighting": reports.relighting_report(relighting),
-            "thumbnails": thumbnails(written.scene.views),
-        }
+        summary = _summary(timed, about or {})
         reports.write_json(summary, staging / "summary.json")
         with part(5, _PARTS):
             if report:
-                write_page(
-                    staging / "report.html",
-                    title=folder.absolute().name,
-                    mesh=ready.mesh,
-                    asset=asset_within(asset, staging / "asset.glb", placement),
-                    surface=asset.mesh,
-                    scene=written.scene,
-                    silhouettes=written.silhouettes,
-                    reference=written.coarse.reference,
-                    predictions=predictions(ready.few, written.scene, relighting),
-                    summary=summary,
-                    settings=read_mapping(staging / "config.yaml"),
-                    lights_world=read_lights(staging / "lights.json", written.scene.views.names),
-                )
+                _write_page(written, placement, summary, staging)
+
+
+def _completed(result: Reconstruction) -> tuple[FinishedMesh, TexturedMesh, Relighting]:
+    ready, asset, relighting = result.finished, result.asset, result.relighting
+    assert ready is not None
+    assert asset is not None
+    assert relighting is not None
+    return ready, asset, relighting
+
+
+def _write_meshes(ready: FinishedMesh, files: MeshFiles, offset: Offset, folder: Path) -> None:
+    mesh, measured = ready.mesh, None
+    if ready.closed is not None:
+        mesh, measured = ready.closed.mesh, ready.closed.measured
+    write_ply(mesh, folder / "mesh.ply", offset, measured)
+    write_glb(mesh, folder / "mesh.glb", offset, measured)
+    if "stl" in files.formats:
+        write_stl(mesh, folder / "mesh.stl", offset)
+    if "obj" in files.formats:
+        write_obj(mesh, folder / "mesh.obj", offset, measured)
+
+
+def _write_assets(
+    asset: TexturedMesh, files: MeshFiles, placement: Placement, folder: Path
+) -> None:
+    write_asset(asset, folder / "asset.glb", placement, files.texture)
+    if "usdz" in files.formats:
+        write_usdz(asset, folder / "asset.usdz", placement)
+    if "obj" in files.formats:
+        write_asset_obj(asset, folder / "asset.obj", placement)
+
+
+def _summary(result: Reconstruction, about: Mapping[str, Any]) -> dict[str, Any]:
+    ready, asset, relighting = _completed(result)
+    return {
+        **reports.summary_report(result, about),
+        **({ready.how: ready.counts} if ready.how else {}),
+        **({"caps": ready.caps} if ready.caps else {}),
+        "asset": asset.summary,
+        "relighting": reports.relighting_report(relighting),
+        "thumbnails": thumbnails(result.scene.views),
+    }
+
+
+def _write_page(
+    result: Reconstruction, placement: Placement, summary: Mapping[str, Any], folder: Path
+) -> None:
+    ready, asset, relighting = _completed(result)
+    write_page(
+        folder / "report.html",
+        title=placement.name,
+        mesh=result.mesh,
+        asset=asset_within(asset, folder / "asset.glb", placement),
+        surface=asset.mesh,
+        scene=result.scene,
+        silhouettes=result.silhouettes,
+        reference=result.coarse.reference,
+        predictions=predictions(ready.few, result.scene, relighting),
+        summary=summary,
+        settings=read_mapping(folder / "config.yaml"),
+        lights_world=read_lights(folder / "lights.json", result.scene.views.names),
+    )
 
 
 def _placement(

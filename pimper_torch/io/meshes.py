@@ -130,22 +130,7 @@ def read_mesh(path: Path | str) -> Mesh:
         found = f"its suffix is {suffix}" if suffix else "its name has no suffix"
         raise InputError(f"{path}: cannot be read as a mesh, {found}; needed: {_NEEDED}.")
     try:
-        # Without a resolver, no other file is opened.
-        scene = trimesh.load_scene(
-            BytesIO(_readable(path, suffix)),
-            file_type=suffix.lstrip("."),
-            process=False,
-            maintain_order=True,
-        )
-        placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
-        count = sum(len(scene.geometry[name].vertices) for _, name in placed)
-        if count > 100_000_000:  # a scene may contain many instances of a mesh
-            raise InputError(
-                f"{path}: its scene has {count} vertices; needed: at most 100,000,000."
-            )
-        parts = [
-            _mesh(scene.geometry[name], pose, linear=suffix == ".glb") for pose, name in placed
-        ]
+        parts = _parts(path, suffix)
     except InputError:
         raise
     except Exception as error:  # parsers of trimesh raise errors of many types
@@ -242,6 +227,22 @@ def write_obj(
                 file.write(f"g {group}\n")
                 corners = mesh.faces.cpu()[chosen].repeat_interleave(2, dim=1) + 1
                 np.savetxt(file, corners.numpy(), fmt="f %d//%d %d//%d %d//%d")
+
+
+def _parts(path: Path, suffix: str) -> list[Mesh]:
+    """Read the parts of a scene with trimesh, transformed to the scene."""
+    # Without a resolver, no other file is opened.
+    scene = trimesh.load_scene(
+        BytesIO(_readable(path, suffix)),
+        file_type=suffix.lstrip("."),
+        process=False,
+        maintain_order=True,
+    )
+    placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+    count = sum(len(scene.geometry[name].vertices) for _, name in placed)
+    if count > 100_000_000:  # a scene may contain many instances of a mesh
+        raise InputError(f"{path}: its scene has {count} vertices; needed: at most 100,000,000.")
+    return [_mesh(scene.geometry[name], pose, linear=suffix == ".glb") for pose, name in placed]
 
 
 def _mesh(part: Any, pose: np.ndarray, *, linear: bool) -> Mesh:  # noqa: ANN401 - untyped

@@ -139,7 +139,7 @@ def warn_of_skipped_files(folder: Path | str, read: Sequence[Path | str]) -> Non
         caution(
             f"{folder}: {some(twins)} were not read, as camera raw with the same names was. To "
             "read them, move the raw files away.",
-            stacklevel=3,
+            stacklevel=4,
         )
     if kinds:
         counts = ", ".join(f"{kind} ({count})" for kind, count in Counter(kinds.values()).items())
@@ -153,7 +153,7 @@ def warn_of_skipped_files(folder: Path | str, read: Sequence[Path | str]) -> Non
             f"{folder}: these were not read: {counts}; {some([path.name for path in kinds])}. "
             f"Supported are files ending in {', '.join(SUFFIXES)}, {_MORE}, not in subfolders."
             f"{hint} Convert or move files that belong to the photographs.",
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

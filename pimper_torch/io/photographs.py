@@ -4,7 +4,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -82,52 +82,86 @@ def load_views(
     """
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
-    paths = list_images(Path(folder))
+    files = _listed(Path(folder), max_size_px)
+    warn_of_responses(files.folder, files.paths, files.headers, encoding)
+    matched = None if masks is None else _match_masks(files.names, Path(masks))
+    images, alphas = read_pictures(files.paths, files.headers, files.sizes, encoding)
+    inside = zeros((len(images), *images.shape[-2:]), torch.bool)
+    has_masks = _fill_masks(inside, files, matched, alphas, mask_object, masks)
+    lit = _check_exposure(files, images, inside, masks)
+    return _as_views(files, images, inside if has_masks else None).take(lit)
+
+
+class _Files(NamedTuple):
+    """Photographs of a folder before their pixels are read; sizes are those after shrinking."""
+
+    folder: Path
+    paths: list[Path]
+    headers: list[Header]
+    sizes: list[tuple[int, int]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the photographs within the folder."""
+        return tuple(image_name(path, self.folder) for path in self.paths)
+
+
+def _listed(folder: Path, max_size_px: int) -> _Files:
+    """List the photographs of a folder; warn of skipped files, refuse too few."""
+    paths = list_images(folder)
     if len(paths) < MIN_PHOTOGRAPHS:
         raise InputError(
             f"{folder}: found {len(paths)} ({some([path.name for path in paths])}); needed: at "
             f"least {MIN_PHOTOGRAPHS} photographs, better 10 or more, each from a different "
             "viewpoint under a different light."
         )
-    warn_of_skipped_files(Path(folder), paths)
+    warn_of_skipped_files(folder, paths)
     headers = [read_header(path) for path in paths]
-    warn_of_responses(Path(folder), paths, headers, encoding)
-    names = tuple(image_name(path, folder) for path in paths)
-    matched = _match_masks(names, Path(masks)) if masks is not None else None
-    sizes = [shrunk_size(header, max_size_px) for header in headers]
-    images, transparent = read_pictures(paths, headers, sizes, encoding)
-    has_masks = matched is not None or any(mask is not None for mask in transparent)
-    inside = zeros((images.shape[0], *images.shape[-2:]), torch.bool)
-    opacities = _read_masks(matched, paths, headers) if matched else []
+    return _Files(folder, paths, headers, [shrunk_size(header, max_size_px) for header in headers])
+
+
+def _fill_masks(
+    inside: Masks,
+    files: _Files,
+    matched: Sequence[Path] | None,
+    alphas: Sequence[Mask | None],
+    mask_object: str,
+    masks: Path | str | None,
+) -> bool:
+    """Write the object masks; return whether there are any, as files or alpha channels."""
+    opacities = _read_masks(matched, files.paths, files.headers) if matched else []
     if mask_object == "dark" or (mask_object == "auto" and _object_is_dark(opacities, masks)):
         for (opacity,) in each(opacities):
             opacity.copy_(1 - opacity)
-    for index, ((wide, high), opaque) in enumerate(zip(sizes, transparent, strict=True)):
+    for index, ((wide, high), opaque) in enumerate(zip(files.sizes, alphas, strict=True)):
         if opacities:
             inside[index, :high, :wide] = resized_mask(opacities[index], wide, high)
         else:
             inside[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
         drop_pages()
-    if has_masks and not opacities:
-        masked = [name for name, mask in zip(names, transparent, strict=True) if mask is not None]
+    names = zip(files.names, alphas, strict=True)
+    masked = [name for name, opaque in names if opaque is not None]
+    if masked and not opacities:
         caution(
-            f"{folder}: {len(masked)} of {len(names)} photographs have transparent pixels "
+            f"{files.folder}: {len(masked)} of {len(alphas)} photographs have transparent pixels "
             f"({some(masked)}), which are used as masks: the object is opaque. If this is wrong, "
             "save them without transparency, or give masks with `--masks`.",
-            stacklevel=2,
+            stacklevel=3,
         )
-    lit = _check_exposure(images, inside, sizes, names, Path(folder), masks)
-    views = Views(
+    return matched is not None or bool(masked)
+
+
+def _as_views(files: _Files, images: Images, masks: Masks | None) -> Views:
+    return Views(
         images=images,
-        sizes_px=torch.tensor(sizes),
-        names=names,
-        masks=inside if has_masks else None,
-        focals_px=shrunk_focals(headers, sizes),
-        orientations=torch.tensor([header.orientation for header in headers]),
-        poses=_poses(paths, Path(folder)),
-        folder=Path(os.path.abspath(folder)).as_posix(),  # noqa: PTH100 - follows no links
+        sizes_px=torch.tensor(files.sizes),
+        names=files.names,
+        masks=masks,
+        focals_px=shrunk_focals(files.headers, files.sizes),
+        orientations=torch.tensor([header.orientation for header in files.headers]),
+        poses=_poses(files.paths, files.folder),
+        folder=Path(os.path.abspath(files.folder)).as_posix(),  # noqa: PTH100 - follows no links
     )
-    return views.take(lit)
 
 
 def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
@@ -139,7 +173,7 @@ def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
         f"{folder}: the {len(paths)} photographs in its {len(folders)} folders are interpreted as "
         f"{len(folders)} camera poses, each under several lights. If the camera moved between "
         "photographs of a folder, move all photographs to a single folder.",
-        stacklevel=3,
+        stacklevel=4,
     )
     return torch.tensor([folders.index(path.parent) for path in paths])
 
@@ -228,7 +262,7 @@ def _object_is_dark(opacities: Sequence[Float[Tensor, "_ _"]], where: Path | str
             f"{where}: the masks are bright along {around:.0%} of the border and in {inside:.0%} "
             "of the centre, so dark pixels are treated as the object. If the object is bright, "
             "add `--mask-object bright`.",
-            stacklevel=3,
+            stacklevel=4,
         )
     return dark
 
@@ -255,20 +289,17 @@ def _threshold(layers: Sequence[Float[Tensor, "_ _"]]) -> Sequence[Float[Tensor,
 
 
 def _check_exposure(
-    images: Images,
-    inside: Masks,
-    sizes: Sequence[tuple[int, int]],
-    names: tuple[str, ...],
-    folder: Path,
-    masks: Path | str | None,
+    files: _Files, images: Images, inside: Masks, masks: Path | str | None
 ) -> list[int]:
     """Return the indices of photographs that are not fully black, and warn of the others.
 
     Fully saturated photographs, empty masks, and folders of mostly black photographs are errors;
     nearly saturated photographs give a warning.
     """
+    folder, names = files.folder, files.names
     black, empty, usable = list[str](), list[str](), dict[str, float]()
-    for name, (image, mask), (wide, high) in zip(names, each(images, inside), sizes, strict=True):
+    pixels = zip(names, each(images, inside), files.sizes, strict=True)
+    for name, (image, mask), (wide, high) in pixels:
         # A thousandth of saturation is level 3 of 255 in sRGB, as with a lens cap on.
         if float((image[:, :high, :wide] > 1e-3).float().mean()) <= _LIT_FRACTION:
             black.append(name)

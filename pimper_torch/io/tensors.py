@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pimper_torch.geometry.lens_models import pinhole_lenses
-from pimper_torch.geometry.local_frame import NO_OFFSET, local_origin, to_local
+from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, local_origin, to_local
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Cameras, SparseScene, Views
-from pimper_torch.records.shapes import Points
+from pimper_torch.records.shapes import Images, Points
 from pimper_torch.runtime.errors import InputError, caution
 
 _DECODED = (
@@ -60,43 +60,11 @@ def scene_of(
     """
     radiance = _floats(images, "images", "linear radiance, view channel height width")
     _check_radiance(radiance)
-    count, _, height, width = radiance.shape
-    sizes = torch.tensor([[width, height]]).repeat(count, 1).to(radiance.device)
-    views = Views(
-        images=radiance,
-        sizes_px=sizes,
-        names=tuple(names) if names is not None else tuple(f"{view:03d}" for view in range(count)),
-        masks=None if masks is None else torch.as_tensor(masks).to(radiance.device).bool(),
-        focals_px=torch.full_like(radiance[:, 0, 0, 0], torch.nan),
-    )
     matrices = _floats(intrinsics, "intrinsics", "K in pixels").to(radiance)
-    poses = _floats(_digits(cam_from_world), "cam_from_world", "rigid matrices")
-    if poses.shape[1:] == (3, 4):
-        poses = rigid(poses[..., :3], poses[..., 3])
-    points = poses.new_zeros(0, 3)
-    if points_world is not None:
-        points = _floats(_digits(points_world), "points_world", "a cloud, point 3")
-    offset = NO_OFFSET
-    if poses.shape[1:] == (4, 4) and points.shape[1:] == (3,):
-        offset = local_origin(poses, points)
-    if offset != NO_OFFSET:
-        poses = to_local(poses.double(), offset)
-        points = points.double() - points.new_tensor(offset, dtype=torch.float64)
+    poses, points, offset = _near_origin(cam_from_world, points_world)
     poses, points = poses.to(radiance), points.to(radiance)
-    cameras = Cameras(
-        intrinsics=matrices.expand(count, 3, 3) if matrices.shape == (3, 3) else matrices,
-        cam_from_world=poses,
-        sizes_px=sizes,
-    )
-    pixels, visible = _observations(points, cameras, views)
-    if observed is not None:
-        given = torch.as_tensor(observed).to(radiance.device).bool()
-        if given.shape != visible.shape:
-            raise InputError(
-                f"observed has shape {tuple(given.shape)}; needed: {tuple(visible.shape)}, a row "
-                "per point, a column per view."
-            )
-        visible = given
+    views, cameras = _posed_views(radiance, matrices, poses, masks, names)
+    pixels, visible = _observations(points, cameras, views, observed)
     point, view = visible.nonzero(as_tuple=True)
     scene = SparseScene(
         views=views,
@@ -111,6 +79,48 @@ def scene_of(
     ).to(radiance.device)
     scene.check("scene_of")
     return scene
+
+
+def _near_origin(
+    cam_from_world: Array, points_world: Array | None
+) -> tuple[Tensor, Tensor, Offset]:
+    """Return poses and points in the local frame, and its offset from the world."""
+    poses = _floats(_digits(cam_from_world), "cam_from_world", "rigid matrices")
+    if poses.shape[1:] == (3, 4):
+        poses = rigid(poses[..., :3], poses[..., 3])
+    points = poses.new_zeros(0, 3)
+    if points_world is not None:
+        points = _floats(_digits(points_world), "points_world", "a cloud, point 3")
+    if poses.shape[1:] != (4, 4) or points.shape[1:] != (3,):
+        return poses, points, NO_OFFSET
+    offset = local_origin(poses, points)
+    if offset != NO_OFFSET:
+        poses = to_local(poses.double(), offset)
+        points = points.double() - points.new_tensor(offset, dtype=torch.float64)
+    return poses, points, offset
+
+
+def _posed_views(
+    images: Images,
+    matrices: Tensor,
+    poses: Tensor,
+    masks: Array | None,
+    names: Sequence[str] | None,
+) -> tuple[Views, Cameras]:
+    count, _, height, width = images.shape
+    sizes = torch.tensor([[width, height]]).repeat(count, 1).to(images.device)
+    views = Views(
+        images=images,
+        sizes_px=sizes,
+        names=tuple(names) if names is not None else tuple(f"{view:03d}" for view in range(count)),
+        masks=None if masks is None else torch.as_tensor(masks).to(images.device).bool(),
+        focals_px=torch.full_like(images[:, 0, 0, 0], torch.nan),
+    )
+    return views, Cameras(
+        intrinsics=matrices.expand(count, 3, 3) if matrices.shape == (3, 3) else matrices,
+        cam_from_world=poses,
+        sizes_px=sizes,
+    )
 
 
 def _check_radiance(images: Tensor) -> None:
@@ -155,9 +165,9 @@ def _digits(values: Array) -> Tensor | np.ndarray:
 
 
 def _observations(
-    points: Points, cameras: Cameras, views: Views
+    points: Points, cameras: Cameras, views: Views, observed: Array | None
 ) -> tuple[Float[Tensor, "view point 2"], Bool[Tensor, "point view"]]:
-    """Return projections of the cloud, and which points are in the frame and on the object."""
+    """Return projections of the cloud, and the ``observed`` ones, or those on the object."""
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
     sizes = cameras.sizes_px[:, None]
     visible = (depth > 0) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
@@ -166,4 +176,12 @@ def _observations(
         height, width = views.masks.shape[-2:]
         view = torch.arange(len(pixels), device=pixels.device)[:, None]
         visible &= views.masks[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
-    return pixels, visible.mT
+    if observed is None:
+        return pixels, visible.mT
+    given = torch.as_tensor(observed).to(visible.device).bool()
+    if given.shape != visible.mT.shape:
+        raise InputError(
+            f"observed has shape {tuple(given.shape)}; needed: {tuple(visible.mT.shape)}, a row "
+            "per point, a column per view."
+        )
+    return pixels, given

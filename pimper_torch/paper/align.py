@@ -15,11 +15,11 @@ from pimper_torch.paper.seams import (
     AlignTerms,
     Seams,
     Transforms,
-    by_facet,
     curvature_along,
     find_seams,
     intersect_overlaps,
     mismatches,
+    per_facet,
     seam_stiffness,
     solve_transforms,
 )
@@ -70,7 +70,7 @@ def vertex_anchors(patches: PatchSet, buckets: tuple[Depths, ...]) -> Anchors:
         normal, spread = frames[:, 2, :3], covariance[mesh.faces[facet]].double()
         variance = torch.einsum("fi,fvij,fj->fv", normal, spread, normal).clamp_min(0)
         results.append((torch.cat([across, height.mT], dim=-1), variance, support[:, 0] > 0.5))
-    samples, variance, valid = (by_facet(patches, values) for values in zip(*results, strict=True))
+    samples, variance, valid = (per_facet(patches, values) for values in zip(*results, strict=True))
     return Anchors(samples=samples, variance=variance, valid=valid)
 
 

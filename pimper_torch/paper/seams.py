@@ -18,7 +18,7 @@ from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.topology import face_counts, face_edges
 from pimper_torch.linalg.sparse import SparseCholesky
 from pimper_torch.records import PatchSet, Record
-from pimper_torch.records.patches import Depths
+from pimper_torch.records.heights import Depths
 from pimper_torch.records.shapes import Faces
 
 Transforms = Float[Tensor, "face 4"]
@@ -61,8 +61,8 @@ def find_seams(patches: PatchSet, rows: int, columns: int, reach_samples: float)
     Args:
         reach_samples: Distance of the outermost lines to the edge, in template samples.
     """
-    frames = by_facet(patches, [bucket.patch_from_world for bucket in patches.buckets]).double()
-    spacing = by_facet(patches, [bucket.spacing for bucket in patches.buckets]).double()
+    frames = per_facet(patches, [bucket.patch_from_world for bucket in patches.buckets]).double()
+    spacing = per_facet(patches, [bucket.spacing for bucket in patches.buckets]).double()
     vertices = patches.coarse.mesh.vertices_world.double()
     edges, edge_of = face_edges(patches.coarse.mesh.faces)
     shared = face_counts(edge_of) == 2
@@ -130,7 +130,7 @@ def intersect_overlaps(
         met = hit.reshape(shape[:3]) & (index >= 0)[..., None]
         results.append((points.reshape(shape), feet_world.reshape(shape), met))
     raster = seams.origins.shape[1:3]
-    joined = [by_facet(patches, values).flatten(0, 1) for values in zip(*results, strict=True)]
+    joined = [per_facet(patches, values).flatten(0, 1) for values in zip(*results, strict=True)]
     samples, feet, met = (
         values[seams.slot_of].reshape(*seams.slot_of.shape, *raster, *values.shape[2:])
         for values in joined
@@ -138,7 +138,7 @@ def intersect_overlaps(
     return samples, feet, met.all(dim=1)
 
 
-def by_facet(patches: PatchSet, values: Iterable[Tensor]) -> Tensor:
+def per_facet(patches: PatchSet, values: Iterable[Tensor]) -> Tensor:
     """Return the values of all buckets, concatenated in the order of the facets."""
     order = torch.argsort(torch.cat([templates.facet for templates in patches.buckets]))
     return torch.cat(list(values))[order]

@@ -26,6 +26,7 @@ _READINGS: dict[tuple[bool, Along], str] = {
     (True, "axis"): "inverse depth (disparity) along the camera's axis",
     (True, "ray"): "inverse depth (disparity) along the ray",
 }
+_NAMES = tuple(_READINGS)
 _GAUGES: dict[Gauge, str] = {
     "scene": "in the scene's unit",
     "scale": "up to a factor per map",
@@ -55,16 +56,11 @@ def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPri
     """
     where = f"The depth of {len(prior.names)} photographs ({some(prior.names, most=1)})"
     lines, errors, observed = _fit_readings(prior.detach(), scene)
-    readings, gauges = tuple(_READINGS), tuple(_GAUGES)
-    enough = errors.shape[-1] >= _MIN_POINTS
-    medians = errors.median(dim=-1).values if enough else errors.new_zeros(len(readings) + 1, 1)
+    gauges, enough = tuple(_GAUGES), errors.shape[-1] >= _MIN_POINTS
+    medians = errors.median(dim=-1).values if enough else errors.new_zeros(len(_NAMES) + 1, 1)
     size = medians[:, -1].min().clamp_min(_CLOUD_ERROR)
     scores = means_by(size / (size + errors), observed.point)
     best = int(medians[:-1, -1].argmin())
-
-    def error(reading: int, gauge: int = -1) -> str:
-        return f"{float(medians[reading, gauge]):.1%}"
-
     if not enough and (prior.inverse, prior.along, prior.gauge) == _OURS:
         return prior
     if change := _better_orientation(prior.detach(), scene, size):
@@ -81,37 +77,47 @@ def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPri
             "each map, at several depths. State `inverse` and `gauge`, or give it in scene units."
         )
     if prior.inverse is not None:
-        stated, gauge = readings.index((prior.inverse, prior.along)), gauges.index(prior.gauge)
-        if informative and clearly_better(scores[best, -1], scores[stated, -1]):
-            raise InputError(
-                f"{where} is {_READINGS[readings[best]]}, given as {_READINGS[readings[stated]]} "
-                f"(median errors at the cloud: {error(best)}, {error(stated)}). State the first."
-            )
-        worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
-        if informative and worse and clearly_better(scores[stated, -1], scores[stated, gauge]):
-            raise InputError(
-                f"{where} is not depth {_GAUGES[prior.gauge]}: its median error at the cloud is "
-                f"{error(stated, gauge)}, and {error(stated)} {_GAUGES['affine']} (`gauge` affine)."
-            )
+        stated, gauge = _NAMES.index((prior.inverse, prior.along)), gauges.index(prior.gauge)
+        if informative:
+            _refuse_contradicted(where, stated, gauge, best, medians, scores)
         best = stated
     else:
-        on_axis = readings.index((readings[best][0], "axis"))
+        on_axis = _NAMES.index((_NAMES[best][0], "axis"))
         if not clearly_better(scores[best, -1], scores[on_axis, -1]):
             best = on_axis
         gauge = [clearly_better(scores[best, -1], row) for row in scores[best]].index(False)
         caution(
-            f"{where} is interpreted as {_READINGS[readings[best]]} {_GAUGES[gauges[gauge]]}, "
-            f"which fits the point cloud best: its median error at {errors.shape[-1]} observations "
-            f"is {error(best, gauge)}. If this is wrong, state `inverse`, `along` and `gauge`.",
+            f"{where} is interpreted as {_READINGS[_NAMES[best]]} {_GAUGES[gauges[gauge]]}, which "
+            f"fits the point cloud best: its median error at {errors.shape[-1]} observations is "
+            f"{medians[best, gauge]:.1%}. If this is wrong, state `inverse`, `along` and `gauge`.",
             stacklevel=4,
         )
-    inverse, along = readings[best]
+    inverse, along = _NAMES[best]
     if (inverse, along, gauges[gauge]) == _OURS:
         return prior.replace(inverse=inverse, along=along, gauge=gauges[gauge])
     deviation, maps = lines.new_zeros(len(prior.names)), observed.index[:, 0]
     for index in torch.unique(maps).tolist():
         deviation[index] = 1.4826 * errors[best, gauge, maps == index].median()  # of Gaussians
     return _to_scene_depth(prior, scene, along, inverse, lines[best, gauge], deviation)
+
+
+def _refuse_contradicted(
+    where: str, stated: int, gauge: int, best: int, medians: Tensor, scores: Tensor
+) -> None:
+    """Raise an error if a different reading or gauge fits far better than the stated ones."""
+    if clearly_better(scores[best, -1], scores[stated, -1]):
+        raise InputError(
+            f"{where} is {_READINGS[_NAMES[best]]}, given as {_READINGS[_NAMES[stated]]} (median "
+            f"errors at the cloud: {medians[best, -1]:.1%}, {medians[stated, -1]:.1%}). State the "
+            "first."
+        )
+    worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
+    if worse and clearly_better(scores[stated, -1], scores[stated, gauge]):
+        raise InputError(
+            f"{where} is not depth {list(_GAUGES.values())[gauge]}: its median error at the cloud "
+            f"is {medians[stated, gauge]:.1%}, and {medians[stated, -1]:.1%} {_GAUGES['affine']} "
+            "(`gauge` affine)."
+        )
 
 
 def _ray_lengths(pixels: Tensor, scene: SparseScene, views: Tensor) -> Tensor:

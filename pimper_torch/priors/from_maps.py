@@ -49,7 +49,7 @@ class Maps(NamedTuple):
         }
 
 
-def stacked(maps: Mapping[str, tuple[Tensor, Tensor | None]], undistorted: bool = False) -> Maps:
+def padded(maps: Mapping[str, tuple[Tensor, Tensor | None]], undistorted: bool = False) -> Maps:
     """Stack maps, padded to one size.
 
     Args:

@@ -75,7 +75,7 @@ def priors_of(
     indices = range(photographs.num_views)
     maps = map(predict, indices) if callable(network) else side_by_side(predict, indices)
     maps_by_name = dict(zip(photographs.names, maps, strict=True))
-    return _prior(from_maps.stacked(maps_by_name, photographs is not views), kind, meaning)
+    return _prior(from_maps.padded(maps_by_name, photographs is not views), kind, meaning)
 
 
 def _map(output: Any, kind: Kind) -> tuple[Tensor, Tensor | None]:  # noqa: ANN401

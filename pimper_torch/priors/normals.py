@@ -98,9 +98,6 @@ def resolve_normal_conventions(
     means = scores.mean(dim=1) if scores.shape[1] else scores.new_zeros(len(_READINGS))
     best = int(means.argmax())
 
-    def far_better(reading: int, baseline: int) -> bool:
-        return clearly_better(scores[reading], scores[baseline])
-
     def contradiction(found: str, remedy: str) -> InputError:
         return InputError(f"{where} {found}, as cloud, outlines and cameras show. {remedy}")
 
@@ -122,23 +119,12 @@ def resolve_normal_conventions(
     index = int(means[: _WORLD + 1].argmax())
     if prior.axes:
         index = _WORLD if prior.frame == "world" else list(AXES).index(prior.axes)
-    if far_better(best, index):
+    if clearly_better(scores[best], scores[index]):
         given = f"given as {_MEANINGS[index]}" if prior.axes else "as no known network writes them"
         raise contradiction(f"are {_MEANINGS[best]}, {given}", "State `axes`, or convert them.")
-    poor = float(means[index]) < _LEAST
     if prior.axes is None:
-        rest = [reading for reading in range(_WORLD + 1) if reading != index]
-        rivals = [_MEANINGS[reading] for reading in rest if not far_better(index, reading)]
-        if rivals or poor:
-            options = f"are {_MEANINGS[index]} or {rivals[0]}" if rivals else "fit any axes"
-            raise InputError(f"{where}: the scene does not show if they {options}. State `axes`.")
-        score, next_best = float(means[index]), float(means[rest].max())
-        caution(
-            f"{where} are interpreted as {_MEANINGS[index]}: they fit cloud, outlines and cameras "
-            f"to {score:.2f} of 1, others to {next_best:.2f}. If this is wrong, state `axes`.",
-            stacklevel=4,
-        )
-    elif scores.shape[1] and poor:
+        _announce(where, index, scores, means)
+    elif scores.shape[1] and float(means[index]) < _LEAST:
         caution(
             f"{where} hardly fit cloud, outlines and cameras, to {float(means[index]):.2f} of 1. "
             "Photographs and maps may be mixed up.",
@@ -149,6 +135,21 @@ def resolve_normal_conventions(
         return prior.replace(frame="world", axes="opencv")
     normals = prior.normals * prior.normals.new_tensor(signs)
     return prior.replace(normals=normals, frame="camera", axes="opencv")
+
+
+def _announce(where: str, index: int, scores: Tensor, means: Tensor) -> None:
+    """Warn of determined axes; raise an error if they fit poorly, or others about as well."""
+    rest = [reading for reading in range(_WORLD + 1) if reading != index]
+    rivals = [rival for rival in rest if not clearly_better(scores[index], scores[rival])]
+    if rivals or float(means[index]) < _LEAST:
+        options = f"are {_MEANINGS[index]} or {_MEANINGS[rivals[0]]}" if rivals else "fit any axes"
+        raise InputError(f"{where}: the scene does not show if they {options}. State `axes`.")
+    caution(
+        f"{where} are interpreted as {_MEANINGS[index]}: they fit cloud, outlines and cameras to "
+        f"{float(means[index]):.2f} of 1, others to {float(means[rest].max()):.2f}. If this is "
+        "wrong, state `axes`.",
+        stacklevel=5,
+    )
 
 
 def _read(

@@ -7,11 +7,13 @@ from pimper_torch.records.finished import Relighting as Relighting
 from pimper_torch.records.finished import TexturedMesh as TexturedMesh
 from pimper_torch.records.finished import ViewErrors as ViewErrors
 from pimper_torch.records.finished import ViewLights as ViewLights
-from pimper_torch.records.patches import AlignStatus as AlignStatus
+from pimper_torch.records.heights import AlignStatus as AlignStatus
+from pimper_torch.records.heights import DepthPatches as DepthPatches
+from pimper_torch.records.heights import Depths as Depths
+from pimper_torch.records.heights import Heights as Heights
+from pimper_torch.records.heights import Surface as Surface
+from pimper_torch.records.heights import SweptPatches as SweptPatches
 from pimper_torch.records.patches import Convergence as Convergence
-from pimper_torch.records.patches import DepthPatches as DepthPatches
-from pimper_torch.records.patches import Depths as Depths
-from pimper_torch.records.patches import Heights as Heights
 from pimper_torch.records.patches import Observations as Observations
 from pimper_torch.records.patches import PatchPriors as PatchPriors
 from pimper_torch.records.patches import PatchSet as PatchSet
@@ -20,8 +22,6 @@ from pimper_torch.records.patches import PatchViews as PatchViews
 from pimper_torch.records.patches import PhotometricPatches as PhotometricPatches
 from pimper_torch.records.patches import Photometry as Photometry
 from pimper_torch.records.patches import StopCause as StopCause
-from pimper_torch.records.patches import Surface as Surface
-from pimper_torch.records.patches import SweptPatches as SweptPatches
 from pimper_torch.records.patches import Templates as Templates
 from pimper_torch.records.priors import AlbedoPrior as AlbedoPrior
 from pimper_torch.records.priors import DepthPrior as DepthPrior

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.records.finished import FinishedMesh, Relighting, TexturedMesh
-from pimper_torch.records.patches import DepthPatches, SweptPatches
+from pimper_torch.records.heights import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
 from pimper_torch.records.silhouettes import Silhouettes

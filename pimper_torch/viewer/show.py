@@ -78,7 +78,6 @@ def show(
     Args:
         result: The result of a chain or of :func:`~pimper_torch.export.result.read_result`,
             a mesh, or the path of a result folder or of a mesh.
-            mesh, or the path of a folder of results or of a mesh.
         host: Address of this machine at which the page is served.
         port: The next free one is used if it is in use; 0 selects any.
 

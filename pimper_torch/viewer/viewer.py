@@ -23,7 +23,7 @@ from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import each
 from pimper_torch.viewer.layers import LAYERS, color_bar, layers_of, painted, pane
 from pimper_torch.viewer.server import HOST, PORT, open_server
-from pimper_torch.viz.report.predictions import shrunk
+from pimper_torch.viz.report.predictions import shrunk_to
 
 NO_PHOTOGRAPH = "none"
 # Scale of frusta: photographs are a third of a unit wide if cameras are three units away, and two
@@ -303,6 +303,6 @@ def small_images(views: Views) -> list[np.ndarray]:
     """Return shrunk photographs as 8-bit sRGB, without the raster's padding."""
     images = []
     for (image,), (width, height) in zip(each(views.images), views.sizes_px.tolist(), strict=True):
-        small = shrunk(image[:, :height, :width].detach().cpu().clamp(0, 1), _IMAGE_PX)
+        small = shrunk_to(image[:, :height, :width].detach().cpu().clamp(0, 1), _IMAGE_PX)
         images.append(to_bytes(small.expand(3, -1, -1)).movedim(0, -1).contiguous().numpy())
     return images

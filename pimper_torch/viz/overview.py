@@ -20,7 +20,7 @@ from pimper_torch.records.views import Cameras, Views
 from pimper_torch.runtime.mapped import drop_pages
 from pimper_torch.viz import tiles
 from pimper_torch.viz.maps import normal_colors, view_maps
-from pimper_torch.viz.render import bounding_box, crop, frame, rotation, shade
+from pimper_torch.viz.render import crop, crop_to, image_bounds, orbit, shade
 
 _ACROSS, _PANEL_PX = 4, 390
 _FACETS = "#ffd24a"
@@ -53,7 +53,7 @@ def panels_of(result: Reconstruction, panel_px: int) -> list[tiles.Tile]:
     photograph, outlined, corners = _photograph(result, full, panel_px)
     maps = view_maps(result.mesh, camera, 0)
     center = vertices.mean(dim=0)
-    sides = [_framed(rotation(full, center, angle), vertices, panel_px) for angle in (-40.0, 40.0)]
+    sides = [_framed(orbit(full, center, angle), vertices, panel_px) for angle in (-40.0, 40.0)]
     coarse = result.coarse.mesh
     images = {
         f"photograph {name}": outlined,
@@ -74,7 +74,7 @@ def _all_views(result: Reconstruction, width_px: int) -> tiles.Tile:
     """Draw photographs with their silhouettes: all, or a selection with the unreliable ones."""
     silhouettes = result.silhouettes
     views = _selected(silhouettes.reliable.cpu())
-    small = thumbnails(
+    small = thumbnail_sheet(
         result.scene.views, silhouettes, views, width_px=width_px, across=_THUMBNAILS_ACROSS
     )
     origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
@@ -97,7 +97,7 @@ def _selected(reliable: Bool[Tensor, " view"]) -> list[int]:
 
 def _framed(camera: Cameras, vertices: Vertices, width_px: int) -> Cameras:
     """Crop a camera's image to the object, at the size of its panel on the sheet."""
-    low, high = bounding_box(camera, vertices, 0.05)
+    low, high = image_bounds(camera, vertices, 0.05)
     width, height = (high - low).tolist()
     return crop(camera, low, high, round(width_px * min(max(height / width, 1.0), tiles.TALLEST)))
 
@@ -120,7 +120,7 @@ def _photograph(
     """Return the cropped reference photograph, the same with its silhouette, and facet corners."""
     reference = result.coarse.reference
     width, height = (int(side) for side in camera.sizes_px[0])
-    low, high = bounding_box(camera, result.mesh.vertices_world, 0.05)
+    low, high = image_bounds(camera, result.mesh.vertices_world, 0.05)
     left, top = (max(0, int(corner)) for corner in low.floor())
     right, bottom = (int(corner) for corner in high.ceil())
     box = slice(top, min(bottom, height)), slice(left, min(right, width))
@@ -140,7 +140,7 @@ def _photograph(
 RELIABLE, UNRELIABLE = (1.0, 0.82, 0.29), (1.0, 0.2, 0.2)
 
 
-def thumbnails(
+def thumbnail_sheet(
     views: Views, silhouettes: Silhouettes, shown: Sequence[int], *, width_px: int, across: int
 ) -> Float[Tensor, "height width 3"]:
     """Tile small photographs of some views, each with its silhouette's outline, one pixel wide.
@@ -196,7 +196,7 @@ def draw_preview(
     center = mesh.vertices_world.mean(dim=0)
     panels = [to_bytes(photograph.expand(*size, 3))]
     for angle in (0.0, -40.0, 40.0):
-        rotated = frame(rotation(camera, center, angle), mesh.vertices_world, panel_px, 0.05)
+        rotated = crop_to(orbit(camera, center, angle), mesh.vertices_world, panel_px, 0.05)
         drawn = (255 * shade(mesh, rotated)).round().to(torch.uint8)
         above = (panel_px - len(drawn)) // 2
         below = panel_px - len(drawn) - above

@@ -126,7 +126,6 @@ def plot_in_view(
         values: One per facet, such as residuals or numbers of views; see :func:`by_facet`.
 
     Raises:
-        InputError: The number of values is not that of facets.
         InputError: There is not one value for each facet.
     """
     if len(values) != len(coarse.mesh.faces):

@@ -81,7 +81,7 @@ def lambertian(normals_cam: Vectors) -> Scalars:
     return light
 
 
-def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
+def orbit(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: float) -> Cameras:
     """Rotate a camera around a point, about the image's vertical axis.
 
     Args:
@@ -96,14 +96,14 @@ def rotation(camera: Cameras, center_world: Float[Tensor, " 3"], angle_deg: floa
     return camera.replace(cam_from_world=rotated_from_cam[None] @ camera.cam_from_world)
 
 
-def frame(camera: Cameras, points_world: Points, longer_side_px: int, margin: float) -> Cameras:
+def crop_to(camera: Cameras, points_world: Points, longer_side_px: int, margin: float) -> Cameras:
     """Crop and scale a camera's image to the bounding box of points.
 
     Args:
         points_world: At least one is in front of the camera.
         margin: Around the box, as a fraction of its longer side.
     """
-    return crop(camera, *bounding_box(camera, points_world, margin), longer_side_px)
+    return crop(camera, *image_bounds(camera, points_world, margin), longer_side_px)
 
 
 def crop(camera: Cameras, low: Pixel, high: Pixel, longer_side_px: int) -> Cameras:
@@ -120,7 +120,7 @@ def crop(camera: Cameras, low: Pixel, high: Pixel, longer_side_px: int) -> Camer
     return camera.replace(intrinsics=intrinsics, sizes_px=sides[None])
 
 
-def bounding_box(camera: Cameras, points_world: Points, margin: float) -> tuple[Pixel, Pixel]:
+def image_bounds(camera: Cameras, points_world: Points, margin: float) -> tuple[Pixel, Pixel]:
     """Return the corners (top left, bottom right) of the points' bounding box in pixels."""
     pixels, depth = project(points_world, camera.cam_from_world[0], camera.intrinsics[0])
     pixels = pixels[depth > 0]

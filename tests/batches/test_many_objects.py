@@ -19,7 +19,7 @@ import pytest
 from pimper_torch.cli.batches.many_objects import batch
 from pimper_torch.cli.batches.objects import read_objects
 from pimper_torch.cli.batches.plan import planned_batch
-from pimper_torch.cli.batches.task import Outcome, carry_out, is_whole
+from pimper_torch.cli.batches.task import Outcome, is_whole, outcome_of
 from pimper_torch.export.result_folder.stages import locked
 from pimper_torch.runtime.errors import ConfigError, OutputError
 
@@ -181,7 +181,7 @@ def test_a_repeated_task_keeps_an_existing_result(world):
     recorder = Inline()
     world.batch(executor=recorder)
     (again,) = recorder.tasks
-    assert carry_out(again).status == "kept"
+    assert outcome_of(again).status == "kept"
     assert world.begun("ball") == 1
 
 

@@ -19,7 +19,7 @@ from pimper_torch.cli.doctor.checks import (
 from pimper_torch.cli.doctor.cost import cost, estimate
 from pimper_torch.cli.doctor.findings import available_gb, machine, total_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
-from pimper_torch.cli.doctor.photograph import Photograph, edge_blur_px, of_views, summarize
+from pimper_torch.cli.doctor.photograph import Photograph, edge_blur_px, summarize, summarize_views
 from pimper_torch.cli.main import main
 from pimper_torch.io.photographs import load_views
 from pimper_torch.stages.sfm.matching import VerifiedPair
@@ -162,7 +162,7 @@ def test_a_run_has_the_findings_of_its_folder(photos):
 
 def test_matches_are_of_the_same_points(photos):
     """All matches between a photograph and its shifted copy differ by the shift."""
-    one = of_views(load_views(photos))[0]
+    one = summarize_views(load_views(photos))[0]
     shifted = one.replace(small=one.small.roll((3, 5), dims=(0, 1)))
     (match,) = match_copies([one.small, shifted.small])
     assert len(match.first) > 50

@@ -8,7 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.datasets import read_transforms
-from pimper_torch.export.nerfstudio import depth_unit, thinned, write_nerfstudio
+from pimper_torch.export.nerfstudio import depth_unit, point_subset, write_nerfstudio
 from pimper_torch.geometry.rigid import rigid
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.runtime.errors import PimperWarning
@@ -32,9 +32,9 @@ def test_splats_are_initialized_on_the_surface_with_its_colours(result, tmp_path
 
 
 def test_points_are_thinned_evenly_to_a_hundred_thousand():
-    assert thinned(0).tolist() == []
-    assert thinned(5).tolist() == [0, 1, 2, 3, 4]
-    many = thinned(1_000_000)
+    assert point_subset(0).tolist() == []
+    assert point_subset(5).tolist() == [0, 1, 2, 3, 4]
+    many = point_subset(1_000_000)
     assert (len(many), int(many[0]), int(many[-1])) == (100_000, 0, 999_999)
     assert set(many.diff().tolist()) == {10, 11} or set(many.diff().tolist()) == {10}
 

@@ -22,7 +22,7 @@ from pimper_torch.viz.report.predictions import (
     longest_px,
     outline,
     predictions,
-    shrunk,
+    shrunk_to,
     view_entries,
 )
 from pimper_torch.viz.report.vertex_layers import (
@@ -178,10 +178,10 @@ def decoded(address):
 
 def test_images_are_downscaled_by_averages_and_encoded_as_srgb():
     stripes = torch.tensor([0.0, 1.0]).repeat(100).expand(1, 100, 200)
-    small = shrunk(stripes, 100)
+    small = shrunk_to(stripes, 100)
     assert small.shape == (1, 50, 100)
     assert_close(small, torch.full_like(small, 0.5))
-    assert shrunk(stripes, 400).shape == stripes.shape
+    assert shrunk_to(stripes, 400).shape == stripes.shape
     assert abs(decoded(jpeg(small)).mean() - 187.5) < 1.5
 
 

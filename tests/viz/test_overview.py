@@ -20,9 +20,9 @@ from pimper_torch.viz.overview import (
     draw_preview,
     headline,
     panels_of,
-    thumbnails,
+    thumbnail_sheet,
 )
-from pimper_torch.viz.render import frame, shade
+from pimper_torch.viz.render import crop_to, shade
 
 
 def drawn(path):
@@ -141,7 +141,7 @@ def test_the_photograph_and_three_views_of_the_surface_are_side_by_side(reconstr
     sheet = drawn(path)
     assert sheet.shape[0] == 90
     own = reconstruction.cameras.take([coarse.reference])
-    front = shade(coarse.mesh, frame(own, coarse.mesh.vertices_world, 90, 0.05)).numpy()
+    front = shade(coarse.mesh, crop_to(own, coarse.mesh.vertices_world, 90, 0.05)).numpy()
     width, height = own.sizes_px[0].tolist()
     left, top = round(90 * width / height), (90 - front.shape[0]) // 2
     found = sheet[top : top + front.shape[0], left : left + front.shape[1]]
@@ -170,7 +170,7 @@ def test_every_view_has_its_tile_and_its_silhouette():
         inside[view, 10:30, 20 : 30 + 10 * view] = 0.9
     reliable = torch.tensor([True, True, False])
     silhouettes = Silhouettes(inside=inside, reliable=reliable, source="found")
-    sheet = thumbnails(views, silhouettes, range(3), width_px=60, across=2)
+    sheet = thumbnail_sheet(views, silhouettes, range(3), width_px=60, across=2)
     assert sheet.shape == (40, 60, 3)  # two rows of two tiles of 30 x 20
     assert_close(sheet[20:, 30:], torch.ones(20, 30, 3))
     for view, colour in enumerate((RELIABLE, RELIABLE, UNRELIABLE)):
@@ -182,5 +182,5 @@ def test_every_view_has_its_tile_and_its_silhouette():
         assert torch.equal(drawn, border(wanted))
         grey = srgb_from_linear(images[view, 0, 0, 0])
         assert_close(tile[~drawn], grey.expand(int((~drawn).sum()), 3))
-    last = thumbnails(views, silhouettes, [2, 0], width_px=60, across=2)
+    last = thumbnail_sheet(views, silhouettes, [2, 0], width_px=60, across=2)
     assert torch.equal(last, torch.cat([sheet[20:, :30], sheet[:20, :30]], dim=1))

@@ -5,7 +5,7 @@ from torch.testing import assert_close
 
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Mesh
-from pimper_torch.viz.render import bounding_box, frame, rotation, shade
+from pimper_torch.viz.render import crop_to, image_bounds, orbit, shade
 
 
 @pytest.fixture
@@ -49,25 +49,25 @@ def test_flat_shading_shows_edges_that_smooth_shading_hides(front):
 
 def test_a_camera_moved_to_the_right_shows_the_right_side_and_keeps_the_centre(front):
     center = torch.tensor([0.2, 0.1, -0.3])
-    rotated = rotation(front, center, 40.0)
+    rotated = orbit(front, center, 40.0)
     before, depth_before = project(center[None], front.cam_from_world[0], front.intrinsics[0])
     after, depth_after = project(center[None], rotated.cam_from_world[0], front.intrinsics[0])
     assert_close(after, before, rtol=0, atol=1e-4)
     assert_close(depth_after, depth_before)
     assert rotated.centers_world[0, 0] > front.centers_world[0, 0] + 1
     assert_close(rotated.centers_world[0, 1], front.centers_world[0, 1])
-    assert_close(rotation(rotated, center, -40.0).cam_from_world, front.cam_from_world)
+    assert_close(orbit(rotated, center, -40.0).cam_from_world, front.cam_from_world)
 
 
 def test_a_frame_contains_the_points_at_the_given_size(front):
     points = torch.tensor([[-1.0, 0.5, 0], [0.5, -0.2, 0.3], [0, 0, 9.0]])  # the last one is behind
-    framed = frame(front, points, longer_side_px=200, margin=0.1)
+    framed = crop_to(front, points, longer_side_px=200, margin=0.1)
     pixels, _ = project(points[:2], framed.cam_from_world[0], framed.intrinsics[0])
     width, height = framed.sizes_px[0].tolist()
     assert max(width, height) == 200
     # A margin of a tenth on either side leaves ten twelfths for the box.
     assert_close(pixels[:, 0].min(), torch.tensor(200 / 12), rtol=0, atol=0.5)
     assert_close(pixels[:, 0].max(), torch.tensor(200 * 11 / 12), rtol=0, atol=0.5)
-    low, high = bounding_box(front, points, 0.0)
+    low, high = image_bounds(front, points, 0.0)
     assert_close(low, project(points[:2], front.cam_from_world[0], front.intrinsics[0])[0].amin(0))
     assert (high > low).all()

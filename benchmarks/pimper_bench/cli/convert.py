@@ -16,7 +16,7 @@ from pimper_bench import datasets
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
-from pimper_torch.export.nerfstudio import thinned
+from pimper_torch.export.nerfstudio import point_subset
 from pimper_torch.export.result_folder.folders import prepare_output, require_apart, written_whole
 from pimper_torch.radiometry import FROM_FILES, LINEAR, Encoding
 from pimper_torch.radiometry.encoding import ResponseChoice, SaturationChoice
@@ -208,7 +208,7 @@ def write(capture: Capture, target: Target, folder: Path) -> None:
 def cloud(truth: Truth) -> Float[Tensor, "point 3"] | None:
     """Return points of the true surface, at most 100,000; ``None`` if it is unknown."""
     points = truth.points_world if truth.mesh is None else truth.mesh.vertices_world
-    return None if points is None else points[thinned(len(points)).to(points.device)]
+    return None if points is None else points[point_subset(len(points)).to(points.device)]
 
 
 def describe(capture: Capture, job: ConvertJob) -> str:

@@ -1,15 +1,15 @@
 """Reconstruction of many objects, as tasks of any ``concurrent.futures.Executor``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 from pimper_torch.cli.batches.objects import Object, read_objects
 from pimper_torch.cli.batches.plan import planned_batch, runs_at_once
 from pimper_torch.cli.batches.table import SIGNS, write_table
-from pimper_torch.cli.batches.task import STOPPED, Outcome, Task, carry_out, lost
+from pimper_torch.cli.batches.task import STOPPED, Outcome, Task, lost, outcome_of
 from pimper_torch.export.result_folder.files import prepare_file
 from pimper_torch.export.result_folder.stages import locked
 from pimper_torch.runtime.config import require
@@ -57,35 +57,44 @@ def batch(
         ConfigError: An object has an invalid setting.
     """
     require(jobs is None or executor is None, "jobs", jobs, "no value together with an executor")
-    for name, value in (
-        ("jobs", jobs),
-        ("time_limit_min", time_limit_min),
-        ("mem_gb", mem_gb),
-        ("cpus_per_task", cpus_per_task),
-    ):
+    positive = {"jobs": jobs, "time_limit_min": time_limit_min}
+    positive |= {"mem_gb": mem_gb, "cpus_per_task": cpus_per_task}
+    for name, value in positive.items():
         require(value is None or value > 0, name, value, "more than 0")
     out = Path(out).absolute()
-    # If OUT is inside the listed folder, results of an earlier batch are not objects.
     items = [
-        item
+        item  # if OUT is inside the listed folder, results of an earlier batch are not objects
         for item in read_objects(objects)
         if not Path(item.photos).resolve().is_relative_to(out.resolve())
     ]
     plan = planned_batch(items, out, settings, overwrite=overwrite)
-    tasks = [entry for entry in plan if isinstance(entry, Task)]
-    threads = cpus_per_task or 1
     if executor is None:
-        jobs = jobs or runs_at_once([mem_gb or task.mem_gb for task in tasks])
-        threads = cpus_per_task or max(1, usable_cores() // jobs)
-    tasks = [
-        replace(
-            task,
-            limit_s=60 * time_limit_min if time_limit_min else task.limit_s,
-            mem_gb=mem_gb or task.mem_gb,
-            threads=threads,
-        )
-        for task in tasks
-    ]
+        needs = [mem_gb or entry.mem_gb for entry in plan if isinstance(entry, Task)]
+        jobs = jobs or runs_at_once(needs)
+        cpus_per_task = cpus_per_task or max(1, usable_cores() // jobs)
+    plan = [_limited(entry, time_limit_min, mem_gb, cpus_per_task or 1) for entry in plan]
+    engine = ThreadPoolExecutor(jobs) if executor is None else nullcontext(executor)
+    return _settled(plan, {item.name: item.photos for item in items}, out, engine, listener)
+
+
+def _limited(
+    entry: Task | Outcome, minutes: float | None, mem_gb: float | None, threads: int
+) -> Task | Outcome:
+    """Return an entry of the plan with given limits instead of the estimated ones."""
+    if isinstance(entry, Outcome):
+        return entry
+    limit_s = 60 * minutes if minutes else entry.limit_s
+    return replace(entry, limit_s=limit_s, mem_gb=mem_gb or entry.mem_gb, threads=threads)
+
+
+def _settled(
+    plan: Sequence[Task | Outcome],
+    photos: Mapping[str, Path | str],
+    out: Path,
+    engine: AbstractContextManager[Executor],
+    listener: Callable[[Outcome], None] | None,
+) -> tuple[Outcome, ...]:
+    """Run the tasks of a plan, and write the table of all outcomes, also if interrupted."""
     outcomes: dict[str, Outcome] = {}
 
     def settle(outcome: Outcome) -> None:
@@ -100,16 +109,15 @@ def batch(
             for entry in plan:
                 if isinstance(entry, Outcome):
                     settle(entry)
-            with ThreadPoolExecutor(jobs) if executor is None else nullcontext(executor) as engine:
-                _run_all(engine, tasks, settle)
+            with engine as executor:
+                _run_all(executor, [task for task in plan if isinstance(task, Task)], settle)
         finally:
             message = "interrupted; the same command continues."
             ended = tuple(
-                outcomes.get(item.name)
-                or Outcome(name=item.name, status="waiting", message=message)
-                for item in items
+                outcomes.get(name) or Outcome(name=name, status="waiting", message=message)
+                for name in photos
             )
-            write_table(ended, out, {item.name: item.photos for item in items})
+            write_table(ended, out, photos)
     return ended
 
 
@@ -119,7 +127,7 @@ def _run_all(executor: Executor, tasks: Sequence[Task], settle: Callable[[Outcom
     STOPPED.difference_update(task.out.parent for task in tasks)
     try:
         for task in tasks:
-            futures[executor.submit(carry_out, task)] = task
+            futures[executor.submit(outcome_of, task)] = task
         for future in as_completed(futures):
             try:
                 outcome = future.result()

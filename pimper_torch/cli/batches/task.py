@@ -102,7 +102,7 @@ class Outcome:
     tries: int = 0
 
 
-def carry_out(task: Task, attempt: Callable[[Task], Outcome] | None = None) -> Outcome:
+def outcome_of(task: Task, attempt: Callable[[Task], Outcome] | None = None) -> Outcome:
     """Return the outcome of an object; lost runs are tried again.
 
     Args:

@@ -9,7 +9,7 @@ from statistics import median
 from pimper_torch.cli.doctor.cost import cost
 from pimper_torch.cli.doctor.findings import Finding, available_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
-from pimper_torch.cli.doctor.photograph import Photograph, of_views
+from pimper_torch.cli.doctor.photograph import Photograph, summarize_views
 from pimper_torch.io.photographs import load_views
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Views
@@ -30,7 +30,7 @@ def examine_folder(
     Raises:
         InputError: As for :func:`pimper_torch.io.photographs.load_views`.
     """
-    photographs = of_views(load_views(folder, encoding=encoding, max_size_px=max_size_px))
+    photographs = summarize_views(load_views(folder, encoding=encoding, max_size_px=max_size_px))
     matches = match_copies([photo.small for photo in photographs])
     return [
         *each_alone(photographs),
@@ -41,7 +41,7 @@ def examine_folder(
 
 def examine_views(views: Views) -> list[Finding]:
     """Check loaded photographs, without overlap."""
-    photographs = of_views(views)
+    photographs = summarize_views(views)
     return [*each_alone(photographs), cost(photographs, available_gb())]
 
 

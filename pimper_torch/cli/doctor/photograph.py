@@ -105,7 +105,7 @@ def summarize(
     )
 
 
-def of_views(views: Views) -> list[Photograph]:
+def summarize_views(views: Views) -> list[Photograph]:
     """Return the measurements of loaded photographs."""
 
     def measure(index: int) -> Photograph:

@@ -23,7 +23,7 @@ from pimper_torch.export.result_folder.marker import (
     seal,
     sort_out,
 )
-from pimper_torch.export.result_folder.stages import NEW, is_ours, kept, locked, resumption
+from pimper_torch.export.result_folder.stages import NEW, is_ours, kept_stages, locked, resumption
 from pimper_torch.runtime.errors import InputError, OutputError, some
 
 # Folders that this run has locked; nested blocks may write to them.
@@ -97,13 +97,13 @@ def held_output(folder: Path | str, kind: Kind, *, overwrite: bool = False) -> I
     try:
         with locked(target, folder):
             with _disk_errors(folder):
-                install(target)
+                install_result(target)
             prepare_output(folder, kind, overwrite)
             token = _held.set(_held.get() | {target})
             try:
                 yield target
             except BaseException as error:
-                if kept(target):
+                if kept_stages(target):
                     error.add_note(resumption(folder))
                 raise
             finally:
@@ -138,12 +138,12 @@ def written_whole(folder: Path | str, kind: Kind, *, overwrite: bool = False) ->
             shutil.rmtree(new, ignore_errors=True)
             raise
         try:
-            install(target)
+            install_result(target)
         except OutputError as error:  # other files were written there meanwhile
             raise OutputError(f"{error} The new result is in {new}.") from error
 
 
-def install(target: Path) -> None:
+def install_result(target: Path) -> None:
     """Move a complete result from the folder of kept stages to its place; remove an incomplete one.
 
     An interrupted call is continued: the list of the previous result is set aside first, so the
@@ -246,8 +246,8 @@ def clean_output(folder: Path | str) -> int:
     try:
         with locked(target, folder):
             before = _size(target)
-            install(target)
-            for path in kept(target):
+            install_result(target)
+            for path in kept_stages(target):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
             return before - _size(target)
     except OSError as error:

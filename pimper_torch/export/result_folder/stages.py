@@ -28,7 +28,7 @@ def is_ours(stages: Path) -> bool:
     return not names or bool(names & {LOCK, HOLDER})
 
 
-def kept(target: Path) -> list[Path]:
+def kept_stages(target: Path) -> list[Path]:
     """List the stages that are kept for the next run into ``target``."""
     stages, internal = target / STAGES, (LOCK, MARKER, NEW, *_PASSING)
     entries = sorted(stages.iterdir()) if stages.is_dir() else []

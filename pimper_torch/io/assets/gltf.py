@@ -2,7 +2,7 @@
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from io import BytesIO
 from typing import Any
 
@@ -46,37 +46,17 @@ def gltf_of(
         offset_world: The node's ``translation``.
         placement: Gives the name of node, mesh and material, the node's ``extras``, and cameras.
     """
-    buffer, views, accessors = bytearray(), [], []
-
-    def viewed(data: bytes, target: int | None) -> int:
-        view: dict[str, int] = {"buffer": 0, "byteOffset": len(buffer), "byteLength": len(data)}
-        views.append(view if target is None else {**view, "target": target})
-        buffer.extend(data + bytes(-len(data) % 4))
-        return len(views) - 1
-
-    def stored(values: np.ndarray, target: int, **more: object) -> int:
-        rows = np.ascontiguousarray(values)
-        accessors.append(
-            {
-                "bufferView": viewed(rows.tobytes(), target),
-                "componentType": _KINDS[rows.dtype.str[1:]],
-                "count": len(rows),
-                "type": _SHAPES[1 if rows.ndim == 1 else rows.shape[1]],
-                **more,
-            }
-        )
-        return len(accessors) - 1
-
+    binary = _Binary()
     positions = np.asarray(attributes["POSITION"], "<f4")
     bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     primitive: dict[str, Any] = {"attributes": {}, "mode": _TRIANGLES if len(faces) else _POINTS}
     if len(faces):
         kind = "<u2" if len(positions) < 65536 else "<u4"
-        primitive["indices"] = stored(faces.astype(kind).ravel(), _INDICES)
+        primitive["indices"] = binary.add_rows(faces.astype(kind).ravel(), _INDICES)
     for key, values in attributes.items():
         rows = _unit(values) if key in ("NORMAL", "TANGENT") else np.asarray(values, "<f4")
         more = bounds if key == "POSITION" else {}
-        primitive["attributes"][key] = stored(rows, _ARRAYS, **more)
+        primitive["attributes"][key] = binary.add_rows(rows, _ARRAYS, **more)
     primitive["material"] = 0
     cameras = [] if placement is None else placement.gltf_cameras()
     tree: dict[str, Any] = {
@@ -86,8 +66,8 @@ def gltf_of(
         "nodes": [{"mesh": 0}, *({**node, "camera": index} for index, node in enumerate(cameras))],
         "meshes": [{"primitives": [primitive]}],
         "materials": [dict(material)],
-        "accessors": accessors,
-        "bufferViews": views,
+        "accessors": binary.accessors,
+        "bufferViews": binary.views,
     }
     if offset_world != NO_OFFSET:
         tree["nodes"][0]["translation"] = list(offset_world)
@@ -97,11 +77,44 @@ def gltf_of(
         tree["nodes"][0]["extras"] = placement.extras
     if cameras:
         tree["cameras"] = [node["camera"] for node in cameras]
-    extensions = set(material.get("extensions", ()))
+    tree |= _textures(images, binary, material.get("extensions", ()))
+    tree["buffers"] = [{"byteLength": len(binary.data)}]
+    return glb(tree, binary.data)
+
+
+class _Binary:
+    """The binary chunk of a GLB under construction, with its buffer views and accessors."""
+
+    def __init__(self) -> None:
+        self.data, self.views, self.accessors = bytearray(), list[Any](), list[Any]()
+
+    def add(self, data: bytes, **target: int) -> int:
+        """Append a buffer view; return its index."""
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
+        self.views.append({**view, **target})
+        self.data.extend(data + bytes(-len(data) % 4))
+        return len(self.views) - 1
+
+    def add_rows(self, values: np.ndarray, target: int, **more: object) -> int:
+        """Append an array as buffer view and accessor; return the accessor's index."""
+        rows = np.ascontiguousarray(values)
+        accessor = {
+            "bufferView": self.add(rows.tobytes(), target=target),
+            "componentType": _KINDS[rows.dtype.str[1:]],
+            "count": len(rows),
+            "type": _SHAPES[1 if rows.ndim == 1 else rows.shape[1]],
+        }
+        self.accessors.append({**accessor, **more})
+        return len(self.accessors) - 1
+
+
+def _textures(images: Sequence[bytes], binary: _Binary, used: Collection[str]) -> dict[str, Any]:
+    """Return a texture per image, and the declarations of all ``used`` and needed extensions."""
+    tree: dict[str, Any] = {}
     if images:
         kinds = [Image.open(BytesIO(image)).get_format_mimetype() for image in images]
         tree["images"] = [
-            {"bufferView": viewed(image, None), "mimeType": kind}
+            {"bufferView": binary.add(image), "mimeType": kind}
             for image, kind in zip(images, kinds, strict=True)
         ]
         sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR}
@@ -113,16 +126,18 @@ def gltf_of(
             for index, kind in enumerate(kinds)
         ]
         if "image/webp" in kinds:
-            extensions.add(_WEBP)
+            used = {*used, _WEBP}
             tree["extensionsRequired"] = [_WEBP]
-    if extensions:
-        tree["extensionsUsed"] = sorted(extensions)
-    tree["buffers"] = [{"byteLength": len(buffer)}]
+    return tree | ({"extensionsUsed": sorted(used)} if used else {})
+
+
+def glb(tree: Mapping[str, Any], binary: bytes | bytearray) -> bytes:
+    """Return a GLB of glTF's JSON and a binary chunk."""
     text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode("ascii")
     text += b" " * (-len(text) % 4)
-    head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(buffer))
+    head = struct.pack("<4s2I", b"glTF", 2, 28 + len(text) + len(binary))
     head += struct.pack("<I4s", len(text), b"JSON") + text
-    return head + struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
+    return head + struct.pack("<I4s", len(binary), b"BIN\0") + binary
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pimper_torch.io.decode import LABELS
-from pimper_torch.priors.from_maps import Maps, stacked
+from pimper_torch.priors.from_maps import Maps, padded
 from pimper_torch.priors.prior_files.map_file import FORMATS, VARIANCE, Layer, read_layer
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import InputError, some
@@ -75,7 +75,7 @@ def read_maps(
             )
         map_variance = None if variance is None else torch.from_numpy(variance)
         maps[name] = torch.from_numpy(values), map_variance
-    return stacked(maps, undistorted)
+    return padded(maps, undistorted)
 
 
 def single_channel(path: Path, layer: Layer) -> np.ndarray:

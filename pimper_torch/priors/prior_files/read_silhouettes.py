@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pimper_torch.priors.from_maps import silhouettes_from, stacked
+from pimper_torch.priors.from_maps import padded, silhouettes_from
 from pimper_torch.priors.prior_files.folder import read_maps, single_channel
 from pimper_torch.priors.prior_files.map_file import Layer
 from pimper_torch.records import SilhouettePrior, Views
@@ -70,4 +70,4 @@ def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
         column = min(int(pointer.x * width / full[0]), width - 1)
         row = min(int(pointer.y * height / full[1]), height - 1)
         inside[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] = 1
-    return silhouettes_from(stacked({views.names[view]: (m, None) for view, m in maps.items()}))
+    return silhouettes_from(padded({views.names[view]: (m, None) for view, m in maps.items()}))

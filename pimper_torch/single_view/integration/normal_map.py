@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Record
-from pimper_torch.records.shapes import Map, Mask, Matrix3
+from pimper_torch.records.shapes import Map, Mask, Matrix3, VectorMap
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.integration.discontinuities import (
     ContinuousSteps,
@@ -89,42 +89,56 @@ def integrate_normal_map(
         for raster, value in ((mask, True), (weight, 1.0), (known_depth, math.nan))
     )
     _refuse(normals, mask, weight, known_depth, spacing)
-    mask = mask.bool()
-    intrinsics = None if intrinsics is None else torch.as_tensor(intrinsics).to(normals)
-    rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
-    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-    frame = (box[1].start, mask.shape[1] - box[1].stop, box[0].start, mask.shape[0] - box[0].stop)
+    # Only the bounding box of the mask, to save time and memory.
+    box, frame = _object_box(mask.bool())
+    mask, weight = mask[box].bool(), weight[box]
     if intrinsics is not None:
-        intrinsics = crop_intrinsics(intrinsics, float(box[1].start), float(box[0].start))
-    # Crop to the bounding box of the mask, to save time and memory.
-    mask, weight, known_depth = mask[box], weight[box], known_depth[box]
-    length = normals[box].norm(dim=-1)
-    usable = mask & (length > 0) & length.isfinite() & (weight > 0)
-    unit = normals[box] / torch.where(usable, length, 1)[..., None]
-    unit = torch.where(usable[..., None], unit, torch.nan)
+        whole = torch.as_tensor(intrinsics).to(normals)
+        intrinsics = crop_intrinsics(whole, float(box[1].start), float(box[0].start))
+    unit = _unit(normals[box], mask & (weight > 0))
     if intrinsics is None:
         steps = orthographic_steps(unit, mask, spacing)
     else:
         steps = perspective_steps(unit, mask, intrinsics)
-    continuity = None
-    known_weight, unknown = _known_pixels(known_depth, mask, steps, intrinsics)
+    known_weight, unknown = _known_pixels(known_depth[box], mask, steps, intrinsics)
+    solution, continuity = _solved(steps, weight, known_weight, unknown, method)
+    if continuity is not None:
+        right, down = pad(continuity.right, frame), pad(continuity.down, frame)
+        continuity = continuity.replace(right=right, down=down)
+    depth = torch.where(mask, solution if intrinsics is None else solution.exp(), 0).to(normals)
+    valid = steps.valid & mask
+    return IntegratedMap(depth=pad(depth, frame), valid=pad(valid, frame), continuity=continuity)
+
+
+def _object_box(mask: Mask) -> tuple[tuple[slice, slice], tuple[int, ...]]:
+    """Return the bounding box of a mask, and the padding that restores the mask's size."""
+    rows, columns = mask.any(dim=1).nonzero()[:, 0], mask.any(dim=0).nonzero()[:, 0]
+    box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+    (height, width), (down, across) = mask.shape, box
+    return box, (across.start, width - across.stop, down.start, height - down.stop)
+
+
+def _unit(normals: VectorMap, usable: Mask) -> VectorMap:
+    """Return normals of length 1, NaN where they are not usable, zero or not finite."""
+    length = normals.norm(dim=-1)
+    usable = usable & (length > 0) & length.isfinite()
+    unit = normals / torch.where(usable, length, 1)[..., None]
+    return torch.where(usable[..., None], unit, torch.nan)
+
+
+def _solved(
+    steps: Steps, weight: Map, known_weight: Map, unknown: Map, method: Integration
+) -> tuple[Map, ContinuousSteps | None]:
+    """Return the unknown of every pixel, and the continuous steps; ``None`` if all are."""
     reliability = torch.where(steps.valid, weight.double(), 0)
     least = torch.where(steps.reliable, at_both_ends(torch.minimum, reliability), _FILLED_WEIGHT)
     weights = at_both_ends(torch.logical_and, steps.inside) * least / steps.unit**2
+    continuity = None
     if method == "discontinuities":
         continuity = find_discontinuities(steps, weights, known_weight, unknown)
         weights = weights * joined(continuity.right, continuity.down)
-        continuity = continuity.replace(
-            right=pad(continuity.right, frame), down=pad(continuity.down, frame)
-        )
     system = RasterSystem(*steps.split(weights), known_weight)
-    solution = system.fit_steps(*steps.target, unknown)
-    depth = torch.where(mask, solution if intrinsics is None else solution.exp(), 0)
-    return IntegratedMap(
-        depth=pad(depth.to(normals), frame),
-        valid=pad(steps.valid & mask, frame),
-        continuity=continuity,
-    )
+    return system.fit_steps(*steps.target, unknown), continuity
 
 
 def _known_pixels(

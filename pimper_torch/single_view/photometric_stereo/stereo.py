@@ -8,7 +8,15 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from pimper_torch.records import Record
-from pimper_torch.records.shapes import Images, Mask, Masks, Matrix3, VectorMap, ViewVectors
+from pimper_torch.records.shapes import (
+    Images,
+    Mask,
+    Masks,
+    Matrix3,
+    VectorMap,
+    Vectors,
+    ViewVectors,
+)
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.single_view.factorization import bas_relief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
@@ -106,48 +114,64 @@ def photometric_stereo(
     weight = images.new_ones(len(images), *mask.shape) if weight is None else weight
     _refuse(images, mask, method, resolve, lights, intrinsics, weight)
     with torch.no_grad():
-        samples = images[:, :, mask]
-        finite = samples.isfinite().all(dim=1)
-        weights = torch.where(finite, weight[:, mask], 0).double()
-        used = (weights > 0).any(dim=1)
-        if int(used.sum()) < 3:
-            raise InputError(
-                f"{method}: {int(used.sum())} photographs have samples inside the mask; needed: 3 "
-                "or more, one for each unknown of a pixel. Add photographs."
-            )
-        weights = weights[used]
-        radiance = torch.where((weights > 0)[:, None], samples[used], 0).double()
+        radiance, weights, used = _inside(images, mask, weight, method)
         applied, free = None, "nothing"
         if lights is not None:
-            known = lights[used].double()
-            all_finite = bool(known.isfinite().all())
-            if not all_finite or int(torch.linalg.matrix_rank(known, rtol=1e-6)) < 3:
-                raise InputError(
-                    "calibrated: the lights are not finite, or in one plane with the object, which "
-                    "leaves normals undetermined across the plane; needed: lights that span space. "
-                    "Add a light outside of the plane."
-                )
-            solution = calibrated_stereo(radiance, weights, known, robust=robust)
+            solution = calibrated_stereo(radiance, weights, _spanning(lights[used]), robust=robust)
         elif intrinsics is not None:
-            raster = torch.zeros_like(images[used], dtype=torch.float64)
-            raster[:, :, mask] = radiance
-            shading, left = factorize_in_perspective(raster, mask, intrinsics.double(), weights > 0)
-            factors = Factored(lights=left.double(), shading=shading.double(), weight=weights)
+            factors = _perspective(radiance, weights, mask, intrinsics.double())
             solution, free = _lambertian(radiance, factors), _FACTOR
         else:
-            resolver = resolve or METHODS[method][0]
-            factors, applied = _integrable(radiance, weights, mask, resolver, robust)
+            factors, applied = _integrable(radiance, weights, mask, resolve, robust)
             solution = _lambertian(radiance, factors)
-            free = f"bas-relief, {_FACTOR}" if resolver == "rounded" else _FACTOR
+            free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
         result = _as_rasters(solution, weights, mask, used, like=images)
         return result.replace(applied=applied, free=free)
+
+
+def _inside(
+    images: Images, mask: Mask, weight: Tensor, method: str
+) -> tuple[Colours, Samples, Bool[Tensor, " all"]]:
+    """Return radiance and weights inside the mask of the photographs with samples, and which."""
+    samples = images[:, :, mask]
+    finite = samples.isfinite().all(dim=1)
+    weights = torch.where(finite, weight[:, mask], 0).double()
+    used = (weights > 0).any(dim=1)
+    if int(used.sum()) < 3:
+        raise InputError(
+            f"{method}: {int(used.sum())} photographs have samples inside the mask; needed: 3 or "
+            "more, one for each unknown of a pixel. Add photographs."
+        )
+    weights = weights[used]
+    return torch.where((weights > 0)[:, None], samples[used], 0).double(), weights, used
+
+
+def _spanning(lights: Vectors) -> Vectors:
+    """Return the lights in double precision if they span space, else raise an error."""
+    lights = lights.double()
+    all_finite = bool(lights.isfinite().all())
+    if not all_finite or int(torch.linalg.matrix_rank(lights, rtol=1e-6)) < 3:
+        raise InputError(
+            "calibrated: the lights are not finite, or in one plane with the object, which leaves "
+            "normals undetermined across the plane; needed: lights that span space. Add a light "
+            "outside of the plane."
+        )
+    return lights
 
 
 _FACTOR = "a factor between albedo and light"
 
 
+def _perspective(radiance: Colours, weight: Samples, mask: Mask, intrinsics: Matrix3) -> Factored:
+    """Return the factors of a pinhole's photographs."""
+    raster = radiance.new_zeros(*radiance.shape[:2], *mask.shape)
+    raster[:, :, mask] = radiance
+    shading, lights = factorize_in_perspective(raster, mask, intrinsics, weight > 0)
+    return Factored(lights=lights.double(), shading=shading.double(), weight=weight)
+
+
 def _integrable(
-    radiance: Colours, weight: Samples, mask: Mask, resolve: str, robust: bool
+    radiance: Colours, weight: Samples, mask: Mask, resolve: str | None, robust: bool
 ) -> tuple[Factored, bas_relief.BasRelief]:
     """Return integrable factors of the mean of the colours, and the bas-relief applied to them."""
     factors = factorize_photographs(radiance.mean(dim=1), weight, 3, robust=robust)

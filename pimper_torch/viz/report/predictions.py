@@ -31,7 +31,7 @@ def longest_px(num_views: int) -> int:
     return round(max(_SHORTEST_PX, _LONGEST_PX * min(1.0, math.sqrt(_VIEWS / num_views))))
 
 
-def shrunk(
+def shrunk_to(
     image: Float[Tensor, "channel height width"], longest: int
 ) -> Float[Tensor, "channel shorter narrower"]:
     """Shrink an image by averaging until its longer side is ``longest`` pixels, if it is larger."""
@@ -139,10 +139,10 @@ def view_entries(
             "centre": [float(intrinsics[0, 2]), float(intrinsics[1, 2])],
             "pose": cameras.cam_from_world[view].double().flatten().tolist(),
             "reliable": bool(silhouettes.reliable[view]),
-            "photo": jpeg(shrunk(scene.views.images[view, :, :height, :width], longest)),
+            "photo": jpeg(shrunk_to(scene.views.images[view, :, :height, :width], longest)),
         }
         if silhouettes.source != "everything":
-            small = shrunk(silhouettes.inside[view, :height, :width][None], longest)[0]
+            small = shrunk_to(silhouettes.inside[view, :height, :width][None], longest)[0]
             entry["outline"] = outline(small, width / small.shape[1])
         if predicted is not None:
             light = predicted.light
@@ -154,7 +154,7 @@ def view_entries(
             }
             if not math.isnan(predicted.psnr_db):
                 entry["psnr_db"] = predicted.psnr_db
-            entry["prediction"] = jpeg(shrunk(predicted.radiance, longest))
+            entry["prediction"] = jpeg(shrunk_to(predicted.radiance, longest))
         if lights_world is not None and bool(lights_world[view].isfinite().all()):
             entry["environment"] = lights_world[view].tolist()
         entries.append(entry)
