@@ -12,31 +12,28 @@ Array = NDArray[Any]
 
 
 @compiled(fast=True)
-def spread(
-    finest: Array,
-    coarser: Array,
-    on_finest: Array,
-    on_coarser: Array,
+def pull_back_lookup(
+    pictures: tuple[Array, Array],
+    on_pictures: tuple[Array, Array],
     levels: Array,
     fractions: Array,
-    image: int,
-    u: float,
-    v: float,
-    area: float,
+    place: tuple[int, float, float, float],
     on_channels: Array,
     on_pixels: bool,
 ) -> tuple[float, float, float]:
     """Pull derivatives by a sample's channels back to the pixels that it is interpolated from.
 
     Args:
-        on_finest: Added to if ``on_pixels``, as is ``on_coarser``.
-        levels: See :func:`~pimper_torch.stages.patches.kernels.resampling.register`.
-        area: Of the sample's footprint, pixels of the finest level.
+        pictures: The finest level of pictures, and the others.
+        on_pictures: Added to if ``on_pixels``.
+        levels: See :func:`~pimper_torch.stages.patches.kernels.resampling.resample_views`.
+        place: Row of the picture; position; area of the footprint, pixels of the finest level.
         on_channels: Derivatives by the sample.
 
     Returns:
         Derivatives by the position, right and down, and by the level, half the area's log2.
     """
+    image, u, v, area = place
     channels, count = len(on_channels), len(levels)
     level, blend = blended_level(area, count)
     on_u, on_v, on_blend = 0.0, 0.0, 0.0
@@ -46,9 +43,9 @@ def spread(
         tall, wide = levels[used_level, 0], levels[used_level, 1]
         x, y = u * fractions[used_level, 1] - 0.5, v * fractions[used_level, 0] - 0.5
         index, right, below, across, down = corners(tall, wide, x, y)
-        pixels, target, plane = finest, on_finest, tall * wide
+        pixels, target, plane = pictures[0], on_pictures[0], tall * wide
         if used_level > 0:
-            pixels, target = coarser, on_coarser
+            pixels, target = pictures[1], on_pictures[1]
             index += channels * levels[used_level, 2]
         by_x, by_y = 0.0, 0.0
         for channel in range(channels):

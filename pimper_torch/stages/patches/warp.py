@@ -98,7 +98,7 @@ class _Resampled(torch.autograd.Function):
         num_patches, *raster = depth.shape
         radiance = torch.empty(num_patches, len(projection.rows), channels, *raster)
         valid = torch.empty(num_patches, len(projection.rows), *raster, dtype=torch.bool)
-        resampling.register(*call, as_array(radiance), as_array(valid))
+        resampling.resample_views(*call, as_array(radiance), as_array(valid))
         ctx.call = call
         ctx.save_for_backward(valid, *inputs)
         ctx.mark_non_differentiable(valid)
@@ -116,7 +116,7 @@ class _Resampled(torch.autograd.Function):
         of_images = any(ctx.needs_input_grad[2:4])
 
         def add_to(*arrays: _Array) -> None:
-            adjoint.pull_back(*call, int(of_images), adjoint.ViewGradients(*arrays))
+            adjoint.pull_back_resampling(*call, int(of_images), adjoint.ViewGradients(*arrays))
 
         return None, None, *pulled_back(add_to, inputs, of_images)
 

@@ -198,9 +198,9 @@ def _compiled_costs(bucket: Hypotheses, num_views: int, min_views: int) -> Costs
         _MIN_FACING,
     )
     shading = sweep_costs.Shading(*(as_array(values, torch.float32) for values in light))
-    call = gray.pictures, as_array(gray.table), placed, as_array(focals), samples, shading, trial
+    table, lengths = as_array(gray.table), as_array(focals)
     cost, swept = _Compiled.apply(  # type: ignore[no-untyped-call]
-        call,
+        sweep_costs.Sweep(gray.pictures, table, placed, lengths, samples, shading, trial),
         gray.finest.flatten(1),
         gray.coarser,
         projection.flatten(0, 1),
@@ -224,11 +224,10 @@ class _Compiled(torch.autograd.Function):
         """Return the costs, and 1 for samples that are swept, else 0."""
         from pimper_torch.stages.sweep.kernels import sweep_costs
 
-        trial = call[-1]
-        num_patches, _, *raster = trial.valid.shape
-        cost = torch.zeros(num_patches, len(trial.ladder), *raster)
+        num_patches, _, *raster = call.trial.valid.shape
+        cost = torch.zeros(num_patches, len(call.trial.ladder), *raster)
         swept = torch.zeros(num_patches, *raster)
-        sweep_costs.costs(*(*call, as_array(cost), as_array(swept)))
+        sweep_costs.costs(call, as_array(cost), as_array(swept))
         ctx.call = call
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(swept)
@@ -244,7 +243,7 @@ class _Compiled(torch.autograd.Function):
 
         def add_to(*arrays: _Array) -> None:
             gradients = adjoint.CostGradients(*arrays)
-            adjoint.pull_back(*(*ctx.call, as_array(on_cost), int(of_images), gradients))
+            adjoint.pull_back_costs(ctx.call, as_array(on_cost), int(of_images), gradients)
 
         return None, *pulled_back(add_to, ctx.saved_tensors, of_images)
 

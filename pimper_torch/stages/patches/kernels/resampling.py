@@ -15,10 +15,14 @@ from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrinkage
 
 Array = NDArray[Any]
+# Photograph and unusable pixels, each the finest level and the others; table of levels, and sizes.
+Pyramid = tuple[tuple[Array, Array], tuple[Array, Array], Array, Array]
+# Pixels right and down, to the next column, then to the next row.
+Sides = tuple[float, float, float, float]
 
 
 @compiled()
-def project(m: Array, samples: signatures.Samples, patch: int, pixels: Array) -> None:
+def project_samples(m: Array, samples: signatures.Samples, patch: int, pixels: Array) -> None:
     """Compute the pixels of a template's samples in a view: right and down."""
     origin, spacing, depth, _ = samples
     for row in range(pixels.shape[0]):
@@ -42,8 +46,115 @@ def neighbours(index: int, count: int) -> tuple[int, int]:
     return first, min(first + 1, count - 1)
 
 
+@compiled()
+def footprint(pixels: Array, row: int, column: int) -> Sides:
+    """Return the sides of a sample's footprint."""
+    above, below = neighbours(row, pixels.shape[0])
+    left, right = neighbours(column, pixels.shape[1])
+    return (
+        pixels[row, right, 0] - pixels[row, left, 0],
+        pixels[row, right, 1] - pixels[row, left, 1],
+        pixels[below, column, 0] - pixels[above, column, 0],
+        pixels[below, column, 1] - pixels[above, column, 1],
+    )
+
+
+@compiled()
+def _mark_facing(
+    m: Array,
+    center: Array,
+    samples: signatures.Samples,
+    patch: int,
+    inside: Array,
+    min_facing: float,
+    facing_samples: Array,
+) -> bool:
+    """Mark the samples in front of a camera and facing it; return whether there are any."""
+    origin, spacing, depth, outward = samples
+    steepest, any_sample = min_facing * min_facing, False
+    for row in range(inside.shape[0]):
+        y = origin[patch, 1] + spacing[patch] * row
+        for column in range(inside.shape[1]):
+            facing_samples[row, column] = False
+            if not inside[row, column]:
+                continue
+            x = origin[patch, 0] + spacing[patch] * column
+            z = depth[patch, row, column]
+            a, b, c = center[0] - x, center[1] - y, center[2] - z
+            facing = a * outward[patch, row, column, 0]
+            facing += b * outward[patch, row, column, 1]
+            facing += c * outward[patch, row, column, 2]
+            if facing > 0 and facing * facing > steepest * (a * a + b * b + c * c):
+                in_front = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] > 0
+                facing_samples[row, column] = in_front
+                any_sample = any_sample or in_front
+    return any_sample
+
+
+@compiled()
+def _blend(pyramid: Pyramid, u: float, v: float, area: float, blended: Array) -> float:
+    """Interpolate between pixels and between levels; return the unusable part, 255ths.
+
+    Args:
+        area: Of the footprint, pixels.
+        blended: Result, one value per channel.
+    """
+    image, unusable, levels, fractions = pyramid
+    channels = len(blended)
+    level, blend = blended_level(area, len(levels))
+    lost: Any = np.float32(0)
+    for step in range(2 if blend > 0 else 1):
+        weight = blend if step == 1 else np.float32(1) - blend
+        current = level + step
+        tall, wide = levels[current, 0], levels[current, 1]
+        x, y = u * fractions[current, 1] - 0.5, v * fractions[current, 0] - 0.5
+        pixel, right, below, across, down = corners(tall, wide, x, y)
+        pixels, masked, start = image[0], unusable[0], 0
+        if current > 0:
+            pixels, masked, start = image[1], unusable[1], levels[current, 2]
+        lost += weight * bilinear(masked, start + pixel, right, below, across, down)
+        pixel += channels * start
+        for channel in range(channels):
+            value = weight * bilinear(pixels, pixel, right, below, across, down)
+            blended[channel] = value if step == 0 else blended[channel] + value
+            pixel += tall * wide
+    return lost
+
+
+@compiled()
+def _sample_picture(
+    pyramid: Pyramid,
+    pixels: Array,
+    facing_samples: Array,
+    size_px: Array,
+    dark_level: float,
+    radiance: Array,
+    valid: Array,
+) -> None:
+    """Sample a picture where footprints are inside it; bright and usable samples are valid."""
+    channels, height, width = radiance.shape
+    blended = np.empty(channels, np.float32)
+    for row in range(height):
+        for column in range(width):
+            usable = False
+            if facing_samples[row, column]:
+                u, v = pixels[row, column, 0], pixels[row, column, 1]
+                du_column, dv_column, du_row, dv_row = footprint(pixels, row, column)
+                area = max(1.0, abs(du_column * dv_row - dv_column * du_row))
+                margin = 0.5 * math.sqrt(area)
+                if margin <= u <= size_px[0] - margin and margin <= v <= size_px[1] - margin:
+                    lost = _blend(pyramid, u, v, area, blended)
+                    mean = np.float32(0)
+                    for channel in range(channels):
+                        mean += blended[channel]
+                    usable = bool(lost < np.float32(25.5)) and bool(mean > channels * dark_level)
+            valid[row, column] = usable
+            for channel in range(channels):
+                radiance[channel, row, column] = blended[channel] if usable else np.float32(0)
+
+
 @compiled(annotated=True)
-def register(
+def resample_views(
     images: signatures.PictureRows,
     unusable: signatures.FractionRows,
     levels: signatures.Integers2,
@@ -63,106 +174,22 @@ def register(
         min_facing: Cosine of the maximum viewing angle.
         dark_level: Mean over the channels below which a sample is invalid.
     """
-    rows, image_from_patch, centers_patch = projection
-    origin, spacing, depth, outward = samples
-    finest, coarser = images
-    unusable_finest, unusable_coarser = unusable
-    patches, views, channels, height, width = radiance.shape
-    fine_plane = levels[0, 0] * levels[0, 1]
-    count = len(levels)
+    patches, views, _, height, width = radiance.shape
     fractions = shrinkage(levels)
-    pixels = np.empty((height, width, 2), np.float64)
-    visible = np.empty((height, width), np.bool_)
-    blended = np.empty(channels, np.float32)
-    steepest = min_facing * min_facing
+    pixels, facing_samples = np.empty((height, width, 2)), np.empty((height, width), np.bool_)
     for patch in range(patches):
         for view in range(views):
-            image = rows[view]
-            fine, coarse = finest[image], coarser[image]
-            fine_unusable, coarse_unusable = unusable_finest[image], unusable_coarser[image]
-            m = image_from_patch[patch * views + view]
-            center = centers_patch[patch * views + view]
-            any_sample = False
-            for row in range(height):
-                y = origin[patch, 1] + spacing[patch] * row
-                for column in range(width):
-                    visible[row, column] = False
-                    if not inside[patch, row, column]:
-                        continue
-                    x = origin[patch, 0] + spacing[patch] * column
-                    z = depth[patch, row, column]
-                    a, b, c = center[0] - x, center[1] - y, center[2] - z
-                    facing = a * outward[patch, row, column, 0]
-                    facing += b * outward[patch, row, column, 1]
-                    facing += c * outward[patch, row, column, 2]
-                    if facing > 0 and facing * facing > steepest * (a * a + b * b + c * c):
-                        visible[row, column] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] > 0
-                        any_sample = any_sample or visible[row, column]
-            if not any_sample:
+            index, picture = patch * views + view, projection.rows[view]
+            m, center = projection.image_from_patch[index], projection.centers_patch[index]
+            if not _mark_facing(
+                m, center, samples, patch, inside[patch], min_facing, facing_samples
+            ):
                 radiance[patch, view] = 0
                 valid[patch, view] = False
                 continue
-            project(m, samples, patch, pixels)
-            for row in range(height):
-                above, below = neighbours(row, height)
-                for column in range(width):
-                    usable = False
-                    if visible[row, column]:
-                        u, v = pixels[row, column, 0], pixels[row, column, 1]
-                        left, right = neighbours(column, width)
-                        du_column = pixels[row, right, 0] - pixels[row, left, 0]
-                        dv_column = pixels[row, right, 1] - pixels[row, left, 1]
-                        du_row = pixels[below, column, 0] - pixels[above, column, 0]
-                        dv_row = pixels[below, column, 1] - pixels[above, column, 1]
-                        area = max(1.0, abs(du_column * dv_row - dv_column * du_row))
-                        margin = 0.5 * math.sqrt(area)
-                        if (
-                            margin <= u <= sizes_px[view, 0] - margin
-                            and margin <= v <= sizes_px[view, 1] - margin
-                        ):
-                            level, blend = blended_level(area, count)
-                            lost = np.float32(0)
-                            for step in range(2 if blend > 0 else 1):
-                                weight = blend if step == 1 else np.float32(1) - blend
-                                current = level + step
-                                tall, wide = levels[current, 0], levels[current, 1]
-                                pixel, to_right, to_below, across, down = corners(
-                                    tall,
-                                    wide,
-                                    u * fractions[current, 1] - 0.5,
-                                    v * fractions[current, 0] - 0.5,
-                                )
-                                if current == 0:
-                                    lost += weight * bilinear(
-                                        fine_unusable, pixel, to_right, to_below, across, down
-                                    )
-                                    for channel in range(channels):
-                                        blended[channel] = weight * bilinear(
-                                            fine, pixel, to_right, to_below, across, down
-                                        )
-                                        pixel += fine_plane
-                                    continue
-                                start = levels[current, 2]
-                                lost += weight * bilinear(
-                                    coarse_unusable, start + pixel, to_right, to_below, across, down
-                                )
-                                pixel += channels * start
-                                for channel in range(channels):
-                                    value = weight * bilinear(
-                                        coarse, pixel, to_right, to_below, across, down
-                                    )
-                                    blended[channel] = (
-                                        value if step == 0 else blended[channel] + value
-                                    )
-                                    pixel += tall * wide
-                            mean = np.float32(0)
-                            for channel in range(channels):
-                                mean += blended[channel]
-                            usable = bool(lost < np.float32(25.5)) and bool(
-                                mean > channels * dark_level
-                            )
-                    valid[patch, view, row, column] = usable
-                    for channel in range(channels):
-                        radiance[patch, view, channel, row, column] = (
-                            blended[channel] if usable else np.float32(0)
-                        )
+            project_samples(m, samples, patch, pixels)
+            image = images.finest[picture], images.coarser[picture]
+            masked = unusable.finest[picture], unusable.coarser[picture]
+            pyramid, size_px = (image, masked, levels, fractions), sizes_px[view]
+            values, usable = radiance[patch, view], valid[patch, view]
+            _sample_picture(pyramid, pixels, facing_samples, size_px, dark_level, values, usable)

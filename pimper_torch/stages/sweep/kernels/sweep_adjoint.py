@@ -9,18 +9,27 @@ from numpy.typing import NDArray
 from pimper_torch.kernels import signatures
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import shrinkage
-from pimper_torch.kernels.lookup_adjoint import spread
+from pimper_torch.kernels.lookup_adjoint import pull_back_lookup
 from pimper_torch.stages.sweep.kernels.sweep_costs import (
     FLOOR,
-    Shading,
-    Trial,
-    choose,
+    Choice,
+    Ray,
+    Sample,
+    Sweep,
+    choose_views,
     empty_choice,
-    look_up,
-    trace,
+    position,
+    sample_ray,
+    sample_view,
 )
 
 Array = NDArray[Any]
+# Radiance and shading of the views of a sample, their number, and the inverse scale of the loss.
+Seen = tuple[Array, Array, int, float]
+# Number of chosen views; radiance, height by view; derivatives by it and by shading; paths; areas.
+Sampled = tuple[int, Array, Array, Array, Array, Array]
+# See `_refit`.
+Fit = tuple[Any, Any, Any]
 
 
 class CostGradients(NamedTuple):
@@ -57,18 +66,70 @@ def _lower_median(values: Array, order: Array, count: int) -> float:
     return values[order[(count - 1) // 2]]
 
 
+@compiled(fast=True)
+def _refit(seen: Seen, albedo: float) -> Fit:
+    """Fit the albedo with the weights of its residuals.
+
+    Returns:
+        The new albedo; the inverse of the normal equation's coefficient, and whether it is regular.
+    """
+    radiance, shading, count, per_scale = seen
+    zero, one = np.float32(0), np.float32(1)
+    square, product = zero, zero
+    for view in range(count):
+        residual = (radiance[view] - albedo * shading[view]) * per_scale
+        lit = shading[view] / (one + residual * residual)
+        square += lit * shading[view]
+        product += lit * radiance[view]
+    inverse = one / square if square > 0 else one
+    return product * inverse, inverse, square > 0
+
+
+@compiled(fast=True)
+def _pull_back_refit(
+    seen: Seen,
+    albedo: float,
+    fit: Fit,
+    on_fit: float,
+    on_scale: float,
+    on_radiance: Array,
+    on_shading: Array,
+) -> tuple[Any, Any]:
+    """Add derivatives by the arguments of :func:`_refit`; return those by albedo and scale.
+
+    Args:
+        fit: Its result.
+        on_fit: Derivative by the new albedo.
+        on_scale: Added to.
+    """
+    radiance, shading, count, per_scale = seen
+    one, two = np.float32(1), np.float32(2)
+    fitted, inverse, regular = fit
+    on_product = on_fit * inverse
+    on_square = -on_product * fitted if regular else np.float32(0)
+    on_albedo = np.float32(0)
+    for view in range(count):
+        error = radiance[view] - albedo * shading[view]
+        residual = error * per_scale
+        weight = one / (one + residual * residual)
+        lit = shading[view] * weight
+        on_lit = on_square * shading[view] + on_product * radiance[view]
+        on_residual = -two * residual * on_lit * lit * weight
+        on_radiance[view] += on_product * lit + on_residual * per_scale
+        on_shading[view] += on_square * lit + on_lit * weight - on_residual * per_scale * albedo
+        on_albedo -= on_residual * per_scale * shading[view]
+        on_scale += on_residual * error
+    return on_albedo, on_scale
+
+
 @compiled(
-    "float64(float32[:,::1], int64, float32[::1], float32[::1], int64, float32, float32[::1],"
-    "int64[::1], float32, float32[:,::1], float32[::1])",
+    "float64(Tuple((float32[::1], float32[::1], int64, float32)), float32[::1], float32[::1],"
+    "int64[::1], float32, float32[::1], float32[::1])",
     fast=True,
 )
-def _inconsistency(
-    radiance: Array,
-    step: int,
-    shading: Array,
+def _pull_back_cost(
+    seen: Seen,
     per_shading: Array,
-    count: int,
-    per_scale: float,
     ratios: Array,
     order: Array,
     on_cost: float,
@@ -78,81 +139,195 @@ def _inconsistency(
     """Compute the derivatives of the cost of one sample and height.
 
     Args:
-        on_radiance: Result, of this step.
+        on_radiance: Result.
         on_shading: Added to.
 
     Returns:
         The derivative by ``per_scale``.
     """
-    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    radiance, shading, count, per_scale = seen
+    zero, one = np.float32(0), np.float32(1)
     if on_cost == 0:
-        on_radiance[step] = 0
+        on_radiance[:] = 0
         return 0.0
     for view in range(count):
-        ratios[view] = radiance[step, view] * per_shading[view]
+        ratios[view] = radiance[view] * per_shading[view]
     first = np.float32(_lower_median(ratios, order, count))
     median = order[(count - 1) // 2]
-    square, product = zero, zero
-    for view in range(count):
-        residual = (radiance[step, view] - first * shading[view]) * per_scale
-        lit = shading[view] / (one + residual * residual)
-        square += lit * shading[view]
-        product += lit * radiance[step, view]
-    per_first = one / square if square > 0 else one
-    falls = square > 0
-    second = product * per_first
-    square, product = zero, zero
-    for view in range(count):
-        residual = (radiance[step, view] - second * shading[view]) * per_scale
-        lit = shading[view] / (one + residual * residual)
-        square += lit * shading[view]
-        product += lit * radiance[step, view]
-    per_second = one / square if square > 0 else one
-    third = product * per_second
+    second = _refit(seen, first)
+    third = _refit(seen, second[0])
     on_scale, on_albedo = zero, zero
     for view in range(count):
-        error = radiance[step, view] - third * shading[view]
+        error = radiance[view] - third[0] * shading[view]
         residual = error * per_scale
         on_residual = on_cost * residual / (one + residual * residual)
-        on_radiance[step, view] = on_residual * per_scale
-        on_shading[view] -= on_residual * per_scale * third
+        on_radiance[view] = on_residual * per_scale
+        on_shading[view] -= on_residual * per_scale * third[0]
         on_albedo -= on_residual * per_scale * shading[view]
         on_scale += on_residual * error
-    falls_second = square > 0
-    for iteration in range(2):
-        albedo = second if iteration == 0 else first
-        mean = third if iteration == 0 else second
-        on_product = on_albedo * (per_second if iteration == 0 else per_first)
-        on_square = -on_product * mean if (falls_second if iteration == 0 else falls) else zero
-        on_albedo = zero
-        for view in range(count):
-            error = radiance[step, view] - albedo * shading[view]
-            residual = error * per_scale
-            weight = one / (one + residual * residual)
-            lit = shading[view] * weight
-            on_lit = on_square * shading[view] + on_product * radiance[step, view]
-            on_residual = -two * residual * on_lit * lit * weight
-            on_radiance[step, view] += on_product * lit + on_residual * per_scale
-            on_shading[view] += on_square * lit + on_lit * weight - on_residual * per_scale * albedo
-            on_albedo -= on_residual * per_scale * shading[view]
-            on_scale += on_residual * error
-    on_radiance[step, median] += on_albedo * per_shading[median]
+    for albedo, fit in ((second[0], third), (first, second)):
+        on_albedo, on_scale = _pull_back_refit(
+            seen, albedo, fit, on_albedo, on_scale, on_radiance, on_shading
+        )
+    on_radiance[median] += on_albedo * per_shading[median]
     on_shading[median] -= on_albedo * per_shading[median] * first
     return float(on_scale)
 
 
-@compiled(annotated=True)
-def pull_back(
-    gray: signatures.PictureRows,
-    levels: signatures.Integers2,
-    projection: signatures.Projection,
-    focals: signatures.Doubles1,
-    samples: signatures.Samples,
-    shaded: Shading,
-    trial: Trial,
-    on_cost: signatures.Floats4,
+@compiled()
+def _pull_back_lookups(
+    sweep: Sweep,
+    fractions: Array,
+    index: tuple[int, int],
+    seen: tuple[Array, Array, Array, float],
+    on_pixels: int,
+    on_spacing: float,
+    gradients: CostGradients,
+) -> tuple[Array, float, float]:
+    """Add derivatives by a view's pixels and gain.
+
+    Args:
+        index: Of patch and view.
+        seen: Radiance at all heights, derivatives by it, the path, and the area of the footprint.
+        on_spacing: Added to.
+
+    Returns:
+        Derivatives by the path, the level of the pyramid, and the spacing.
+    """
+    gray, levels, projection, _, samples, shaded, trial = sweep
+    radiance, on_radiance, path, area = seen
+    spacing, gain = samples.spacing[index[0]], shaded.gains[index]
+    on_gray = gradients.finest, gradients.coarser
+    on_path, on_channel = np.zeros((2, 3)), np.empty(1, np.float32)
+    on_level, on_gain = 0.0, 0.0
+    for step in range(len(trial.ladder)):
+        if on_radiance[step] == 0:
+            continue
+        on_gain += on_radiance[step] * radiance[step]
+        on_channel[0] = on_radiance[step] * gain
+        move = spacing * trial.ladder[step]
+        z_cam, inverse_z, u, v = position(path, move)
+        place = projection.rows[index[1]], u, v, area
+        on_u, on_v, by_level = pull_back_lookup(
+            gray, on_gray, levels, fractions, place, on_channel, on_pixels > 0
+        )
+        on_level += by_level
+        if z_cam == 0:
+            continue  # no position in the picture
+        a, b = on_u * inverse_z, on_v * inverse_z
+        c = -(a * u + b * v)
+        on_path[0, 0] += a
+        on_path[0, 1] += b
+        on_path[0, 2] += c
+        on_path[1, 0] += a * move
+        on_path[1, 1] += b * move
+        on_path[1, 2] += c * move
+        on_move = a * path[1, 0] + b * path[1, 1] + c * path[1, 2]
+        on_spacing += on_move * trial.ladder[step]
+    if gain != 0:
+        gradients.gains[index] += on_gain / gain
+    return on_path, on_level, on_spacing
+
+
+@compiled()
+def _pull_back_facing(
+    center: Array, ray: Ray, facing: float, on_facing: float, on_center: Array, on_ray: Array
+) -> None:
+    """Add derivatives of a facing by the camera's centre, the sample and its outward normal."""
+    point, along = ray
+    distance = 0.0
+    for axis in range(3):
+        distance += (center[axis] - point[axis]) ** 2
+    distance = math.sqrt(distance)
+    for axis in range(3):
+        direction = (center[axis] - point[axis]) / distance
+        on_ray[1, axis] += on_facing * direction
+        change = on_facing * (along[axis] - facing * direction) / distance
+        on_center[axis] += change
+        on_ray[0, axis] -= change
+
+
+@compiled()
+def _pull_back_path(m: Array, ray: Ray, on_path: Array, by_m: Array, on_ray: Array) -> None:
+    """Add derivatives of a path by the projection, the sample and its outward normal."""
+    for i in range(3):
+        for axis in range(3):
+            for k in range(2):
+                on_ray[k, axis] += on_path[k, i] * m[i, axis]
+                by_m[i, axis] += on_path[k, i] * ray[k][axis]
+        by_m[i, 3] += on_path[0, i]
+
+
+@compiled()
+def _pull_back_view(
+    sweep: Sweep,
+    sample: Sample,
+    view: int,
+    facing: float,
+    path: Array,
+    on_path: Array,
+    on_level: float,
+    on_lit: float,
+    on_ray: Array,
+    gradients: CostGradients,
+) -> None:
+    """Add derivatives by a chosen view's footprint, projection and shading."""
+    patch, row, column = sample
+    index = patch * len(sweep.focals) + view
+    ray = sample_ray(sweep.samples, sample)
+    gradients.focals[view] += on_level / sweep.focals[view]
+    if path[0, 2] > FLOOR:
+        on_path[0, 2] -= on_level / path[0, 2]
+    if facing > sweep.trial.min_facing:
+        center, on_center = sweep.projection.centers_patch[index], gradients.centers_patch[index]
+        _pull_back_facing(center, ray, facing, 0.5 * on_level / facing, on_center, on_ray)
+    m, by_m = sweep.projection.image_from_patch[index], gradients.image_from_patch[index]
+    _pull_back_path(m, ray, on_path, by_m, on_ray)
+    on_light, light = gradients.lights[patch, view], sweep.shaded.lights[patch, view]
+    on_light[0] += on_lit
+    for axis in range(3):
+        on_light[1 + axis] += on_lit * sweep.shaded.normals[patch, row, column, axis]
+        gradients.normals[patch, row, column, axis] += on_lit * light[1 + axis]
+
+
+@compiled()
+def _pull_back_sample(
+    sweep: Sweep,
+    fractions: Array,
+    sample: Sample,
+    choice: Choice,
+    sampled: Sampled,
     on_pixels: int,
     gradients: CostGradients,
+) -> None:
+    """Add derivatives of the radiance and shading of a sample's chosen views."""
+    patch, row, column = sample
+    count, radiance, on_radiance, on_lit, paths, areas = sampled
+    on_ray, on_spacing = np.zeros((2, 3)), 0.0
+    for slot in range(count):
+        view, path = choice.views[slot], paths[slot]
+        seen = radiance[:, slot], on_radiance[:, slot], path, areas[slot]
+        on_path, on_level, on_spacing = _pull_back_lookups(
+            sweep, fractions, (patch, view), seen, on_pixels, on_spacing, gradients
+        )
+        # The level is the logarithm of the footprint plus half that of the facing.
+        on_level /= math.log(2)
+        on_spacing += on_level / sweep.samples.spacing[patch]
+        facing, on_shade = choice.facings[view], on_lit[slot]
+        _pull_back_view(
+            sweep, sample, view, facing, path, on_path, on_level, on_shade, on_ray, gradients
+        )
+    gradients.origin[patch, 0] += on_ray[0, 0]
+    gradients.origin[patch, 1] += on_ray[0, 1]
+    gradients.depth[patch, row, column] += on_ray[0, 2]
+    gradients.spacing[patch] += on_spacing + on_ray[0, 0] * column + on_ray[0, 1] * row
+    for axis in range(3):
+        gradients.outward[patch, row, column, axis] += on_ray[1, axis]
+
+
+@compiled(annotated=True)
+def pull_back_costs(
+    sweep: Sweep, on_cost: signatures.Floats4, on_pixels: int, gradients: CostGradients
 ) -> None:
     """Compute derivatives by pictures, geometry and light from those by the costs.
 
@@ -162,166 +337,35 @@ def pull_back(
         on_pixels: Whether derivatives by pictures are needed, 1 or 0.
         gradients: Added to.
     """
+    trial = sweep.trial
     patches, views, height, width = trial.valid.shape
     heights, limit = len(trial.ladder), min(trial.num_views, views)
-    choice = empty_choice(views, limit)
-    lit = np.empty(limit, np.float32)
-    per_lit = np.empty(limit, np.float32)
-    ratios = np.empty(limit, np.float32)
-    order = np.empty(limit, np.int64)
-    fractions = shrinkage(levels)
+    choice, fractions = empty_choice(views, limit), shrinkage(sweep.levels)
     radiance = np.empty((heights, limit), np.float32)
     on_radiance = np.empty((heights, limit), np.float32)
-    on_lit = np.empty(limit, np.float32)
-    paths = np.empty((limit, 2, 3))
-    areas = np.empty(limit)
-    on_channel = np.empty(1, np.float32)
-    point, on_point = np.empty(3), np.empty(3)
-    along, on_along = np.empty(3), np.empty(3)
-    on_path = np.empty((2, 3))
+    ratios, order = np.empty(limit, np.float32), np.empty(limit, np.int64)
+    on_lit, paths, areas = np.empty(limit, np.float32), np.empty((limit, 2, 3)), np.empty(limit)
     for patch in range(patches):
-        spacing = samples.spacing[patch]
         per_scale = np.float32(1) / trial.scale[patch]
         on_per_scale = 0.0
         for row in range(height):
             for column in range(width):
+                sample = patch, row, column
                 if not np.any(on_cost[patch, :, row, column] != 0):
                     continue
-                count = choose(
-                    patch, row, column, projection, focals, samples, shaded, trial, choice
-                )
+                count = choose_views(sweep, sample, choice)
                 if count == 0:
                     continue
                 for slot in range(count):
-                    view = choice.views[slot]
-                    lit[slot] = choice.shading[view]
-                    per_lit[slot] = np.float32(1) / choice.shading[view]
-                    order[slot] = slot
-                    on_lit[slot] = 0
-                    m = projection.image_from_patch[patch * views + view]
-                    trace(m, samples, patch, row, column, paths[slot])
-                    footprint = choice.footprints[view]
-                    bounded = max(choice.facings[view], trial.min_facing)
-                    areas[slot] = footprint * footprint * bounded
-                    look_up(
-                        gray,
-                        levels,
-                        fractions,
-                        projection.rows[view],
-                        paths[slot],
-                        spacing,
-                        trial.ladder,
-                        areas[slot],
-                        shaded.gains[patch, view],
-                        radiance[:, slot],
-                    )
+                    order[slot], on_lit[slot] = slot, 0
+                    path, values = paths[slot], radiance[:, slot]
+                    areas[slot] = sample_view(sweep, fractions, sample, choice, slot, path, values)
                 for step in range(heights):
-                    on_per_scale += _inconsistency(
-                        radiance,
-                        step,
-                        lit,
-                        per_lit,
-                        count,
-                        per_scale,
-                        ratios,
-                        order,
-                        on_cost[patch, step, row, column],
-                        on_radiance,
-                        on_lit,
+                    seen = radiance[step], choice.lit, count, per_scale
+                    on_step, upstream = on_radiance[step], on_cost[patch, step, row, column]
+                    on_per_scale += _pull_back_cost(
+                        seen, choice.per_lit, ratios, order, upstream, on_step, on_lit
                     )
-                point[0] = samples.origin[patch, 0] + spacing * column
-                point[1] = samples.origin[patch, 1] + spacing * row
-                point[2] = samples.depth[patch, row, column]
-                on_point[:], on_along[:] = 0, 0
-                for axis in range(3):
-                    along[axis] = samples.outward[patch, row, column, axis]
-                normal = shaded.normals[patch, row, column]
-                on_normal = gradients.normals[patch, row, column]
-                on_spacing = 0.0
-                for slot in range(count):
-                    view = choice.views[slot]
-                    index = patch * views + view
-                    gain = shaded.gains[patch, view]
-                    path = paths[slot]
-                    on_path[:] = 0
-                    on_level, on_gain = 0.0, 0.0
-                    for step in range(heights):
-                        on_sample = on_radiance[step, slot]
-                        if on_sample == 0:
-                            continue
-                        on_gain += on_sample * radiance[step, slot]
-                        on_channel[0] = on_sample * gain
-                        move = spacing * trial.ladder[step]
-                        z_cam = path[0, 2] + move * path[1, 2]
-                        inverse_z = 1 / z_cam if z_cam != 0 else 1.0
-                        u = inverse_z * (path[0, 0] + move * path[1, 0])
-                        v = inverse_z * (path[0, 1] + move * path[1, 1])
-                        on_u, on_v, by_level = spread(
-                            gray.finest,
-                            gray.coarser,
-                            gradients.finest,
-                            gradients.coarser,
-                            levels,
-                            fractions,
-                            projection.rows[view],
-                            u,
-                            v,
-                            areas[slot],
-                            on_channel,
-                            on_pixels > 0,
-                        )
-                        on_level += by_level
-                        if z_cam == 0:
-                            continue  # no position in the picture
-                        a, b = on_u * inverse_z, on_v * inverse_z
-                        c = -(a * u + b * v)
-                        on_path[0, 0] += a
-                        on_path[0, 1] += b
-                        on_path[0, 2] += c
-                        on_path[1, 0] += a * move
-                        on_path[1, 1] += b * move
-                        on_path[1, 2] += c * move
-                        on_move = a * path[1, 0] + b * path[1, 1] + c * path[1, 2]
-                        on_spacing += on_move * trial.ladder[step]
-                    if gain != 0:
-                        gradients.gains[patch, view] += on_gain / gain
-                    # The level is the logarithm of the footprint plus half that of the facing.
-                    on_level /= math.log(2)
-                    on_spacing += on_level / spacing
-                    gradients.focals[view] += on_level / focals[view]
-                    if path[0, 2] > FLOOR:
-                        on_path[0, 2] -= on_level / path[0, 2]
-                    facing = choice.facings[view]
-                    if facing > trial.min_facing:
-                        on_facing = 0.5 * on_level / facing
-                        center = projection.centers_patch[index]
-                        distance = 0.0
-                        for axis in range(3):
-                            distance += (center[axis] - point[axis]) ** 2
-                        distance = math.sqrt(distance)
-                        for axis in range(3):
-                            direction = (center[axis] - point[axis]) / distance
-                            on_along[axis] += on_facing * direction
-                            on_center = on_facing * (along[axis] - facing * direction) / distance
-                            gradients.centers_patch[index, axis] += on_center
-                            on_point[axis] -= on_center
-                    m, by_m = projection.image_from_patch[index], gradients.image_from_patch[index]
-                    for i in range(3):
-                        for axis in range(3):
-                            on_point[axis] += on_path[0, i] * m[i, axis]
-                            on_along[axis] += on_path[1, i] * m[i, axis]
-                            by_m[i, axis] += on_path[0, i] * point[axis]
-                            by_m[i, axis] += on_path[1, i] * along[axis]
-                        by_m[i, 3] += on_path[0, i]
-                    on_light, light = gradients.lights[patch, view], shaded.lights[patch, view]
-                    on_light[0] += on_lit[slot]
-                    for axis in range(3):
-                        on_light[1 + axis] += on_lit[slot] * normal[axis]
-                        on_normal[axis] += on_lit[slot] * light[1 + axis]
-                gradients.origin[patch, 0] += on_point[0]
-                gradients.origin[patch, 1] += on_point[1]
-                gradients.depth[patch, row, column] += on_point[2]
-                gradients.spacing[patch] += on_spacing + on_point[0] * column + on_point[1] * row
-                for axis in range(3):
-                    gradients.outward[patch, row, column, axis] += on_along[axis]
+                sampled = count, radiance, on_radiance, on_lit, paths, areas
+                _pull_back_sample(sweep, fractions, sample, choice, sampled, on_pixels, gradients)
         gradients.scale[patch] -= on_per_scale * per_scale * per_scale

@@ -14,6 +14,10 @@ from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.lookup import bilinear, blended_level, corners, shrinkage
 
 Array = NDArray[Any]
+# Indices: patch, row, column.
+Sample = tuple[int, int, int]
+Vector = tuple[float, float, float]
+Ray = tuple[Vector, Vector]
 
 FLOOR = float(np.finfo(np.float32).eps)
 
@@ -136,12 +140,31 @@ class Trial(NamedTuple):
     min_facing: float
 
 
+class Sweep(NamedTuple):
+    """A bucket of samples, the photographs, and the height hypotheses.
+
+    Attributes:
+        levels: Height, width and offset of every level.
+        focals: Focal length of every view, pixels.
+    """
+
+    gray: signatures.PictureRows
+    levels: signatures.Integers2
+    projection: signatures.Projection
+    focals: signatures.Doubles1
+    samples: signatures.Samples
+    shaded: Shading
+    trial: Trial
+
+
 class Choice(NamedTuple):
     """Chosen views of a sample, and workspace to choose them.
 
     Attributes:
         views: Chosen views, best first.
         score: Of these.
+        lit: Shading of these.
+        per_lit: Its inverse.
         shading: Of albedo 1, in every view; facings and footprints are set for candidates only.
         ratings: Of every view; 0 if it is no candidate.
         demoted: Ratings, minus one for each better view of the same pose.
@@ -149,6 +172,8 @@ class Choice(NamedTuple):
 
     views: signatures.Integers1
     score: signatures.Floats1
+    lit: signatures.Floats1
+    per_lit: signatures.Floats1
     shading: signatures.Floats1
     facings: signatures.Doubles1
     footprints: signatures.Doubles1
@@ -162,6 +187,8 @@ def empty_choice(views: int, limit: int) -> Choice:
     return Choice(
         np.empty(limit, np.int64),
         np.empty(limit, np.float32),
+        np.empty(limit, np.float32),
+        np.empty(limit, np.float32),
         np.empty(views, np.float32),
         np.empty(views, np.float64),
         np.empty(views, np.float64),
@@ -171,50 +198,46 @@ def empty_choice(views: int, limit: int) -> Choice:
 
 
 @compiled()
-def choose(
-    patch: int,
-    row: int,
-    column: int,
-    projection: signatures.Projection,
-    focals: Array,
-    samples: signatures.Samples,
-    shaded: Shading,
-    trial: Trial,
-    choice: Choice,
-) -> int:
-    """Choose the views of a sample.
-
-    Returns:
-        Their number; 0 if the sample is not swept.
-    """
-    _, image_from_patch, centers_patch = projection
+def sample_ray(samples: signatures.Samples, sample: Sample) -> Ray:
+    """Return a sample and its outward normal, patch frame."""
+    patch, row, column = sample
     origin, spacing, depth, outward = samples
-    normals, lights, _ = shaded
-    tested, valid, _, _, poses, _, min_views, _ = trial
-    chosen, score, shading, facings, footprints, ratings, demoted = choice
-    views, limit = len(shading), len(chosen)
-    if not tested[patch, row, column]:
-        return 0
-    num_valid = 0
-    for view in range(views):
-        num_valid += valid[patch, view, row, column]
-    if num_valid < min_views:
-        return 0
     x = origin[patch, 0] + spacing[patch] * column
     y = origin[patch, 1] + spacing[patch] * row
     z = np.float64(depth[patch, row, column])
     ox = np.float64(outward[patch, row, column, 0])
     oy = np.float64(outward[patch, row, column, 1])
     oz = np.float64(outward[patch, row, column, 2])
-    mean_shading = np.float32(0)
-    for view in range(views):
+    return (x, y, z), (ox, oy, oz)
+
+
+@compiled()
+def _shade(shaded: Shading, sample: Sample, shading: Array) -> float:
+    """Compute the shading of albedo 1 in every view; return its mean, negative values as zero."""
+    patch, row, column = sample
+    normals, lights, _ = shaded
+    mean_shading: Any = np.float32(0)
+    for view in range(len(shading)):
         light = lights[patch, view]
         shade = light[0] + light[1] * normals[patch, row, column, 0]
         shade += light[2] * normals[patch, row, column, 1]
         shade += light[3] * normals[patch, row, column, 2]
         shading[view] = shade
         mean_shading += max(shade, np.float32(0))
-    mean_shading /= np.float32(views)
+    mean_shading /= np.float32(len(shading))
+    return mean_shading
+
+
+@compiled()
+def _rate(sweep: Sweep, sample: Sample, choice: Choice) -> None:
+    """Rate every view of a sample: by its angle, resolution and light."""
+    patch, row, column = sample
+    _, image_from_patch, centers_patch = sweep.projection
+    shading, ratings = choice.shading, choice.ratings
+    spacing, valid, focals = sweep.samples.spacing, sweep.trial.valid, sweep.focals
+    (x, y, z), (ox, oy, oz) = sample_ray(sweep.samples, sample)
+    mean_shading = _shade(sweep.shaded, sample, shading)
+    views = len(shading)
     for view in range(views):
         ratings[view] = 0
         if not valid[patch, view, row, column] or not shading[view] > 0:
@@ -228,14 +251,19 @@ def choose(
         m = image_from_patch[patch * views + view]
         z_cam = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
         footprint = spacing[patch] * focals[view] / max(z_cam, FLOOR)
-        facings[view], footprints[view] = facing, footprint
+        choice.facings[view], choice.footprints[view] = facing, footprint
         rating = facing * min(footprint, 1.0) * min(shading[view] / mean_shading, 1.0)
         ratings[view] = np.float32(rating)
-    num_distinct = _demote_repeated_poses(ratings, poses, demoted)
+
+
+@compiled()
+def _take_best(choice: Choice) -> int:
+    """Write the views of the largest demoted ratings in order; return their number."""
+    chosen, score, limit = choice.views, choice.score, len(choice.views)
     num_chosen = 0
-    for view in range(views):
-        rating = demoted[view]
-        if not ratings[view] > 0:
+    for view in range(len(choice.demoted)):
+        rating = choice.demoted[view]
+        if not choice.ratings[view] > 0:
             continue
         if num_chosen == limit and not rating > score[limit - 1]:
             continue
@@ -245,126 +273,116 @@ def choose(
             index -= 1
         score[index], chosen[index] = rating, view
         num_chosen = min(num_chosen + 1, limit)
+    return num_chosen
+
+
+@compiled()
+def choose_views(sweep: Sweep, sample: Sample, choice: Choice) -> int:
+    """Choose the views of a sample.
+
+    Returns:
+        Their number; 0 if the sample is not swept.
+    """
+    patch, row, column = sample
+    tested, valid, _, _, poses, _, min_views, _ = sweep.trial
+    if not tested[patch, row, column]:
+        return 0
+    num_valid = 0
+    for view in range(len(choice.shading)):
+        num_valid += valid[patch, view, row, column]
+    if num_valid < min_views:
+        return 0
+    _rate(sweep, sample, choice)
+    num_distinct = _demote_repeated_poses(choice.ratings, poses, choice.demoted)
+    num_chosen = _take_best(choice)
+    for slot in range(num_chosen):
+        choice.lit[slot] = choice.shading[choice.views[slot]]
+        choice.per_lit[slot] = np.float32(1) / choice.lit[slot]
     return num_chosen if min(num_chosen, num_distinct) >= min_views else 0
 
 
 @compiled()
-def look_up(
-    gray: signatures.PictureRows,
-    levels: Array,
+def position(path: Array, move: float) -> tuple[float, float, float, float]:
+    """Return depth, inverse depth (1 for zero), and pixel of a point moved along its path."""
+    z_cam = path[0, 2] + move * path[1, 2]
+    inverse_z = 1 / z_cam if z_cam != 0 else 1.0
+    u = inverse_z * (path[0, 0] + move * path[1, 0])
+    v = inverse_z * (path[0, 1] + move * path[1, 1])
+    return z_cam, inverse_z, u, v
+
+
+@compiled()
+def sample_view(
+    sweep: Sweep,
     fractions: Array,
-    row: int,
+    sample: Sample,
+    choice: Choice,
+    slot: int,
     path: Array,
-    spacing: float,
-    ladder: Array,
-    squared_footprint: float,
-    gain: float,
     radiance: Array,
-) -> None:
-    """Sample a view at all heights of a sample.
+) -> float:
+    """Sample a chosen view at all heights of a sample.
 
     Args:
-        row: Of the photograph in the pyramids.
-        path: Homogeneous projections of the sample and of its outward normal.
-        spacing: Unit of the ladder.
-        gain: Inverse of the view's exposure.
-        radiance: Result: ``gain`` times the photograph, for every height.
+        fractions: See :func:`~pimper_torch.kernels.lookup.shrinkage`.
+        path: Result: homogeneous projections of the sample and of its outward normal.
+        radiance: Result: the photograph over the view's exposure, for every height.
+
+    Returns:
+        The area of the sample's footprint, pixels.
     """
-    level, blend = blended_level(squared_footprint, len(levels))
-    coarse = gray.coarser[row]
-    fine = coarse if level > 0 else gray.finest[row]
+    gray, levels, projection, _, samples, shaded, trial = sweep
+    patch, view = sample[0], choice.views[slot]
+    m = projection.image_from_patch[patch * len(choice.shading) + view]
+    (x, y, z), (ox, oy, oz) = sample_ray(samples, sample)
+    for i in range(3):
+        path[0, i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
+        path[1, i] = m[i, 0] * ox + m[i, 1] * oy + m[i, 2] * oz
+    footprint = choice.footprints[view]
+    area = footprint * footprint * max(choice.facings[view], trial.min_facing)
+    level, blend = blended_level(area, len(levels))
+    coarse = gray.coarser[projection.rows[view]]
+    fine = coarse if level > 0 else gray.finest[projection.rows[view]]
     coarser_level = level + (1 if blend > 0 else 0)
-    for step in range(len(ladder)):
-        move = spacing * ladder[step]
-        z_cam = path[0, 2] + move * path[1, 2]
-        inverse_z = 1 / z_cam if z_cam != 0 else 1.0
-        u = inverse_z * (path[0, 0] + move * path[1, 0])
-        v = inverse_z * (path[0, 1] + move * path[1, 1])
+    spacing, gain = samples.spacing[patch], shaded.gains[patch, view]
+    for step in range(len(trial.ladder)):
+        _, _, u, v = position(path, spacing * trial.ladder[step])
         value = _gray(fine, levels, fractions, level, u, v)
         if blend > 0:
             value += blend * (_gray(coarse, levels, fractions, coarser_level, u, v) - value)
         radiance[step] = gain * value
-
-
-@compiled()
-def trace(
-    m: Array, samples: signatures.Samples, patch: int, row: int, column: int, path: Array
-) -> None:
-    """Project a sample and its outward normal by a 3x4 matrix."""
-    origin, spacing, depth, outward = samples
-    x = origin[patch, 0] + spacing[patch] * column
-    y = origin[patch, 1] + spacing[patch] * row
-    z = np.float64(depth[patch, row, column])
-    ox = np.float64(outward[patch, row, column, 0])
-    oy = np.float64(outward[patch, row, column, 1])
-    oz = np.float64(outward[patch, row, column, 2])
-    for i in range(3):
-        path[0, i] = m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
-        path[1, i] = m[i, 0] * ox + m[i, 1] * oy + m[i, 2] * oz
+    return area
 
 
 @compiled(annotated=True)
-def costs(
-    gray: signatures.PictureRows,
-    levels: signatures.Integers2,
-    projection: signatures.Projection,
-    focals: signatures.Doubles1,
-    samples: signatures.Samples,
-    shaded: Shading,
-    trial: Trial,
-    cost: signatures.Floats4,
-    swept: signatures.Floats3,
-) -> None:
+def costs(sweep: Sweep, cost: signatures.Floats4, swept: signatures.Floats3) -> None:
     """Choose the views of each sample, and evaluate its cost at all heights.
 
     Args:
-        levels: Height, width and offset of every level.
         swept: Result, zero before: 1 for samples with costs.
     """
+    trial = sweep.trial
     patches, views, height, width = trial.valid.shape
     heights, limit = len(trial.ladder), min(trial.num_views, views)
-    choice = empty_choice(views, limit)
-    lit = np.empty(limit, np.float32)
-    per_lit = np.empty(limit, np.float32)
-    fractions = shrinkage(levels)
+    choice, fractions = empty_choice(views, limit), shrinkage(sweep.levels)
     radiance = np.empty((limit, heights), np.float32)
     ranked = np.empty((limit, heights), np.float32)
-    albedo, square, product = (
-        np.empty(heights, np.float32),
-        np.empty(heights, np.float32),
-        np.empty(heights, np.float32),
-    )
+    albedo, square = np.empty(heights, np.float32), np.empty(heights, np.float32)
+    product = np.empty(heights, np.float32)
     work, evaluated = (albedo, square, product, np.empty(heights)), np.empty(heights)
     path = np.empty((2, 3))
     for patch in range(patches):
         per_scale = np.float32(1) / trial.scale[patch]
         for row in range(height):
             for column in range(width):
-                count = choose(
-                    patch, row, column, projection, focals, samples, shaded, trial, choice
-                )
+                sample = patch, row, column
+                count = choose_views(sweep, sample, choice)
                 if count == 0:
                     continue
                 for slot in range(count):
-                    view = choice.views[slot]
-                    lit[slot] = choice.shading[view]
-                    per_lit[slot] = np.float32(1) / choice.shading[view]
-                    m = projection.image_from_patch[patch * views + view]
-                    trace(m, samples, patch, row, column, path)
-                    footprint = choice.footprints[view]
-                    look_up(
-                        gray,
-                        levels,
-                        fractions,
-                        projection.rows[view],
-                        path,
-                        samples.spacing[patch],
-                        trial.ladder,
-                        footprint * footprint * max(choice.facings[view], trial.min_facing),
-                        shaded.gains[patch, view],
-                        radiance[slot],
-                    )
+                    sample_view(sweep, fractions, sample, choice, slot, path, radiance[slot])
                 swept[patch, row, column] = 1
+                lit, per_lit = choice.lit, choice.per_lit
                 _inconsistency(radiance, lit, per_lit, count, per_scale, ranked, work, evaluated)
                 for step in range(heights):
                     cost[patch, step, row, column] = evaluated[step]
