@@ -23,6 +23,7 @@ from torch.nn.functional import grid_sample, normalize
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.rigid import transform
+from pimper_torch.kernels.arrays import as_array
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Cameras, Record
 from pimper_torch.records.shapes import Map, Points
@@ -250,10 +251,11 @@ def observe_points(
 def _observed(
     pictures: LogPictures, cameras: Cameras, tangents: Tangents, limits: Float[Tensor, " limit"]
 ) -> TrackObservations:
-    from pimper_torch.stages.sfm.kernels.patch_alignment import align
+    from pimper_torch.stages.sfm.kernels import patch_alignment as kernels
 
     window = _Window(like=pictures.log)
     templates = _templates(pictures, cameras, tangents, window)
+    values = templates.values, templates.slopes, templates.inverse
 
     def in_view(view: int) -> tuple[Tensor, Tensor, Tensor]:
         candidates = tangents.candidates[:, view] & templates.usable
@@ -261,10 +263,13 @@ def _observed(
         homographies = plane_homographies(tangents, cameras, view, chosen)
         shift = homographies.new_empty(len(homographies), 2)
         deviation, correlation = torch.empty_like(shift).mT.contiguous()
-        template = (templates.values, templates.slopes, templates.inverse)
-        given = (homographies, chosen, *template, window.raster, window.root, window.light, limits)
-        results = (shift, deviation, correlation)  # written to: these are contiguous
-        align(*(x.contiguous().numpy() for x in (pictures.log[view], *given, *results)))
+        kernels.align(
+            *map(as_array, (pictures.log[view], homographies, chosen)),
+            kernels.PatchTemplates(*map(as_array, values)),
+            kernels.PatchWindow(*map(as_array, (window.raster, window.root, window.light))),
+            as_array(limits),
+            kernels.Alignment(*map(as_array, (shift, deviation, correlation))),
+        )
         valid = shift.isfinite().all(dim=1)
         axes = homographies[:, :, :2]
         centre = homographies[:, :, 2:] + axes @ torch.where(valid[:, None], shift, 0)[..., None]
