@@ -3,6 +3,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -104,6 +105,27 @@ def test_folders_import_only_folders_before_them(path):
             assert head in allowed, module
             if (folder, head) == ("stages", "stages") and path.name != "__init__.py":
                 assert inside in {inner, "stage"}, module
+
+
+# Functions that every command has, and entry points.
+PROTOCOL = {"checked", "run", "main"}
+
+# Compiled functions with the name of the function in torch that they are the twin of.
+TWINS = {
+    *("coarser", "congruence", "prolongation", "robust_variance", "tangent_step"),
+    *("update_shading", "project_to_cone"),
+}
+
+
+def test_a_name_of_a_public_function_means_one_thing():
+    homes = defaultdict(set)
+    for path in files():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+                homes[node.name].add(named(path))
+    doubled = {name: found for name, found in homes.items() if len(found) > 1}
+    assert doubled.keys() <= PROTOCOL | TWINS, doubled
+    assert all(sum("kernels/" in home for home in homes[name]) == 1 for name in TWINS)
 
 
 @pytest.mark.parametrize("package", SOLE_IMPORTERS)

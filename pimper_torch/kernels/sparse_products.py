@@ -71,7 +71,7 @@ def product(
 
 
 @compiled(*_types("void(D, V, V, float64, int64, int64)"))
-def scaled(
+def jacobi_step(
     inverse_diagonal: Array, residual: Array, step: Array, fraction: float, first: int, last: int
 ) -> None:
     """Write ``fraction * D^-1 residual`` to ``step``."""

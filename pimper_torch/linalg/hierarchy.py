@@ -67,7 +67,7 @@ class Level:
             remaining = self._buffer("remaining", residual)
             with_product(self._matrix, start, residual, keep=1.0, gain=-1.0, out=remaining)
         diagonal, rhs = self._inverse_diagonal, as_array(remaining)
-        over_rows(sparse_products.scaled, size, diagonal, rhs, as_array(step), 1 / _CENTER)
+        over_rows(sparse_products.jacobi_step, size, diagonal, rhs, as_array(step), 1 / _CENTER)
         vectors = [as_array(each) for each in (step, step if start is None else start, solution)]
         of_step = _OF_STEP - 1 if start is None else _OF_STEP
         arrays = *aggregation.parts_of(self._matrix), diagonal, rhs, *vectors

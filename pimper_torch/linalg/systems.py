@@ -31,7 +31,7 @@ _COMPILED_CHOLESKY_UNKNOWNS = 10_000
 _POSITIVE_FRACTION = 0.1
 
 
-def prepare(
+def prepare_system(
     rows: Int[Tensor, " entry"],
     cols: Int[Tensor, " entry"],
     values: Float[Tensor, " entry"],
@@ -76,7 +76,7 @@ def solutions(
     neighbours, may slow multigrid down. Differentiable in ``values`` and in the sides.
     """
     size = len(sides[0])
-    prepared = prepare(rows, cols, values, size, what, tolerance=tolerance)
+    prepared = prepare_system(rows, cols, values, size, what, tolerance=tolerance)
     try:
         return tuple(prepared.solve(side) for side in sides)
     except SingularSystemError as error:

@@ -8,45 +8,28 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-# Former paths and present ones, in the package; the longest one that matches counts. A folder
-# without a present path only held others.
+# Former folders, and the present folder of what they held; the empty one is the package.
+_FOLDERS = {"doors": "", "ground": "", "method": "stages.", "published": "paper.", "result": ""}
+
+# Other changes of paths in the package; the longest one that matches counts.
 _FORMER = {
-    "doors": None,
     "doors.camera_files": "io.cameras",
-    "doors.export": "export",
     "doors.export.openexr": "io.openexr",
-    "doors.io": "io",
     "doors.io.reports": "export.reports",
     "doors.io.results": "export.results",
     "doors.result_folder": "export.result_folder",
-    "doors.scale": "scale",
-    "ground": None,
-    "ground.geometry": "geometry",
-    "ground.kernels": "kernels",
-    "ground.linalg": "linalg",
-    "ground.radiometry": "radiometry",
     "ground.shapes": "records.shapes",
-    "method": None,
     "method.chains": "chains",
     "method.chains.presets": "presets.load_chain",
     "method.chains.published": "paper.chain",
-    "method.coarse": "stages.coarse",
-    "method.fusion": "stages.fusion",
-    "method.meshing": "stages.meshing",
-    "method.patches": "stages.patches",
-    "method.photometry": "stages.photometry",
     "method.photometry.depth_from_light": "stages.light_depth.depth_from_light",
     "method.photometry.light_field": "lighting.light_field",
     "method.photometry.lights": "lighting.lights",
-    "method.sfm": "stages.sfm",
     "method.sfm.existing": "io.cameras.existing",
     "method.sfm.model": "records.sparse_model",
     "method.sfm.model_files": "io.cameras.model_files",
-    "method.silhouettes": "stages.silhouettes",
-    "method.sweep": "stages.sweep",
     "published": "paper",
     "published.published_config": "paper.paper_config",
-    "result": None,
     "result.asset": "stages.texturing",
     "result.asset.finish": "stages.meshing.finish",
     "result.asset.gltf": "io.assets.gltf",
@@ -55,11 +38,20 @@ _FORMER = {
     "result.asset.write": "io.assets.write",
     "result.relighting": "stages.relighting",
     "result.report": "viz.report",
-    "result.viewer": "viewer",
-    "result.viz": "viz",
     "runtime.stage": "stages.stage",
     "runtime.store": "store",
 }
+
+
+def present_path(former: str) -> str | None:
+    """Return the present path of a module in the package; ``None`` if it has not changed."""
+    parts = former.split(".")
+    heads = (".".join(parts[:count]) for count in range(len(parts), 0, -1))
+    head = next((head for head in heads if head in _FORMER), None)
+    if head is not None:
+        return _FORMER[head] + former[len(head) :]
+    folder, _, inside = former.partition(".")
+    return f"{_FOLDERS[folder]}{inside}" if folder in _FOLDERS else None
 
 
 def renamed(old: str, new: str) -> str:
@@ -75,18 +67,13 @@ class FormerModules(MetaPathFinder, Loader):
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """Return how to load a module with a former path; ``None`` for others."""
-        package, _, inside = name.partition(".")
-        if package != "pimper_torch":
-            return None
-        parts = inside.split(".")
-        heads = (".".join(parts[:count]) for count in range(len(parts), 0, -1))
-        former = next((head for head in heads if head in _FORMER), None)
-        if former is None:
-            return None
-        present = _FORMER[former]
+        package, _, former = name.partition(".")
+        present = present_path(former) if package == "pimper_torch" else None
         if present is None:
-            return ModuleSpec(name, self, is_package=True) if former == inside else None
-        return ModuleSpec(name, self, loader_state=f"{package}.{present}{inside[len(former) :]}")
+            return None
+        if former in _FOLDERS and former not in _FORMER:
+            return ModuleSpec(name, self, is_package=True)
+        return ModuleSpec(name, self, loader_state=f"{package}.{present}")
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
         """Import the present module; a folder that only held others is a new module."""

@@ -17,7 +17,7 @@ from pimper_torch.stages.fusion.blend import vertex_spacing
 from pimper_torch.stages.fusion.detail import spacing_of
 from pimper_torch.stages.fusion.estimate import fuse_terms
 from pimper_torch.stages.fusion.fuse_config import FuseConfig
-from pimper_torch.stages.fusion.problem import build_problem, subdivide_facets
+from pimper_torch.stages.fusion.problem import fusion_problem, subdivide_facets
 from pimper_torch.stages.fusion.terms import KeptSlopes, Normals, SweptHeights
 from pimper_torch.stages.patches.patches_config import DecomposeConfig
 from tests.fusion.test_fuse import unlit
@@ -225,7 +225,7 @@ def test_heights_without_photometric_normals_have_their_own_noise_factor(cap):
     swept = cap.replace(
         photometric=cap.photometric.replace(buckets=tuple(photometry)), buckets=tuple(heights)
     )
-    problem = build_problem(
+    problem = fusion_problem(
         swept, subdivide_facets(swept, vertex_spacing(swept.patches, 1.0)), True
     )
     own, coarse = kinds = SweptHeights().equations(problem)

@@ -8,7 +8,7 @@ from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements,
 from pimper_torch.geometry.topology import boundary_vertices
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.linalg.systems import prepare
+from pimper_torch.linalg.systems import prepare_system
 
 
 def square(count, generator, jitter=0.25):
@@ -121,6 +121,6 @@ def test_gradients_reach_weights_and_vertices(generator):
         index = torch.arange(mesh.count)
         entries = torch.cat([values, lumped_mass(mesh, weight) + anchor])
         whole = torch.cat([rows, index]), torch.cat([cols, index]), entries
-        return prepare(*whole, mesh.count).solve(rhs)
+        return prepare_system(*whole, mesh.count).solve(rhs)
 
     assert torch.autograd.gradcheck(solution, [vertices, weight])

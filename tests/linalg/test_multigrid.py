@@ -11,7 +11,7 @@ from pimper_torch.linalg.hierarchy import Hierarchy
 from pimper_torch.linalg.multigrid import Multigrid
 from pimper_torch.linalg.prepared import SingularSystemError
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.linalg.systems import prepare
+from pimper_torch.linalg.systems import prepare_system
 
 
 def entries(size, generator, decades=6.0, anchor=1e-3):
@@ -157,10 +157,10 @@ def test_a_smooth_solution_is_accepted_once_its_error_is_below_the_tolerance(gen
 def test_the_solver_is_chosen_by_the_matrix(generator, monkeypatch):
     monkeypatch.setattr("pimper_torch.linalg.systems._CHOLESKY_UNKNOWNS", 100)
     rows, cols, values = entries(200, generator)
-    assert isinstance(prepare(rows, cols, values, 200), Multigrid)
+    assert isinstance(prepare_system(rows, cols, values, 200), Multigrid)
     loop = torch.arange(200)  # positive couplings, made definite
     blocks = torch.cat([values.abs(), torch.full((200,), 50.0, dtype=torch.float64)])
     whole = torch.cat([rows, loop]), torch.cat([cols, loop]), blocks
-    assert isinstance(prepare(*whole, 200), SparseCholesky)
+    assert isinstance(prepare_system(*whole, 200), SparseCholesky)
     small = entries(50, generator)
-    assert isinstance(prepare(*small, 50), SparseCholesky)
+    assert isinstance(prepare_system(*small, 50), SparseCholesky)

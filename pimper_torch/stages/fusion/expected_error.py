@@ -24,7 +24,7 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.linalg.sums import sum_at
-from pimper_torch.linalg.systems import prepare
+from pimper_torch.linalg.systems import prepare_system
 from pimper_torch.records.shapes import PerVertex, Scalar
 from pimper_torch.stages.fusion.equations import Equations
 from pimper_torch.stages.fusion.estimate import FusedHeights
@@ -57,7 +57,7 @@ def expected_error(
         Errors along the directions of the heights, scene units, float64. Not differentiable.
 
     Raises:
-        SingularSystemError: See :func:`~pimper_torch.linalg.systems.prepare`.
+        SingularSystemError: See :func:`~pimper_torch.linalg.systems.prepare_system`.
     """
     generator = torch.Generator().manual_seed(0)  # of noise; any seed
     region = regions(subdivision)
@@ -74,7 +74,7 @@ def expected_error(
     solutions = []
     for solve, side in zip(solves, sides, strict=True):
         size, what = len(solve.heights), "the expected error"
-        system = prepare(*solve.matrix(), size, what, tolerance=1e-2)
+        system = prepare_system(*solve.matrix(), size, what, tolerance=1e-2)
         solutions.append(system.solve(torch.stack(side, dim=1)))
         del system
     error = solutions[0]

@@ -34,7 +34,7 @@ from pimper_torch.stages.fusion.estimate import FusedHeights, fuse_like, fuse_te
 from pimper_torch.stages.fusion.expected_error import expected_error
 from pimper_torch.stages.fusion.fuse_config import FuseConfig
 from pimper_torch.stages.fusion.normal_bias import NormalBias, PiecewiseLinearFit, normal_bias
-from pimper_torch.stages.fusion.problem import FINEST, build_problem, subdivide_facets
+from pimper_torch.stages.fusion.problem import FINEST, fusion_problem, subdivide_facets
 from pimper_torch.stages.fusion.terms import (
     ROTATION,
     SLOPES,
@@ -123,7 +123,7 @@ class Fuse(Stage):
         """
         config = self.config
         spacing = spacing_of(swept, config.samples_per_vertex, config.max_lost)
-        problem = build_problem(swept, subdivide_facets(swept, _COARSER * spacing), self._lit)
+        problem = fusion_problem(swept, subdivide_facets(swept, _COARSER * spacing), self._lit)
         terms = tuple(term.bound(problem, contours) for term in self._terms)
         several = _COARSER**2 * len(problem.points) > most
         shared = self._shared(Assembly.of(terms, problem), expected, several)
@@ -203,7 +203,7 @@ class Fuse(Stage):
     ) -> Assembly:
         """Return the terms of a block of facets, with corrected normals."""
         block = blocks.block_of(full, swept.patches.coarse.mesh.faces, mask, shared.coarse)
-        problem = build_problem(swept, block, self._lit).replace(typical=typical)
+        problem = fusion_problem(swept, block, self._lit).replace(typical=typical)
         if shared.tilt is not None:
             tilt = shared.tilt.at(problem.subdivision, problem.facets)
             problem = problem.replace(photometric=normalize(problem.photometric + tilt, dim=-1))

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.linalg.sums import sum_at
-from pimper_torch.linalg.systems import prepare
+from pimper_torch.linalg.systems import prepare_system
 from pimper_torch.records import Record
 from pimper_torch.records.shapes import PerVertex, Scalar, VertexMask, Vertices
 from pimper_torch.stages.fusion.equations import Equations, SharedError
@@ -128,7 +128,7 @@ class PiecewiseLinearFit:
         diagonal = torch.arange(self._size, device=facets.device)
         # Only for corners without vertices, where the matrix would be singular.
         damping = torch.full_like(diagonal, 1e-3, dtype=fraction.dtype)
-        self._normal = prepare(
+        self._normal = prepare_system(
             torch.cat([diagonal, rows.flatten()]),
             torch.cat([diagonal, cols.flatten()]),
             torch.cat([damping, blocks.permute(1, 2, 0).flatten()]),

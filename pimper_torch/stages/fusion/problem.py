@@ -114,7 +114,7 @@ def subdivide_facets(swept: SweptPatches, spacing: Float[Tensor, " facet"]) -> B
     return Block.full(subdivide(mesh.vertices_world, mesh.faces, spacing), mesh.faces)
 
 
-def build_problem(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
+def fusion_problem(swept: SweptPatches, block: Block, slopes: bool) -> Problem:
     """Return a block's problem, with the patches blended; ``slopes`` enables their normals."""
     patches = swept.patches
     subdivision, spacing = block.subdivision, block.subdivision.spacing

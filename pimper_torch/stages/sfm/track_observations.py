@@ -264,7 +264,9 @@ def _observed(
         shift = homographies.new_empty(len(homographies), 2)
         deviation, correlation = torch.empty_like(shift).mT.contiguous()
         kernels.align(
-            *map(as_array, (pictures.log[view], homographies, chosen)),
+            as_array(pictures.log[view]),
+            as_array(homographies),
+            as_array(chosen),
             kernels.PatchTemplates(*map(as_array, values)),
             kernels.PatchWindow(*map(as_array, (window.raster, window.root, window.light))),
             as_array(limits),

@@ -20,7 +20,7 @@ from pimper_torch.kernels.robust_scale import robust_variance
 from pimper_torch.kernels.signatures import Doubles1, Doubles2, Doubles3
 from pimper_torch.kernels.twin_constants import CAUCHY, GEMAN_MCCLURE, MIN_DEVIATION, SQUARES
 from pimper_torch.stages.photometry.kernels.factorization import overwrite, samples_that_count
-from pimper_torch.stages.photometry.kernels.shading_steps import frame, project
+from pimper_torch.stages.photometry.kernels.shading_steps import frame, project_to_cone
 
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -564,7 +564,7 @@ def _newton_refined(data: Data, lights: Doubles, shading: Doubles, weight: Doubl
                 return rms
         new_lights, trial = lights + fraction * direction, shading + fraction * change
         for k in range(num_samples):
-            projected = project(trial[0, k], trial[1, k], trial[2, k], trial[3, k])
+            projected = project_to_cone(trial[0, k], trial[1, k], trial[2, k], trial[3, k])
             for i in range(4):
                 new_shading[i, k] = projected[i]
     return rms

@@ -37,7 +37,7 @@ def update_shading(equations: Floats, shading: Floats, steps: int) -> None:
     """
     tile = np.empty(18 * TILE, np.float64)
     for first in range(0, shading.shape[1], TILE):
-        load(equations, shading, first, tile)
+        load_tile(equations, shading, first, tile)
         for _ in range(steps):
             _step(tile)
         for row in range(4):
@@ -47,7 +47,7 @@ def update_shading(equations: Floats, shading: Floats, steps: int) -> None:
 
 
 @compiled()
-def load(equations: Floats, shading: Floats, first: int, tile: Doubles) -> None:
+def load_tile(equations: Floats, shading: Floats, first: int, tile: Doubles) -> None:
     """Copy equations and shading of a tile's samples."""
     for row in range(14):
         source = equations[row]
@@ -140,7 +140,7 @@ def tangent_step(a: Ten, slope: Four, s: Four) -> Four:
     shrink = limit / max(length, 1e-30)
     shrink = shrink if length > limit else 1.0
     y0, y1, y2 = shrink * y0, shrink * y1, shrink * y2
-    return project(
+    return project_to_cone(
         s[0] + y0,
         s[1] + n[0] * y0 + first[0] * y1 + second[0] * y2,
         s[2] + n[1] * y0 + first[1] * y1 + second[1] * y2,
@@ -149,7 +149,7 @@ def tangent_step(a: Ten, slope: Four, s: Four) -> Four:
 
 
 @compiled(fast=True)
-def project(b: float, x: float, y: float, z: float) -> Four:
+def project_to_cone(b: float, x: float, y: float, z: float) -> Four:
     """Return the nearest vector of the cone; see ``stages.photometry.cone.project_to_cone``."""
     square = x * x + y * y + z * z
     length = math.sqrt(square if square > 0 else 1.0)
@@ -222,7 +222,7 @@ def whitening(equations: Floats, shading: Floats, vectors: Floats) -> None:
     """
     tile, whitened = np.empty(18 * TILE, np.float64), np.empty(12 * TILE, np.float64)
     for start in range(0, shading.shape[1], TILE):
-        load(equations, shading, start, tile)
+        load_tile(equations, shading, start, tile)
         for k in range(TILE):
             a, _, s = read_sample(tile, k)
             n, first, second = frame(s)

@@ -133,7 +133,7 @@ def align(
     for i in range(len(homographies)):
         t = chosen[i]
         template, slope, inverse = templates.values[t], templates.slopes[t], templates.inverse[t]
-        power = max(_power(template), np.float32(1e-12))
+        power: Any = max(_power(template), np.float32(1e-12))
         worst = _worst_variance(inverse)
         along, across = 0.0, 0.0
         has_converged = False
@@ -150,7 +150,7 @@ def align(
             along += step_x * scale
             across += step_y * scale
             result.deviation[i] = np.sqrt(squares / total * worst)
-            size = max(np.sqrt(norm) * np.sqrt(power), np.float32(1e-12))
+            size: Any = max(np.sqrt(norm) * np.sqrt(power), np.float32(1e-12))
             result.correlation[i] = common / size
             if np.sqrt(along**2 + across**2) > max_shift:
                 break

@@ -67,7 +67,7 @@ def _lower_median(values: Array, order: Array, count: int) -> float:
 
 
 @compiled(fast=True)
-def _refit(seen: Seen, albedo: float) -> Fit:
+def _refit(seen: Seen, albedo: Any) -> Fit:  # noqa: ANN401 - numbers of numpy
     """Fit the albedo with the weights of its residuals.
 
     Returns:
@@ -88,10 +88,10 @@ def _refit(seen: Seen, albedo: float) -> Fit:
 @compiled(fast=True)
 def _pull_back_refit(
     seen: Seen,
-    albedo: float,
+    albedo: Any,  # noqa: ANN401 - numbers of numpy
     fit: Fit,
-    on_fit: float,
-    on_scale: float,
+    on_fit: Any,  # noqa: ANN401
+    on_scale: Any,  # noqa: ANN401
     on_radiance: Array,
     on_shading: Array,
 ) -> tuple[Any, Any]:
