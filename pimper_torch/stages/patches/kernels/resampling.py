@@ -92,32 +92,28 @@ def _mark_facing(
 
 
 @compiled()
-def _blend(pyramid: Pyramid, u: float, v: float, area: float, blended: Array) -> float:
-    """Interpolate between pixels and between levels; return the unusable part, 255ths.
+def _add_level(
+    pixels: Array,
+    unusable: Array,
+    start: int,
+    sides: tuple[int, int],
+    place: tuple[float, float],
+    weight: Any,  # noqa: ANN401 - numbers of numpy
+    blended: Array,
+) -> float:
+    """Add the weighted pixels around a place in a level; return its weighted unusable part.
 
     Args:
-        area: Of the footprint, pixels.
-        blended: Result, one value per channel.
+        start: Row of the level's first pixel.
+        place: Pixels right and down, from the centre of the top-left pixel.
     """
-    image, unusable, levels, fractions = pyramid
-    channels = len(blended)
-    level, blend = blended_level(area, len(levels))
-    lost: Any = np.float32(0)
-    for step in range(2 if blend > 0 else 1):
-        weight = blend if step == 1 else np.float32(1) - blend
-        current = level + step
-        tall, wide = levels[current, 0], levels[current, 1]
-        x, y = u * fractions[current, 1] - 0.5, v * fractions[current, 0] - 0.5
-        pixel, right, below, across, down = corners(tall, wide, x, y)
-        pixels, masked, start = image[0], unusable[0], 0
-        if current > 0:
-            pixels, masked, start = image[1], unusable[1], levels[current, 2]
-        lost += weight * bilinear(masked, start + pixel, right, below, across, down)
-        pixel += channels * start
-        for channel in range(channels):
-            value = weight * bilinear(pixels, pixel, right, below, across, down)
-            blended[channel] = value if step == 0 else blended[channel] + value
-            pixel += tall * wide
+    tall, wide = sides
+    pixel, right, below, across, down = corners(tall, wide, place[0], place[1])
+    lost: float = weight * bilinear(unusable, start + pixel, right, below, across, down)
+    pixel += len(blended) * start
+    for channel in range(len(blended)):
+        blended[channel] += weight * bilinear(pixels, pixel, right, below, across, down)
+        pixel += tall * wide
     return lost
 
 
@@ -133,6 +129,7 @@ def _sample_picture(
 ) -> None:
     """Sample a picture where footprints are inside it; bright and usable samples are valid."""
     channels, height, width = radiance.shape
+    (finest, coarser), (unusable, unusable_coarser), levels, fractions = pyramid
     blended = np.empty(channels, np.float32)
     for row in range(height):
         for column in range(width):
@@ -143,7 +140,20 @@ def _sample_picture(
                 area = max(1.0, abs(du_column * dv_row - dv_column * du_row))
                 margin = 0.5 * math.sqrt(area)
                 if margin <= u <= size_px[0] - margin and margin <= v <= size_px[1] - margin:
-                    lost = _blend(pyramid, u, v, area, blended)
+                    level, blend = blended_level(area, len(levels))
+                    lost: Any = np.float32(0)
+                    blended[:] = 0
+                    for step in range(2 if blend > 0 else 1):
+                        weight = blend if step == 1 else np.float32(1) - blend
+                        current, start = level + step, levels[level + step, 2]
+                        sides = levels[current, 0], levels[current, 1]
+                        place = u * fractions[current, 1] - 0.5, v * fractions[current, 0] - 0.5
+                        if current == 0:
+                            lost += _add_level(finest, unusable, 0, sides, place, weight, blended)
+                        else:
+                            lost += _add_level(
+                                coarser, unusable_coarser, start, sides, place, weight, blended
+                            )
                     mean = np.float32(0)
                     for channel in range(channels):
                         mean += blended[channel]
