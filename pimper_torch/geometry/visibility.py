@@ -88,7 +88,8 @@ class RayCaster:
 
     >>> square = torch.tensor([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
     >>> caster = RayCaster(square, torch.tensor([[0, 2, 1], [0, 3, 2]]))
-    >>> caster.cast(torch.zeros(1, 3), torch.tensor([[0.2, 0.1, 1.0]])).distance
+    >>> hits = caster.cast(torch.zeros(1, 3), torch.tensor([[0.2, 0.1, 1.0]]))
+    >>> hits.distance.round(decimals=4)
     tensor([1.])
     """
 
