@@ -149,6 +149,11 @@ def a_scene_in_tensors(_: pytest.MonkeyPatch) -> dict[str, object]:
     }
 
 
+def a_scene_and_a_chain(_: pytest.MonkeyPatch) -> dict[str, object]:
+    _, scene = photographed()
+    return {"scene": scene, "chain": pimper_torch.load_chain("default", {"scales": [1.0]})}
+
+
 @pytest.mark.usefixtures("small_pictures")
 @pytest.mark.filterwarnings("default::pimper_torch.runtime.errors.PimperWarning")
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
@@ -262,6 +267,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/python.md", 0): a_folder_of_photographs,
     ("docs/python.md", 1): a_scene_and_a_mesh,
     ("docs/python.md", 2): a_scene_in_tensors,
+    ("docs/python.md", 3): a_scene_and_a_chain,
     ("docs/parts.md", 0): a_matrix_and_patches,
     ("docs/parts.md", 1): photographs_of_one_viewpoint,
     ("docs/parts.md", 2): a_normal_map,

@@ -9,6 +9,7 @@ from probes import small_scene
 
 import pimper_torch as pt
 from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.chains.prepare import locate
 from pimper_torch.radiometry import linear_from_srgb, to_bytes
 from tests.coarse import ball
 
@@ -79,7 +80,7 @@ def test_a_mesh_reveals_inverted_poses_and_flipped_axes(preset, mistaken, messag
     vertices, faces = icosphere(1)
     mesh = pt.Mesh(vertices_world=vertices, faces=faces)
     chain = pt.load_chain(preset)
-    chain.placed(chain.running(), scene, None, mesh)
+    locate(chain, chain.running(), scene, None, mesh)
     poses = mistaken(scene.cameras.cam_from_world)
     wrong = pt.scene_of(scene.views.images, scene.cameras.intrinsics, poses)
     with pytest.raises(

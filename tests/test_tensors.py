@@ -11,6 +11,7 @@ import trimesh
 from probes import small_scene
 
 import pimper_torch as pt
+from pimper_torch.chains.prepare import locate
 from pimper_torch.geometry.local_frame import from_local
 from pimper_torch.geometry.projection import project
 from tests.sfm.ball import cameras_on_an_arc, photographs
@@ -158,7 +159,7 @@ def test_gradients_reach_cameras_far_from_the_origin(given):
 
 def placed(scene):
     chain = pt.load_chain("fast")
-    return chain.placed(chain.running(), scene, None)
+    return locate(chain, chain.running(), scene)[0]
 
 
 @pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
@@ -177,7 +178,7 @@ def test_a_chain_triangulates_points_for_given_poses():
 def test_an_unknown_reference_is_refused_before_structure_from_motion(preset, monkeypatch):
     views = photographs(cameras_on_an_arc(), lit=False)
     chain = pt.load_chain(preset, {"coarse_surface": {"reference": "nobody"}})
-    monkeypatch.setattr(chain, "placed", lambda *given: pytest.fail("it ran"))
+    monkeypatch.setattr("pimper_torch.chains.chain.prepare", lambda *given: pytest.fail("it ran"))
     with pytest.raises(pt.InputError, match=r"0 photographs are named 'nobody'; needed: one of 0"):
         chain(views)
 

@@ -76,7 +76,7 @@ PATCHES: dict[str, dict[str, object]] = {
     "sfm.moved_object": {"stages.sfm.registration.link_sessions": lambda *_: ()},
     "sfm.weak_views": {"stages.sfm.registration.drop_weak_views": lambda model, _: model},
     "sfm.misplaced": {"stages.sfm.diagnose._MIN_AGREEMENT": 0.0},
-    "sfm.sound_views": {"chains.chain.sound": lambda scene: scene},
+    "sfm.sound_views": {"chains.prepare.sound": lambda scene: scene},
     "silhouettes.empty": {
         "stages.silhouettes.find._without_empty": lambda silhouettes, _: silhouettes
     },
