@@ -84,6 +84,11 @@ class Step(Record):
         return self.prepared.silhouettes
 
     @property
+    def held_out(self) -> SparseScene | None:
+        """Photographs used only to estimate cameras; ``None`` without any."""
+        return self.prepared.held_out
+
+    @property
     def photometric(self) -> PhotometricPatches:
         """Normals, albedo and lights of every patch."""
         return self.heights.photometric
@@ -276,7 +281,7 @@ class Chain(Stage):
         return Reconstruction(
             mesh=extracted,
             scene=step.scene,
-            held_out=step.prepared.held_out,
+            held_out=step.held_out,
             silhouettes=step.silhouettes,
             coarse=step.coarse,
             patches=step.heights,

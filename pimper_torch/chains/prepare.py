@@ -79,6 +79,7 @@ class ObservesPoints(Protocol):
         """Return the scene with points that its photographs observe."""
 
 
+@runtime_checkable
 class Preparing(Protocol):
     """The stages and settings of a chain that its preparation uses."""
 

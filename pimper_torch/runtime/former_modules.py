@@ -2,7 +2,6 @@
 
 import sys
 import warnings
-from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -64,7 +63,7 @@ class FormerModules(MetaPathFinder, Loader):
     """Finder of modules by their former paths, which gives the present module."""
 
     def find_spec(
-        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+        self, name: str, path: object, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         """Return how to load a module with a former path; ``None`` for others."""
         package, _, former = name.partition(".")
