@@ -53,7 +53,7 @@ def stage_report(
 
 def seconds_of(reports: Iterable[StageReport]) -> float:
     """Return the seconds of all stages in this run; stages with kept records ran earlier."""
-    return sum(report.seconds for report in reports if not report.kept)
+    return sum((report.seconds for report in reports if not report.kept), 0.0)
 
 
 def table_of(reports: Sequence[StageReport]) -> tuple[StageReport, ...]:
