@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pimper_torch.runtime.mapped import each
 
-Raster = Shaped[Tensor, "height width"]
+Raster = Shaped[Tensor, "_ _"]
 
 
 def around_and_inside(maps: Sequence[Raster]) -> tuple[float, float]:

@@ -104,7 +104,7 @@ def _nearest_hits(
     caster: RayCaster,
     points: Vertices,
     outward: Vertices,
-    face_normals: Vertices,
+    face_normals: Float[Tensor, "face 3"],
     reach: Scalar,
 ) -> Hits:
     """Return the nearer hits of rays outward and inward on surface of similar orientation."""
