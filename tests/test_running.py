@@ -6,7 +6,7 @@ from probes import small_scene
 from torch import nn
 
 import pimper_torch as pt
-from pimper_torch.chains.running import ChainRun
+from pimper_torch.chains.running import ChainRun, _beside
 from pimper_torch.runtime.errors import PimperWarning, caution
 from pimper_torch.runtime.reporting import SilentObserver, observed
 from pimper_torch.store import Store
@@ -79,3 +79,10 @@ def test_the_record_of_a_sequence_and_of_keywords_is_read_by_a_later_run(tmp_pat
     assert torch.equal(found[0].mesh.vertices_world, found[1].mesh.vertices_world)
     assert found[0].closed is None
     assert found[2].closed is not None
+
+
+def test_a_kept_record_is_on_the_device_of_the_inputs_also_of_keywords():
+    record = small_scene(num_views=4, width=32, num_points=17)[1].mesh
+    elsewhere = record.to("meta")
+    assert _beside(elsewhere, (1, "no records")) is elsewhere
+    assert _beside(record, ("text", elsewhere)).faces.device.type == "meta"

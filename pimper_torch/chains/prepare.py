@@ -151,8 +151,8 @@ def locate(
     points, and cameras are estimated again.
     """
     scene, decisions = _located(chain, run, views, sparse_model, mesh)
-    stage = chain.silhouettes
-    if isinstance(stage, FindSilhouettes) and stage.config.object == "everything":
+    finder = chain.silhouettes
+    if isinstance(finder, FindSilhouettes) and finder.config.object == "everything":
         return scene, decisions
     photographs = views if isinstance(views, Views) else views.views
     reading = right_reading(scene, photographs)

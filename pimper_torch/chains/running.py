@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, ParamSpec, TypeVar
 
-import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
@@ -61,7 +60,7 @@ class ChainRun:
             if hashed is None:
                 return make()
             record, _ = kept(self.store, f"{name}-{hashed}", stage.kept_as, make)
-            return typing.cast(R, record.to(device_of(inputs)))
+            return typing.cast(R, _beside(record, (*inputs, *named.values())))
 
     def passes(self, scales: Sequence[float]) -> Iterator[tuple[float, bool]]:
         """Yield the scale of each pass, and whether it is the last."""
@@ -70,11 +69,11 @@ class ChainRun:
             yield scale, self.last
 
 
-def device_of(inputs: Sequence[object]) -> torch.device:
-    """Return the device of the first tensor in the records among a stage's inputs."""
-    records = [value for value in inputs if isinstance(value, Record)]
-    leaves = pytree.tree_leaves(records)
-    return next((leaf.device for leaf in leaves if isinstance(leaf, Tensor)), torch.device("cpu"))
+def _beside(record: Record, inputs: Sequence[object]) -> Record:
+    """Move a record to the device of the first tensor in the records among a stage's inputs."""
+    leaves = pytree.tree_leaves([value for value in inputs if isinstance(value, Record)])
+    tensors = [leaf for leaf in leaves if isinstance(leaf, Tensor)]
+    return record.to(tensors[0].device) if tensors else record
 
 
 def called(name: str, call: Callable[[], R]) -> R:
