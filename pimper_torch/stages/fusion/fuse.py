@@ -294,8 +294,8 @@ class Fuse(Stage):
                 noise=dict(zip(assembly.keys, independent.factors, strict=True)),
                 typical={
                     SLOPES: own_slope_variance(problem),
-                    ROTATION: rotation_variance(problem)
-                    / _COARSER,  # shorter steps of a random walk
+                    # The steps of a random walk are shorter at full size.
+                    ROTATION: rotation_variance(problem) / _COARSER,
                 },
             )
         if not expected:
