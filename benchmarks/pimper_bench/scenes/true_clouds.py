@@ -10,7 +10,7 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through, triangulate_rays
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.visibility import RayCaster
-from pimper_torch.records import Cameras, Mesh, SparseScene
+from pimper_torch.records import Cameras, Mesh, SparseScene, Views
 from pimper_torch.records.sparse_model import SparseModel
 
 
@@ -33,10 +33,32 @@ def sparse_scene(
     """
     cameras = scene.cameras
     points = _draw(scene, 4 * num_points, generator)
-    pixels, seen = _tracked(scene, points)
+    pixels, seen = tracked(cameras, scene.depth, points)
     (kept,) = torch.nonzero(seen.sum(dim=1) >= 3, as_tuple=True)
     kept = kept[:num_points]
     points, pixels, seen = points[kept], pixels[kept], seen[kept]
+    return triangulated(
+        scene.views, cameras, points, pixels, seen, generator, noise_px=noise_px, dtype=dtype
+    )
+
+
+def triangulated(
+    views: Views,
+    cameras: Cameras,
+    points: Float[Tensor, "point 3"],
+    pixels: Float[Tensor, "point view 2"],
+    seen: Bool[Tensor, "point view"],
+    generator: torch.Generator,
+    *,
+    noise_px: float,
+    dtype: torch.dtype = torch.float32,
+) -> SparseScene:
+    """Return a cloud from exact points, their pixels and the views that see them.
+
+    Args:
+        noise_px: Added to the pixels, from which the points are then triangulated.
+        dtype: Of photographs, cameras and points.
+    """
     if noise_px > 0:
         spread = torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         pixels = pixels + noise_px * spread.to(pixels)
@@ -45,7 +67,7 @@ def sparse_scene(
     errors = (projected - pixels).norm(dim=-1)
     point_index, view_index = torch.nonzero(seen, as_tuple=True)
     return SparseScene(
-        views=scene.views.replace(images=scene.views.images.to(dtype)),
+        views=views.replace(images=views.images.to(dtype)),
         cameras=cameras.replace(
             intrinsics=cameras.intrinsics.to(dtype), cam_from_world=cameras.cam_from_world.to(dtype)
         ),
@@ -74,15 +96,14 @@ def _draw(scene: RenderedScene, count: int, generator: torch.Generator) -> Float
     return points[torch.randperm(len(points), generator=generator)]
 
 
-def _tracked(
-    scene: RenderedScene, points: Float[Tensor, "point 3"]
+def tracked(
+    cameras: Cameras, depths: Float[Tensor, "view height width"], points: Float[Tensor, "point 3"]
 ) -> tuple[Float[Tensor, "point view 2"], Bool[Tensor, "point view"]]:
     """Project points to all views, and return where the depth maps confirm their depth.
 
     A point is seen if the depths of the 3x3 pixels around it bracket its depth and
     are on one surface. The rim of an object, and the image's border, are excluded.
     """
-    cameras = scene.cameras
     pixels, depth = project(points, cameras.cam_from_world, cameras.intrinsics)
     seen = torch.zeros(depth.shape, dtype=torch.bool)
     for view in range(cameras.num_views):
@@ -91,11 +112,7 @@ def _tracked(
         framed = (depth[view] > 0) & (u >= 1) & (v >= 1) & (u < width - 1) & (v < height - 1)
         (inside,) = torch.nonzero(framed, as_tuple=True)
         patch = torch.stack(
-            [
-                scene.depth[view, v[inside] + dv, u[inside] + du]
-                for dv in (-1, 0, 1)
-                for du in (-1, 0, 1)
-            ]
+            [depths[view, v[inside] + dv, u[inside] + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)]
         ).to(depth)
         z = depth[view, inside]
         slack = 1e-4 * z
