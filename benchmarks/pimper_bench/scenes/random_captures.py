@@ -106,7 +106,10 @@ def render_random(
     ]
     views = _views([stored(image, sensor, draws.generator) for image in clean], cameras)
     chance = torch.stack(
-        [detectability(image, kind) for image, kind in zip(clean, surface, strict=True)]
+        [
+            detectability(image, item.albedo.movedim(-1, 0), item.surface)
+            for image, item in zip(clean, seen, strict=True)
+        ]
     )
     # The room of a turntable moves relative to the object.
     static = depth.where(surface != ROOM, torch.inf) if path.turning else depth

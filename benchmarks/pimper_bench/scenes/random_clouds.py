@@ -2,7 +2,7 @@
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -12,53 +12,66 @@ from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.records import Cameras, SparseScene, Views
 
-_WINDOW_PX = 9
+_WINDOW_PX = 7
 # Standard deviation of log radiance below which nothing is detected, and above which all is.
 _FAINTEST, _STRONGEST = 0.02, 0.15
-_CLEAR = 0.75  # fraction of a window on one surface, below which its outline hinders matching
+_SHADING = 0.2  # probability that contrast without texture is matched
 _DARK = 0.01  # added before the logarithm: noise hides weaker differences
 _NOISE_PX, _OUTLIERS = 0.3, 0.02
 _FEWEST, _MOST = 300, 3000  # points
 _GAINS = (1.0, 4.0, 16.0)  # factors on the probabilities, tried in turn until points suffice
 
 
-def local_contrast(
-    image: Float[Tensor, "channel height width"], surface: Int[Tensor, "height width"]
+def detectability(
+    image: Float[Tensor, "channel height width"],
+    albedo: Float[Tensor, "channel height width"],
+    surface: Int[Tensor, "height width"],
 ) -> Float[Tensor, "height width"]:
-    """Return the standard deviation of log radiance around each pixel, on its own surface.
+    """Return the probability that a feature is detected at each pixel, and again elsewhere.
 
-    Slow changes are removed first: shading is no texture. It is 0 near outlines, where the window
-    contains too much of another surface.
+    It grows with the contrast of the photograph, and is a fifth without contrast of albedo: edges
+    of shadows move with the light.
 
     Args:
         image: Linear radiance without noise.
         surface: A number for each surface, across whose outlines nothing is compared.
     """
+    clear = whole_windows(surface)
+    visible, lasting = (
+        ((local_contrast(values, clear) - _FAINTEST) / (_STRONGEST - _FAINTEST)).clamp(0, 1)
+        for values in (image, albedo)
+    )
+    return visible * (_SHADING + (1 - _SHADING) * (2 * lasting).clamp_max(1))
+
+
+def whole_windows(surface: Int[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Return the pixels around which a window is on one surface and inside the image."""
+    numbers = surface.numpy().astype("int8")
+    lowest = minimum_filter(numbers, _WINDOW_PX, mode="constant", cval=-2)
+    highest = maximum_filter(numbers, _WINDOW_PX, mode="constant", cval=-2)
+    return torch.from_numpy(lowest == highest)
+
+
+def local_contrast(
+    image: Float[Tensor, "channel height width"], clear: Bool[Tensor, "height width"]
+) -> Float[Tensor, "height width"]:
+    """Return the standard deviation of log radiance in a window around each pixel.
+
+    Slow changes are removed first: shading is no texture.
+
+    Args:
+        clear: Pixels whose windows are on one surface; the contrast is that of these pixels, and
+            0 around which they are less than a third of a window.
+    """
     logarithm = (image.mean(dim=0).clamp(0, 1) + _DARK).log()
-    contrast = torch.zeros_like(logarithm)
-    for number in range(int(surface.amin()), int(surface.amax()) + 1):
-        own = surface == number
-        covered = _window_mean(own.to(logarithm))
-        share = covered.clamp_min(1 / _WINDOW_PX**2)
-        detail = logarithm - _window_mean(torch.where(own, logarithm, 0)) / share
-        detail = torch.where(own, detail, 0)
-        variance = _window_mean(detail**2) / share - (_window_mean(detail) / share) ** 2
-        clear = own & (covered > _CLEAR)
-        contrast = torch.where(clear, variance.clamp_min(0).sqrt(), contrast)
-    return contrast
+    detail = torch.where(clear, logarithm - _window_mean(logarithm), 0)
+    share = _window_mean(clear.to(logarithm))
+    mean, square = (_window_mean(values) / share.clamp_min(1e-3) for values in (detail, detail**2))
+    return torch.where(share > 1 / 3, (square - mean**2).clamp_min(0).sqrt(), 0)
 
 
 def _window_mean(values: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    filtered = uniform_filter(values.numpy(), _WINDOW_PX, mode="constant")
-    return torch.from_numpy(filtered)
-
-
-def detectability(
-    image: Float[Tensor, "channel height width"], surface: Int[Tensor, "height width"]
-) -> Float[Tensor, "height width"]:
-    """Return the probability that a feature is detected at each pixel."""
-    contrast = local_contrast(image, surface)
-    return ((contrast - _FAINTEST) / (_STRONGEST - _FAINTEST)).clamp(0, 1)
+    return torch.from_numpy(uniform_filter(values.numpy(), _WINDOW_PX, mode="constant"))
 
 
 def textured_cloud(

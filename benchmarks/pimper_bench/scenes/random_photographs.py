@@ -24,7 +24,7 @@ from pimper_torch.records import Cameras, Record
 NOTHING, OBJECT, TABLE, ROOM = -1, 0, 1, 2
 # At most this fraction of the pixels has four rays, and none that differs by less in the square
 # root of radiance from those next to it.
-_FINE, _UNEVEN = 0.12, 0.04
+_FINE, _UNEVEN = 0.1, 0.04
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -37,6 +37,7 @@ class Seen(Record):
     """
 
     radiance: Float[Tensor, "*batch channel"]
+    albedo: Float[Tensor, "*batch channel"]
     depth: Float[Tensor, "*batch"]
     surface: Int[Tensor, "*batch"]
 
@@ -70,6 +71,7 @@ def render_view(
     mean = seen_at(fine).radiance.reshape(4, -1, 3).mean(dim=0)
     return Seen(
         radiance=seen.radiance.index_copy(0, uneven, mean).reshape(height, width, 3),
+        albedo=seen.albedo.reshape(height, width, 3),
         depth=seen.depth.reshape(height, width),
         surface=seen.surface.reshape(height, width),
     )
@@ -84,11 +86,13 @@ def _seen(
     light: PointLight,
 ) -> Seen:
     spots = stage.trace(eye, rays)
-    shaded = stage.shade(spots, eye, light)
     met = spots.object_index >= 0
-    radiance = torch.where(met[:, None], shaded.matte + shaded.mirrored, 0)
-    depth, surface = spots.hits.distance.clone(), torch.full_like(spots.object_index, NOTHING)
-    surface[met] = stage.outside[spots.object_index[met]].long()
+    (rows,) = torch.nonzero(met, as_tuple=True)
+    shaded = stage.shade(spots.take(rows), eye, light)
+    radiance = torch.zeros_like(spots.albedo).index_copy(0, rows, shaded.matte + shaded.mirrored)
+    albedo, depth = spots.albedo.clone(), spots.hits.distance.clone()
+    surface = torch.full_like(spots.object_index, NOTHING)
+    surface[rows] = stage.outside[spots.object_index[rows]].long()
     (free,) = torch.nonzero(~met, as_tuple=True)
     if room is not None and len(free):
         room_from_world = invert_rigid(world_from_room)
@@ -100,9 +104,10 @@ def _seen(
         )
         if room.glow is not None:
             received = torch.full_like(received, room.glow)
-        radiance[free] = room.texture(points).expand(-1, 3) * received
+        albedo[free] = room.texture(points).expand(-1, 3)
+        radiance[free] = albedo[free] * received
         depth[free], surface[free] = distance, ROOM
-    return Seen(radiance=radiance, depth=depth, surface=surface)
+    return Seen(radiance=radiance, albedo=albedo, depth=depth, surface=surface)
 
 
 def _received(

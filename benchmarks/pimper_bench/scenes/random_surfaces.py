@@ -62,27 +62,6 @@ def _cells(draws: Draws, coarsest: float) -> tuple[float, ...]:
     return tuple(coarsest * ratio for ratio in (1.0, 0.41, 0.17))
 
 
-def random_material(draws: Draws) -> Material:
-    """Draw an object's material: textured, weakly textured or of one colour; 40 % are glossy."""
-    albedo, kind = random_colour(draws), draws.pick(["textured", "textured", "weak", "uniform"])
-    if kind == "textured":
-        cells = _cells(draws, draws.log_uniform(0.15, 0.6))
-        texture = speckled(
-            draws, albedo, draws.uniform(0.4, 0.9), draws.log_uniform(0.6, 3.0), cells
-        )
-    elif kind == "weak":
-        cells = _cells(draws, draws.log_uniform(0.2, 0.9))
-        texture = speckled(draws, albedo, draws.uniform(0.08, 0.25), 1.0, cells)
-    else:
-        texture = Uniform(albedo=tuple(albedo.tolist()))
-    specular, roughness = draws.uniform(0.02, 0.06), draws.uniform(0.15, 0.4)
-    if not draws.chance(0.4):
-        return Material(kind=kind, texture=texture, albedo=albedo)
-    return Material(
-        kind=kind, texture=texture, albedo=albedo, specular=specular, roughness=roughness
-    )
-
-
 def _speckle(draws: Draws, albedo: Colour, size: float) -> Texture:
     cells = _cells(draws, size * draws.log_uniform(0.08, 0.3))
     return speckled(draws, albedo, draws.uniform(0.25, 0.8), draws.log_uniform(0.4, 2.5), cells)
@@ -191,6 +170,7 @@ TABLES: dict[str, Pattern] = {
     "print": _print,
     "plain": _plain,
 }
+PATTERNS: dict[str, Pattern] = {"planks": _planks, "checks": _checks, "print": _print}
 WALLS: dict[str, Pattern] = {
     "smooth": _smooth,
     "speckle": _speckle,
@@ -198,6 +178,29 @@ WALLS: dict[str, Pattern] = {
     "checks": _checks,
     "print": _print,
 }
+
+
+def random_material(draws: Draws) -> Material:
+    """Draw an object's material: textured, weakly textured or of one colour; 40 % are glossy."""
+    albedo, kind = random_colour(draws), draws.pick(["textured", "textured", "weak", "uniform"])
+    if kind == "textured" and draws.chance(0.25):
+        texture = PATTERNS[draws.pick(list(PATTERNS))](draws, albedo, 1.5)
+    elif kind == "textured":
+        cells = _cells(draws, draws.log_uniform(0.15, 0.6))
+        texture = speckled(
+            draws, albedo, draws.uniform(0.4, 0.9), draws.log_uniform(0.6, 3.0), cells
+        )
+    elif kind == "weak":
+        cells = _cells(draws, draws.log_uniform(0.2, 0.9))
+        texture = speckled(draws, albedo, draws.uniform(0.08, 0.25), 1.0, cells)
+    else:
+        texture = Uniform(albedo=tuple(albedo.tolist()))
+    specular, roughness = draws.uniform(0.02, 0.06), draws.uniform(0.15, 0.4)
+    if not draws.chance(0.4):
+        return Material(kind=kind, texture=texture, albedo=albedo)
+    return Material(
+        kind=kind, texture=texture, albedo=albedo, specular=specular, roughness=roughness
+    )
 
 
 def random_table(draws: Draws, radius: float, similar: Colour, *, round_one: bool) -> SceneObject:

@@ -116,6 +116,8 @@ def random_lights(
         place = min(max(middle + spread * draws.uniform(-1, 1), 0.0), 1.0)
         ambient = _FAINTEST * (_SOFTEST / _FAINTEST) ** place
         soft = draws.uniform(0.1, 0.7) if window else 0.0
+        # Half of the ambient light, more or less, is from above one side: shadows have shading.
+        sided = ambient * draws.uniform(0.2, 0.9)
         colour = (warmth * draws.vector(-1, 1, 3)).exp()
         position = _lamp(draws, eye, centre, radius)
         if flash:
@@ -128,8 +130,8 @@ def random_lights(
                 position=position.float(),
                 target=centre.float(),
                 irradiance=(1 - ambient) * (1 - soft),
-                ambient=ambient,
-                window=((1 - ambient) * soft * _above(draws)).float() if window else None,
+                ambient=ambient - sided,
+                window=((1.5 * sided + (1 - ambient) * soft) * _above(draws)).float(),
                 colour=(colour / colour.mean()).float() if coloured else None,
             )
         )

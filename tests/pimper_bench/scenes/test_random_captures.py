@@ -4,7 +4,7 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.random_bodies import FAMILIES, SIZE, random_body
 from pimper_bench.scenes.random_captures import render_random
-from pimper_bench.scenes.random_clouds import detectability, local_contrast
+from pimper_bench.scenes.random_clouds import detectability, local_contrast, whole_windows
 from pimper_bench.scenes.random_draws import Draws
 from pimper_bench.scenes.random_photographs import Sensor, stored
 from pimper_torch.geometry.pixels import pixel_centers
@@ -96,14 +96,19 @@ def test_contrast_is_texture_and_neither_shading_nor_outlines():
     noisy[:, 30:] = 1
     bright = torch.where(surface == 1, 1.5, 1.0)  # a step at the outline
     image = (ramp * noisy * bright).expand(3, -1, -1)
-    contrast = local_contrast(image, surface)
+    clear = whole_windows(surface)
+    assert clear[3:-3, 3:27].all()
+    assert not clear[:, 27:33].any()
+    contrast = local_contrast(image, clear)
     inside = contrast[6:-6, 6:24]
     assert 0.06 < inside.median() < 0.12  # 0.1, less the window's mean
     assert contrast[6:-6, 30:54].max() < 0.02
     assert (contrast[:, 29:31] == 0).all()
-    chance = detectability(image, surface)
+    chance = detectability(image, image, surface)
     assert (chance[6:-6, 30:] == 0).all()
     assert 0.2 < chance[6:-6, 6:24].median() < 0.8
+    plain = detectability(image, torch.ones_like(image), surface)
+    assert_close(plain[6:-6, 6:24], 0.2 * inside.sub(0.02).div(0.13).clamp(0, 1))
 
 
 def test_points_are_detected_where_there_is_contrast(capture):
@@ -112,7 +117,7 @@ def test_points_are_detected_where_there_is_contrast(capture):
     inside = (u >= 0) & (u < 96) & (v >= 0) & (v < 72)
     contrast = torch.stack(
         [
-            local_contrast(image, kind)
+            local_contrast(image, whole_windows(kind))
             for image, kind in zip(capture.views.images, capture.surface, strict=True)
         ]
     )
