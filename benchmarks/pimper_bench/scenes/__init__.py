@@ -2,9 +2,10 @@
 
 :func:`render_scene` renders one into a folder, frame by frame; :func:`build_scene` and
 :func:`render_frame` are its parts. :func:`render_objects` and :func:`render_shape` keep a small
-scene in memory.
+scene in memory, and :func:`render_random` a random one.
 """
 
+from pimper_bench.scenes.random_captures import RandomCapture, render_random
 from pimper_bench.scenes.ray_tracing import RenderedFrame, TracedObjects, render_frame
 from pimper_bench.scenes.render_in_memory import (
     RenderedScene,
@@ -23,6 +24,7 @@ SCENES = tuple(RECIPES)
 
 __all__ = [
     "SCENES",
+    "RandomCapture",
     "RenderedFrame",
     "RenderedScene",
     "Scene",
@@ -34,6 +36,7 @@ __all__ = [
     "potato_on_table",
     "render_frame",
     "render_objects",
+    "render_random",
     "render_scene",
     "render_shape",
     "sparse_scene",

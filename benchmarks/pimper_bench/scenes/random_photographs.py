@@ -24,7 +24,7 @@ from pimper_torch.records import Cameras, Record
 NOTHING, OBJECT, TABLE, ROOM = -1, 0, 1, 2
 # At most this fraction of the pixels has four rays, and none that differs by less in the square
 # root of radiance from those next to it.
-_FINE, _UNEVEN = 0.1, 0.04
+_FINE, _UNEVEN = 0.07, 0.04
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
