@@ -23,7 +23,8 @@ from pimper_bench.scenes.random_photographs import (
     render_view,
     stored,
 )
-from pimper_bench.scenes.random_surfaces import random_material, random_room, random_table
+from pimper_bench.scenes.random_rooms import random_room
+from pimper_bench.scenes.random_surfaces import random_material, random_table
 from pimper_bench.scenes.random_views import random_cameras, random_lights
 from pimper_bench.scenes.ray_tracing import TracedObjects
 from pimper_bench.scenes.scene_object import SceneObject
@@ -83,9 +84,7 @@ def render_random(
     mesh = join(*body.meshes)
     points = mesh.vertices_world
     path = random_cameras(Draws(seed, "cameras"), points, num_views, width, height)
-    cameras = path.cameras
-    objects = _dressed(seed, body, turning=path.turning)
-    stage = TracedObjects(objects)
+    cameras, stage = path.cameras, TracedObjects(_dressed(seed, body, turning=path.turning))
     centre = (points.amin(dim=0) + points.amax(dim=0)) / 2
     lights = random_lights(Draws(seed, "lights"), cameras, centre, _RADIUS)
     reach = float((cameras.centers_world - centre).norm(dim=1).amax())
@@ -105,12 +104,10 @@ def render_random(
         for exposure, item in zip(exposures, seen, strict=True)
     ]
     views = _views([stored(image, sensor, draws.generator) for image in clean], cameras)
-    chance = torch.stack(
-        [
-            detectability(image, item.albedo.movedim(-1, 0), item.surface)
-            for image, item in zip(clean, seen, strict=True)
-        ]
-    )
+    chance = [
+        detectability(image, item.albedo.movedim(-1, 0), item.surface)
+        for image, item in zip(clean, seen, strict=True)
+    ]
     # The room of a turntable moves relative to the object.
     static = depth.where(surface != ROOM, torch.inf) if path.turning else depth
     return RandomCapture(
@@ -119,7 +116,7 @@ def render_random(
         depth=depth,
         surface=surface,
         foreground=surface == OBJECT,
-        scene=textured_cloud(views, cameras, static, chance, Draws(seed, "cloud")),
+        scene=textured_cloud(views, cameras, static, torch.stack(chance), Draws(seed, "cloud")),
         mesh=mesh,
         family=body.family,
         turning=path.turning,

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from pimper_bench.scenes.random_draws import Draws
-from pimper_bench.scenes.random_surfaces import Room
+from pimper_bench.scenes.random_rooms import Room
 from pimper_bench.scenes.ray_tracing import TracedObjects
 from pimper_bench.scenes.scene_lights import PointLight
 from pimper_bench.scenes.scene_settings import SensorConfig, expose
