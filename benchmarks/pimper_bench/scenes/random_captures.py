@@ -95,7 +95,6 @@ def render_random(
     ]
     depth = torch.stack([item.depth for item in seen])
     surface = torch.stack([item.surface for item in seen])
-
     draws = Draws(seed, "sensor")
     sensor = random_sensor(draws)
     exposures = draws.vector(0.6, 1.4, num_views).float()
