@@ -20,6 +20,10 @@ GIVEN = "--sparse {scene}/truth/sparse --masks {scene}/masks"
 RUNS = {
     "coarse": ("{scene}", "| scene | Poisson of points and contours |"),
     "file_encodings": ("{scene} -o {out} --encodings sRGB", "| sRGB | no | "),
+    "fleet": (
+        "--out {out} --tiny --only jar-arc-soft --preset fast --tag now",
+        "| jar-arc-soft | 0.",
+    ),
     "gamma": ("--curves sRGB --noise 0.01 --seeds 1", "| sRGB | 0.2 | 4 | 1.0 | 2."),
     "gradient_cost": ("{scene} --scales 0.25 --only repair", "| repair | "),
     "gradients": (
@@ -60,7 +64,7 @@ def flat(folder: Path, *, depth: bool) -> None:
 
 
 def test_all_studies_are_run():
-    assert {path.stem for path in STUDIES.glob("*.py")} == {*RUNS, "guard_sets"}
+    assert {path.stem for path in STUDIES.glob("*.py")} == {*RUNS, "fleet_captures", "guard_sets"}
 
 
 @pytest.mark.parametrize("study", RUNS)
