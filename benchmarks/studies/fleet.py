@@ -14,6 +14,7 @@ one should be announced.
 import argparse
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +22,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatch
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from pimper_bench.metrics.in_view import compare_along_rays
 from pimper_bench.metrics.similarity import align_estimate, transfer
 from pimper_bench.metrics.surface_distances import TrueSurface
 from pimper_torch.chains.prepare import locate
+from pimper_torch.export.result_folder.marker import STAGES
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.photographs import load_views
 from pimper_torch.presets.load_chain import load_chain
@@ -51,7 +53,7 @@ ANNOUNCING = (
     *("cameras are unreliable", "may be misplaced", "Give masks of the object"),
     *("Features hardly match", "No points", "keep the normals of the coarse mesh"),
 )
-MOST_LOST = 0.2  # fraction of the photographs that may be excluded or fail without announcement
+MOST_LOST = 0.2  # of the photographs may be excluded or fail without announcement
 COLUMNS = (
     *("IoU", "worst", "lost %", "extra %", "reliable", "CPU s"),
     *("normals °", "met %", "accuracy %", "completeness %", "good", "announced", "error"),
@@ -60,15 +62,15 @@ COLUMNS = (
 
 def outlines(place: Path, preset: str) -> Row:
     """Find the silhouettes of a capture, and compare them with the true masks."""
-    views, chain = load_views(place / "photos"), load_chain(preset)
+    views, method = load_views(place / "photos"), load_chain(preset)
     with warnings.catch_warnings(record=True) as cautions:
         warnings.simplefilter("always", PimperWarning)
-        config, name = chain.reconstruct.config, Path(preset).stem
-        store = Store(folder=place / "cameras")
-        model, _ = kept(store, name, SparseModel, lambda: structure_from_motion(views, config))
-        scene, _ = locate(chain, chain.running(), placed_scene(views, model))
+        config, store = method.reconstruct.config, Store(folder=place / "cameras")
+        key = Path(preset).stem
+        model, _ = kept(store, key, SparseModel, lambda: structure_from_motion(views, config))
+        scene, _ = locate(method, method.running(), placed_scene(views, model))
         began = time.process_time()
-        found = chain.silhouettes(scene)
+        found = method.silhouettes(scene)
         seconds = time.process_time() - began
     told = {
         "views": views.num_views,
@@ -94,9 +96,8 @@ def compared(found: torch.Tensor, known: torch.Tensor) -> Row:
 
 def announced(told: Mapping[str, Any]) -> bool:
     """Return whether ``summary.json`` says that the result is bad."""
-    failures = [each for each in told.get("failures", ()) if each["what"] == "view"]
-    failed = {name for each in failures for name in each["names"]}
-    missing = max(len(failed), told["views"] - told["registered"])
+    failures = [each["names"] for each in told.get("failures", ()) if each["what"] == "view"]
+    missing = max(len({*chain.from_iterable(failures)}), told["views"] - told["registered"])
     counted = any(part in text for text in told["warnings"] for part in ANNOUNCING)
     return bool(told["diagnosis"]) or counted or missing > MOST_LOST * told["views"]
 
@@ -111,18 +112,18 @@ def reconstructed(place: Path, result: Path, preset: str) -> Row:
     if ran.returncode:
         error = ReconstructionError if ran.returncode == 2 else RuntimeError
         raise error(ran.stderr.strip()[-500:])
+    shutil.rmtree(result / STAGES, ignore_errors=True)  # of use only to an interrupted run
     told = json.loads((result / "summary.json").read_text(encoding="utf-8"))
-    names = ("views", "registered", "diagnosis", "failures", "warnings")
-    row = {name: told[name] for name in names}
+    entries = ("views", "registered", "diagnosis", "failures", "warnings")
+    row = {name: told[name] for name in entries}
     return row | {"announced": announced(told), "CPU s": sum(after[2:4]) - sum(before[2:4])}
 
 
 def measured(place: Path, result: Path) -> Row:
     """Compare a result with the truth; normals and coverage over all photographs."""
     capture, estimate = read_rendered(place, photographs=False), read_estimate(result)
-    generator = torch.Generator().manual_seed(0)
-    alignment = align_estimate(estimate, capture, "cameras", generator=generator)
-    mesh = transfer(estimate.mesh, alignment.truth_from_world)
+    moved = align_estimate(estimate, capture, "cameras", generator=torch.Generator())
+    mesh = transfer(estimate.mesh, moved.truth_from_world)
     surface = TrueSurface(capture).compare(mesh)
     angles, met, pixels = 0.0, 0.0, float(capture.truth.foreground.sum())
     for view in range(capture.views.num_views):
@@ -142,7 +143,6 @@ def measured(place: Path, result: Path) -> Row:
 
 def judged(row: Row, place: Path, result: Path | None, preset: str) -> Row:
     """Add to a row what it lacks: silhouettes, and the surface if a folder is given for it."""
-    row = dict(row)
     try:
         if "IoU" not in row:
             row |= outlines(place, preset)
@@ -233,8 +233,7 @@ def main(arguments: list[str] | None = None) -> None:
         result = None if options.outlines else out / "results" / name
         row = judged(row, place, result, options.preset)
         path.parent.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(row, indent=1, ensure_ascii=False)
-        path.with_suffix(".part").write_text(text, encoding="utf-8")
+        path.with_suffix(".part").write_text(json.dumps(row, indent=1), encoding="utf-8")
         path.with_suffix(".part").rename(path)
         say(f"{name}: " + ", ".join(f"{one} {cell(row, one)}" for one in COLUMNS if one in row))
     kept_rows: dict[str, dict[str, Row]] = {one: {} for one in options.table or (tag,)}
@@ -242,8 +241,7 @@ def main(arguments: list[str] | None = None) -> None:
         path = out / "rows" / one / f"{name}.json"
         if path.exists():
             kept_rows[one][name] = json.loads(path.read_text(encoding="utf-8"))
-    for line in table(kept_rows):
-        say(line)
+    say("\n".join(table(kept_rows)))
 
 
 if __name__ == "__main__":
