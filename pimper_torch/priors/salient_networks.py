@@ -9,7 +9,7 @@ from typing import Any
 from pimper_torch.runtime.config import require
 from pimper_torch.runtime.errors import ConfigError, InputError, caution
 
-# The default of rembg itself changes between versions; its present one forbids commercial use.
+# rembg's own default varies with its version; the present one's licence restricts commercial use.
 DEFAULT = "u2net"
 
 # They need a click, return masks of clothes, or need a file in rembg's folder.
