@@ -38,6 +38,7 @@ from .priors.prior_files.read_maps import read_depth as read_depth
 from .priors.prior_files.read_maps import read_normals as read_normals
 from .priors.prior_files.read_silhouettes import object_at as object_at
 from .priors.prior_files.read_silhouettes import read_silhouettes as read_silhouettes
+from .priors.segmenter import segment as segment
 from .radiometry import Encoding as Encoding
 from .records import AlbedoPrior as AlbedoPrior
 from .records import Cameras as Cameras

@@ -46,6 +46,7 @@ SOLE_IMPORTERS = {
     "viser": {"viewer/"},
     "pxr": {"io/assets/usd.py"},
     "onnxruntime": {"priors/network.py"},
+    "rembg": {"priors/salient_networks.py"},
     "distributed": {"cli/batches/engines.py"},
     "submitit": {"cli/batches/engines.py"},
 }

@@ -18,6 +18,7 @@ from pimper_torch.io.photograph_files import image_name, list_images
 from pimper_torch.paper.paper_config import PublishedConfig
 from pimper_torch.presets.load_config import Config, load_config
 from pimper_torch.priors.map_config import DEPTH_ERROR, NORMALS_ERROR_DEG, NormalAxes
+from pimper_torch.priors.salient_networks import network_file, require_network
 from pimper_torch.runtime.config import bytes_of, presets, require
 from pimper_torch.runtime.errors import ConfigError, InputError
 from pimper_torch.runtime.file_names import view_named
@@ -134,6 +135,8 @@ class InputOptions:
         unit: Unit of given lengths, and of the result if its size is known.
         silhouettes: Folder of soft masks of a segmentation network, for all or some photographs, of
             any size: PNG, JPEG, EXR, NPZ or NPY. Contradicting views overrule them.
+        segmenter: Make soft masks by a salient-object network: name of one in rembg, such as u2net,
+            isnet-general-use or birefnet-general; or its ONNX file.
         object_at: Pixel of a photograph on the object; may be repeated.
         normals: Folder of a network's normal maps, named like photographs: PNG, EXR, NPZ or NPY.
         axes: Axes of these normals; auto detects them from point cloud and outlines.
@@ -153,6 +156,7 @@ class InputOptions:
     markers: Markers = "auto"
     unit: given.Unit = "mm"
     silhouettes: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    segmenter: Annotated[str, tyro.conf.arg(metavar="NAME|FILE")] = ""
     object_at: Places = ()
     normals: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     axes: NormalAxes = "auto"
@@ -164,9 +168,9 @@ class InputOptions:
         valid = isinstance(self.markers, str) or 0 < self.markers < float("inf")
         require(valid, "markers", self.markers, "auto, off, or a length in millimetres above 0")
         require(
-            self.masks is None or not (self.silhouettes or self.object_at),
-            "--silhouettes or --object-at",
-            str(self.silhouettes or (*self.object_at, "")[0]),
+            self.masks is None or not (self.silhouettes or self.segmenter or self.object_at),
+            "--silhouettes, --segmenter or --object-at",
+            str(self.silhouettes or self.segmenter or (*self.object_at, "")[0]),
             "no value together with --masks, which are used unchanged",
         )
         _ = self.bars, self.distances  # refused before anything is read
@@ -203,7 +207,7 @@ class Job:
 _RARE = (
     *("--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
     *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
-    *("--silhouettes", "--object-at", "--usdz", "--texture", "--asset-cameras"),
+    *("--silhouettes", "--segmenter", "--object-at", "--usdz", "--texture", "--asset-cameras"),
 )
 
 # Both cranium and face of the skull are visible in this photograph.
@@ -309,6 +313,8 @@ def check(job: Job) -> Job:
     """Make all checks of a run that do not read photographs, and return the run."""
     if job.common.view:
         require_viser()
+    if job.inputs.segmenter:
+        require_network(job.inputs.segmenter)
     require_apart(job.out, inputs_of(job))
     prepare_output(job.out, "result", job.common.overwrite)
     for folder in (job.photos, job.inputs.masks):
@@ -342,6 +348,7 @@ def inputs_of(job: Job) -> dict[str, Path | None]:
         "--sparse": job.inputs.sparse,
         "--mesh": job.inputs.mesh,
         "--silhouettes": job.inputs.silhouettes,
+        "--segmenter": network_file(job.inputs.segmenter) if job.inputs.segmenter else None,
         "--normals": job.inputs.normals,
         "--depth": job.inputs.depth,
         "--cache": job.common.cache,

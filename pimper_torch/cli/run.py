@@ -27,6 +27,7 @@ from pimper_torch.io.photographs import load_views
 from pimper_torch.presets.load_chain import make_chain
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
+from pimper_torch.priors.segmenter import segment
 from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene, Views
 from pimper_torch.runtime.config import bytes_of
 from pimper_torch.runtime.errors import ConfigError, caution
@@ -61,17 +62,17 @@ def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
     common = job.common
     imports = stage_report("import", time.perf_counter() - output.began)
     lock, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
+    folder, limit = common.cache or job.out / STAGES, bytes_of(common.max_kept)
+    store = Store(folder=folder, max_bytes=limit, fresh=common.fresh)
     warned = collected(Caution, passed_on=True)
     with lock, output.observer(forecast) as table, warned as cautions:
         with stage("read") as figures:
-            views = _read(job)
+            views = _read(job, store)
             figures["photographs"] = views.num_views
             _examine(job, views)
             bars = bars_in_files(job, views)
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
-        folder, limit = common.cache or job.out / STAGES, bytes_of(common.max_kept)
-        store = Store(folder=folder, max_bytes=limit, fresh=common.fresh)
         chain = make_chain(job.config, table.observer, store)
         chain.needed = tuple(given.measured_in(job.inputs.bars, job.inputs.distances))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
@@ -120,7 +121,7 @@ def _preview(
         output.remark(f"{path} shows the coarse surface, until the run ends.")
 
 
-def _read(job: Job) -> Views:
+def _read(job: Job, store: Store) -> Views:
     inputs = job.inputs
     views = load_views(
         job.photos,
@@ -132,6 +133,8 @@ def _read(job: Job) -> Views:
     priors: list[Prior] = []
     if inputs.silhouettes is not None:
         priors.append(read_silhouettes(inputs.silhouettes, views))
+    if inputs.segmenter:
+        priors.append(segment(views, inputs.segmenter, cache=store))
     if inputs.object_at:
         priors.append(object_at([in_files(job, views, mark) for mark in inputs.object_at], views))
     if inputs.normals is not None:
@@ -158,6 +161,7 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None, cautions: list
     about: dict[str, object] = {
         "photographs": str(job.photos.absolute()),
         **{name: path and str(path) for name, path in paths.items()},
+        "segmenter": job.inputs.segmenter or None,
         "object_at": [str(mark) for mark in job.inputs.object_at],
         "response": str(job.config.photographs.response),
         "max_size_px": job.common.max_size_px,

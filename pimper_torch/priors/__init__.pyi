@@ -2,3 +2,4 @@
 __all__: list[str]
 from .conventions import resolve_prior_conventions as resolve_prior_conventions
 from .network import priors_of as priors_of
+from .segmenter import segment as segment

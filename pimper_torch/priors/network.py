@@ -116,8 +116,13 @@ def _prior(maps: from_maps.Maps, kind: Kind, meaning: dict[str, Any]) -> Prior:
     return InlierPrior(probability=values[..., 0], **maps.about, **meaning)
 
 
-def _loaded(path: Path) -> Network:
-    """Load an ONNX file, with one thread per image, so that bits do not depend on their number."""
+def onnx_session(path: Path) -> Any:  # noqa: ANN401 - onnxruntime's
+    """Open an ONNX file, with one thread per image, so that bits do not depend on their number.
+
+    Raises:
+        InputError: The file is not ONNX.
+        ConfigError: onnxruntime is not installed.
+    """
     if path.suffix.lower() != ".onnx":
         raise InputError(
             f"{path}: is not an ONNX file. Files of `torch.export` (.pt2) and `torch.save` contain "
@@ -133,11 +138,13 @@ def _loaded(path: Path) -> Network:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
-        session = onnxruntime.InferenceSession(
-            str(path), options, providers=["CPUExecutionProvider"]
-        )
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has a type for each error
         raise InputError(f"{path}: cannot be opened by onnxruntime ({error}).") from error
+
+
+def _loaded(path: Path) -> Network:
+    session = onnx_session(path)
     (into, *_), outputs = session.get_inputs(), [output.name for output in session.get_outputs()]
     names = [outputs[0], *(name for name in outputs[1:] if name == "variance")]
 

@@ -19,6 +19,7 @@ from pimper_torch.cli.main import main
 from pimper_torch.cli.options import parse
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.store import Store
+from tests.priors.onnx_files import brightness
 from tests.video.clips import written
 
 # The values of each option; {names} are paths in the folder of `world`.
@@ -34,8 +35,8 @@ RUNS = {
         "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report "
         "--normals {maps} --axes world --normals-error-deg 10 --depth {maps} --depth-error 0.05",
         "{photos} -o {out} --sparse {sparse} --mesh {true_mesh} --preset {preset} --max-size-px 48 "
-        "--silhouettes {masks} --object-at view_000.png,32,24 --object-at view_002,30,25 "
-        "--no-report",
+        "--silhouettes {masks} --segmenter {network} --object-at view_000.png,32,24 "
+        "--object-at view_002,30,25 --no-report",
     ],
     "batch": [
         "{table} --out {out} --jobs 1 --time-limit 30 --mem-gb 2 --cpus-per-task 1 --overwrite",
@@ -107,6 +108,7 @@ def world(tmp_path_factory, dtu):
     folder = tmp_path_factory.mktemp("world")
     write_ball(folder / "ball.ply", level=2)
     (folder / "preset.yaml").write_text(PRESET)
+    (folder / "bright.onnx").write_bytes(brightness())
     scene = folder / "scene"
     small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1"
     assert main(["render", str(folder / "ball.ply"), "-o", str(scene), *small.split()]) == 0
@@ -132,6 +134,7 @@ def world(tmp_path_factory, dtu):
         "ball": folder / "ball.ply",
         "told": folder / "told.ply",
         "preset": folder / "preset.yaml",
+        "network": folder / "bright.onnx",
         "scene": scene,
         "photos": scene / "photos",
         "masks": scene / "masks",

@@ -44,3 +44,14 @@ def model(nodes, constants, outputs) -> bytes:
         graph += field(5, sides + field(2, 1) + field(8, name) + field(9, raw))
     graph += field(11, port("picture")) + b"".join(field(12, port(name)) for name in outputs)
     return field(1, 8) + field(8, field(2, 13)) + field(7, graph)
+
+
+def brightness() -> bytes:
+    """Encode a network like U2-Net, whose saliency is the mean of the colours."""
+    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+    constants = {
+        "weights": ((1, 3, 1, 1), tuple(each / 3 for each in std)),
+        "mean": ((), (sum(mean) / 3,)),
+    }
+    nodes = [("Conv", ("picture", "weights"), "grey"), ("Add", ("grey", "mean"), "saliency")]
+    return model(nodes, constants, ("saliency",))

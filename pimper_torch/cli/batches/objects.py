@@ -16,6 +16,7 @@ from pimper_torch.runtime.errors import ConfigError, InputError, some
 CSV, HTML = "batch.csv", "batch.html"
 
 _PATHS = ("DIR", "FILE", "PATH")
+_NAMED = ("--preset", "--segmenter")  # a name, or a file
 _YES, _NO = ("yes", "true", "1"), ("no", "false", "0")
 
 
@@ -136,7 +137,7 @@ def _words(where: str, option: str, cell: str, kinds: Mapping[str, str], base: P
         stage, dot, last = option[2:].rpartition(".")
         negated = f"--{stage}{dot}no-{last}"
         return [option] if cell.lower() in _YES else [negated] if negated in kinds else []
-    if kind in _PATHS or (option == "--preset" and (base / cell).is_file()):
+    if kind in _PATHS or (option in _NAMED and (base / cell).is_file()):
         cell = str((base / cell).absolute())
     try:
         return [option, *(shlex.split(cell) if kind and " " in kind else [cell])]
