@@ -29,8 +29,11 @@ from typing import Any
 import torch
 from fleet_captures import MESHES, SUBSET, fleet, rendered
 from silhouettes import known_masks, overlaps
+from silhouettes import soft_masks as given_masks
 
 from pimper_bench.datasets import read_rendered
+from pimper_bench.evidence.silhouette_network import load_network
+from pimper_bench.evidence.soft_masks import soft_masks
 from pimper_bench.metrics.in_view import compare_along_rays
 from pimper_bench.metrics.similarity import align_estimate, transfer
 from pimper_bench.metrics.surface_distances import TrueSurface
@@ -55,12 +58,12 @@ ANNOUNCING = (
 )
 MOST_LOST = 0.2  # of the photographs may be excluded or fail without announcement
 COLUMNS = (
-    *("IoU", "worst", "lost %", "extra %", "reliable", "CPU s"),
+    *("evidence", "IoU", "worst", "lost %", "extra %", "reliable", "CPU s"),
     *("normals °", "met %", "accuracy %", "completeness %", "good", "announced", "error"),
 )
 
 
-def outlines(place: Path, preset: str) -> Row:
+def outlines(place: Path, preset: str, weights: Path | None) -> Row:
     """Find the silhouettes of a capture, and compare them with the true masks."""
     views, method = load_views(place / "photos"), load_chain(preset)
     with warnings.catch_warnings(record=True) as cautions:
@@ -70,6 +73,9 @@ def outlines(place: Path, preset: str) -> Row:
         model, _ = kept(store, key, SparseModel, lambda: structure_from_motion(views, config))
         scene, _ = locate(method, method.running(), placed_scene(views, model))
         began = time.process_time()
+        if weights is not None:
+            priors = (soft_masks(scene, load_network(weights)),)
+            scene = scene.replace(views=scene.views.replace(priors=priors))
         found = method.silhouettes(scene)
         seconds = time.process_time() - began
     told = {
@@ -78,7 +84,10 @@ def outlines(place: Path, preset: str) -> Row:
         "diagnosis": scene.diagnosis,
         "warnings": [str(each.message) for each in cautions],
     }
-    figures = compared(found.masks, torch.stack(known_masks(str(place / "masks"), scene)))
+    known = known_masks(str(place / "masks"), scene)
+    figures = compared(found.masks, torch.stack(known))
+    if weights is not None:
+        figures["evidence"] = float(overlaps(given_masks(scene), known).mean())
     reliable = f"{int(found.reliable.sum())} of {views.num_views}"
     return told | figures | {"reliable": reliable, "announced": announced(told), "CPU s": seconds}
 
@@ -141,11 +150,13 @@ def measured(place: Path, result: Path) -> Row:
     }
 
 
-def judged(row: Row, place: Path, result: Path | None, preset: str) -> Row:
+def judged(
+    row: Row, place: Path, result: Path | None, preset: str, weights: Path | None = None
+) -> Row:
     """Add to a row what it lacks: silhouettes, and the surface if a folder is given for it."""
     try:
         if "IoU" not in row:
-            row |= outlines(place, preset)
+            row |= outlines(place, preset, weights)
         if result is not None:
             row |= reconstructed(place, result, preset)
             row |= measured(place, result)
@@ -201,6 +212,7 @@ def options_of(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--meshes", type=Path, default=MESHES, help="folder of mesh files")
     parser.add_argument("--outlines", action="store_true", help="stop at silhouettes")
     parser.add_argument("--preset", default="default")
+    parser.add_argument("--evidence", type=Path, help="weights of train_silhouettes.py")
     parser.add_argument("--all", action="store_true", help="every shape, path and material")
     parser.add_argument("--subset", action="store_true", help="six captures")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="names or patterns")
@@ -231,7 +243,7 @@ def main(arguments: list[str] | None = None) -> None:
             continue
         place = rendered(name, options.tiny, options.meshes, out)
         result = None if options.outlines else out / "results" / name
-        row = judged(row, place, result, options.preset)
+        row = judged(row, place, result, options.preset, options.evidence)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.with_suffix(".part").write_text(json.dumps(row, indent=1), encoding="utf-8")
         path.with_suffix(".part").rename(path)

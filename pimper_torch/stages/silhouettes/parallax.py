@@ -28,7 +28,7 @@ from pimper_torch.stages.silhouettes.image_shifts import shift_between
 
 Homographies = Float[Tensor, "view 3 3"]
 _FAINT = 0.03  # of white; ratios of darker colours are noise
-_RATIO = 100.0  # grey levels for a ratio of e
+RATIO = 100.0  # grey levels for a ratio of e
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -63,7 +63,7 @@ def working_pictures(views: Views, cameras: Cameras, size_px: int) -> WorkingPic
         colours = (255 * srgb_from_linear(radiance)).round().byte().permute(1, 2, 0)
         red, green, blue = torch.log(radiance + _FAINT)
         luma = 255 * srgb_from_linear(radiance.mean(dim=0))
-        ratios = [128 + _RATIO * (red - green), 128 + _RATIO * (blue - green)]
+        ratios = [128 + RATIO * (red - green), 128 + RATIO * (blue - green)]
         opponent = torch.stack([luma, *ratios], dim=-1).clamp(0, 255).round().byte()
         # Logarithms of darker values are noise.
         return colours, opponent, torch.log(small.mean(dim=0) / white + 0.005)
@@ -131,8 +131,8 @@ def plane_agreement(
         fixation: The raster is centred at the foot of its fixation point.
         hidden: Pixels that are known not to show the plane.
     """
-    near = _plane_raster(pictures.cameras, plane, fixation, _REACH, _STEP)
-    far = _plane_raster(pictures.cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
+    near = plane_raster(pictures.cameras, plane, fixation, _REACH, _STEP)
+    far = plane_raster(pictures.cameras, plane, fixation, _FAR_REACH, _FAR_STEP)
     return texture_agreement(pictures, near, far, hidden)
 
 
@@ -253,7 +253,7 @@ def _common(values: Maps, hidden: Masks, raster: Raster) -> tuple[Maps, Maps]:
         if not sees[view]:
             return values.new_full((2, *size_px[::-1]), torch.nan)
         to = torch.linalg.inv(maps[view])
-        return torch.stack([_in_front(warped(x, to, size_px), to) for x in (common, spread)])
+        return torch.stack([in_front(warped(x, to, size_px), to) for x in (common, spread)])
 
     common, spread = of_views(back, len(values)).unbind(dim=1)
     return common, spread
@@ -267,7 +267,7 @@ def _centre(values: Float[Tensor, "view row column"]) -> Float[Tensor, "2 row co
     return torch.stack([common, spread]).masked_fill(too_few, torch.nan)
 
 
-def _in_front(layer: Map, raster_from_pixels: Matrix3) -> Map:
+def in_front(layer: Map, raster_from_pixels: Matrix3) -> Map:
     """Set pixels to NaN that the homography maps to points behind the camera."""
     height, width = layer.shape
     pixels = pixel_centers(width, height, like=layer)
@@ -275,7 +275,7 @@ def _in_front(layer: Map, raster_from_pixels: Matrix3) -> Map:
     return torch.where(scale > 0, layer, torch.nan)
 
 
-def _plane_raster(
+def plane_raster(
     cameras: Cameras, plane: Plane, fixation: Fixation, reach: float, step_px: float
 ) -> Raster:
     """Return a raster on the plane, centred at the foot of the fixation point."""

@@ -1,0 +1,289 @@
+"""Train the network that reads cues about the object's silhouette.
+
+Run as ``python benchmarks/studies/train_silhouettes.py OUT --meshes FILE ...``. Random captures are
+rendered with their truth to ``OUT/captures``, and their maps of cues are stored. The network is
+trained on them for half of ``--minutes``. Then it reads all captures once, and the hulls of its
+silhouettes are further maps in the second half. ``OUT/silhouettes.safetensors`` has the weights,
+and ``OUT/silhouettes.json`` their record. An interrupted run continues where it was.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
+
+from pimper_bench.evidence.evidence_maps import MAPS, evidence_maps
+from pimper_bench.evidence.silhouette_network import SilhouetteNetwork, read
+from pimper_bench.evidence.soft_masks import second_reading
+from pimper_bench.scenes.random_captures import render_random
+from pimper_torch.records import SparseScene
+from pimper_torch.records.stored import load_record, save_record
+from pimper_torch.stages.silhouettes.cues import cues_of
+from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
+
+LEVELS = 42.0  # stored levels for a unit of a map, between -3 and 3
+TESTS = 100_000  # seed of the first capture to test on
+GROUPS = sorted(set(MAPS.values()))
+PLANE = ("light", "texture", "plane")
+
+
+def main() -> None:
+    """Render captures, train, and write weights and record."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--meshes", type=Path, nargs="*", default=[], help="bodies to train on")
+    parser.add_argument("--held-out", type=Path, nargs="*", default=[], help="bodies to test on")
+    parser.add_argument("--captures", type=int, default=160, help="to train on")
+    parser.add_argument("--tests", type=int, default=16, help="captures to test on")
+    parser.add_argument("--views", type=int, default=14, help="of each capture")
+    parser.add_argument("--size", type=int, nargs=2, default=(480, 360), help="of its photographs")
+    parser.add_argument("--minutes", type=float, default=90, help="of a processor")
+    parser.add_argument("--only", choices=("render", "read", "train"), help="do a part")
+    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("REST", "OF"))
+    options = parser.parse_args()
+    folder = options.out / "captures"
+    folder.mkdir(parents=True, exist_ok=True)
+    seeds, tests = range(options.captures), range(TESTS, TESTS + options.tests)
+    rest, of = options.part
+    mine = [seed for seed in (*tests, *seeds) if seed % of == rest]
+    only, run = options.only, Run(options.out, options.minutes)
+    for seed in mine if only in (None, "render") else ():
+        meshes = options.meshes if seed < TESTS else options.held_out
+        store(folder, seed, meshes, options.views, *options.size)
+    if only in (None, "train"):
+        run.train(lambda: existing(folder, seeds, "first"), until=0.5)
+    for seed in mine if only in (None, "read") else ():
+        store_second(folder, seed, run.network)
+    if only in (None, "train"):
+        both = ("first", "second")
+        run.train(lambda: [one for kind in both for one in existing(folder, seeds, kind)], until=1)
+        run.finish({kind: existing(folder, tests, kind) for kind in both})
+
+
+def store(
+    folder: Path, seed: int, meshes: Sequence[Path], num_views: int, width: int, height: int
+) -> None:
+    """Render a capture, and store its scene and its maps of a first reading."""
+    if (folder / f"{seed}.first.npy").exists():
+        return
+    capture = render_random(seed, meshes, num_views=num_views, width=width, height=height)
+    save_record(capture.scene, folder / f"{seed}.scene.safetensors")
+    write(folder / f"{seed}.first.npy", maps_of(capture.scene), capture.foreground)
+    say(f"capture {seed}")
+
+
+def maps_of(scene: SparseScene, network: SilhouetteNetwork | None = None) -> Iterator[Tensor]:
+    """Return the maps of every view; of a second reading if there is a network."""
+    evidence = evidence_maps(cues_of(scene, SilhouetteConfig()))
+    if network is not None:
+        again = second_reading(evidence, read(evidence, network))
+        if again is None:
+            return iter(())
+        evidence = again
+    return map(evidence.of, range(evidence.cues.num_views))
+
+
+def write(path: Path, maps: Iterator[Tensor], foreground: Tensor) -> None:
+    """Store maps and the truth in levels from 0 to 255, whole or not at all."""
+    part = path.with_suffix(".part")
+    shape = (len(foreground), len(MAPS) + 1, *foreground.shape[1:])
+    stored = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
+    view = -1
+    for view, (values, truth) in enumerate(zip(maps, foreground, strict=False)):
+        stored[view, :-1] = (values * LEVELS + 127.5).round().clamp(0, 255).byte().numpy()
+        stored[view, -1] = truth.numpy()
+    del stored
+    if view >= 0:
+        part.rename(path)
+    else:
+        part.unlink()
+
+
+def store_second(folder: Path, seed: int, network: SilhouetteNetwork) -> None:
+    """Store the maps of a second reading of a capture."""
+    path = folder / f"{seed}.second.npy"
+    if not path.exists() and (folder / f"{seed}.first.npy").exists():
+        truth = torch.from_numpy(np.array(np.load(folder / f"{seed}.first.npy", "r")[:, -1]))
+        scene = load_record(SparseScene, folder / f"{seed}.scene.safetensors")
+        write(path, maps_of(scene, network.eval()), truth > 0)
+        say(f"second reading of {seed}")
+
+
+def existing(folder: Path, seeds: Sequence[int], kind: str) -> list[np.ndarray]:
+    """Open the stored maps of captures."""
+    paths = (folder / f"{seed}.{kind}.npy" for seed in seeds)
+    return [np.load(path, mmap_mode="r") for path in paths if path.exists()]
+
+
+@dataclass
+class Batches:
+    """Random views of captures, varied."""
+
+    captures: list[np.ndarray]
+    generator: torch.Generator
+
+    def draw(self, small: bool) -> tuple[Tensor, Tensor]:
+        """Return maps and truth: of whole views at half their size, or of crops."""
+        samples = [self._view(small) for _ in range(6 if small else 4)]
+        maps, truth = (torch.stack(parts) for parts in zip(*samples, strict=True))
+        return maps, truth
+
+    def _number(self, below: int) -> int:
+        return int(torch.randint(below, (1,), generator=self.generator))
+
+    def _chance(self, probability: float) -> bool:
+        return float(torch.rand(1, generator=self.generator)) < probability
+
+    def _view(self, small: bool) -> tuple[Tensor, Tensor]:
+        capture = self.captures[self._number(len(self.captures))]
+        stored = capture[self._number(len(capture))]
+        if not small:  # two thirds of both sides
+            high, wide = (2 * side // 3 for side in stored.shape[1:])
+            top, left = self._number(high // 2 + 1), self._number(wide // 2 + 1)
+            stored = stored[:, top : top + high, left : left + wide]
+        values = torch.from_numpy(np.array(stored)).float()
+        if small:
+            values = interpolate(values[None], scale_factor=0.5, mode="area")[0]
+        if self._chance(0.5):
+            values = values.flip(-1)
+        maps, truth = (values[:-1] - 127.5) / LEVELS, values[-1]
+        maps[0] += 0.3 * torch.randn(1, generator=self.generator)
+        dropped = {group for group in GROUPS if self._chance(0.08)}
+        if self._chance(0.12):
+            dropped.update(PLANE)
+        for index, group in enumerate(MAPS.values()):
+            if group in dropped:
+                maps[index] = 0
+        return maps, truth
+
+
+class Run:
+    """Training that continues where it was interrupted."""
+
+    def __init__(self, out: Path, minutes: float) -> None:
+        self.out, self.minutes = out, minutes
+        torch.manual_seed(0)
+        self.network = SilhouetteNetwork()
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=2e-3, weight_decay=0.01)
+        self.spent, self.steps, self.losses = 0.0, 0, []
+        if (out / "state.pt").exists():
+            state = torch.load(out / "state.pt", weights_only=True)
+            self.network.load_state_dict(state["network"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.spent, self.steps, self.losses = state["spent"], state["steps"], state["losses"]
+
+    @property
+    def done(self) -> float:
+        """Fraction of the time that is spent."""
+        return self.spent / (60 * self.minutes)
+
+    def train(self, captures: Callable[[], list[np.ndarray]], until: float) -> None:
+        """Train until a fraction of the time is spent, on captures that may become more."""
+        batches = Batches(captures(), torch.Generator().manual_seed(self.steps))
+        self.network.train()
+        recent: list[float] = []
+        began = time.process_time()
+        while self.done < until:
+            small = float(torch.rand(1)) < (0.7 if self.done < 0.5 else 0.3)
+            for group in self.optimizer.param_groups:
+                group["lr"] = 2e-3 * max(0.01, 0.5 * (1 + math.cos(math.pi * min(1, self.done))))
+                group["lr"] *= min(1, (self.steps + 1) / 100)
+            loss = loss_of(self.network, *batches.draw(small))
+            self.optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+            self.optimizer.step()
+            self.steps += 1
+            recent.append(float(loss.detach()))
+            now = time.process_time()
+            self.spent, began = self.spent + now - began, now
+            if len(recent) == 100:
+                self.losses.append(sum(recent) / len(recent))
+                say(f"step {self.steps}, {self.done:.0%}, loss {self.losses[-1]:.4f}")
+                recent = []
+                batches.captures = captures()
+                self.keep()
+        self.keep()
+
+    def keep(self) -> None:
+        """Store the state, whole or not at all."""
+        state = {
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "spent": self.spent,
+            "steps": self.steps,
+            "losses": self.losses,
+        }
+        torch.save(state, self.out / "state.part")
+        (self.out / "state.part").rename(self.out / "state.pt")
+
+    def finish(self, tests: dict[str, list[np.ndarray]]) -> None:
+        """Write the weights and their record."""
+        self.network.eval()
+        weights = {name: value.half() for name, value in self.network.state_dict().items()}
+        save_file(weights, self.out / "silhouettes.safetensors")
+        record: dict[str, object] = {"steps": self.steps, "minutes": self.minutes}
+        record["loss of every hundredth step"] = [round(loss, 4) for loss in self.losses]
+        say("| reading | captures | overlap | worst |\n|---|--:|--:|--:|")
+        for kind, captures in tests.items():
+            overlaps, calibration = measured(self.network, captures)
+            record[f"{kind} reading"] = {"overlap": overlaps, "calibration": calibration}
+            if overlaps:
+                mean, worst = sum(overlaps) / len(overlaps), min(overlaps)
+                say(f"| {kind} | {len(overlaps)} | {mean:.3f} | {worst:.3f} |")
+        (self.out / "silhouettes.json").write_text(json.dumps(record, indent=1) + "\n")
+
+
+def loss_of(network: SilhouetteNetwork, maps: Tensor, truth: Tensor) -> Tensor:
+    """Return cross entropy, and half of what the soft overlap lacks."""
+    odds = network(maps)
+    entropy = binary_cross_entropy_with_logits(odds, truth)
+    inside = odds.sigmoid()
+    both = (inside * truth).sum(dim=(1, 2))
+    union = (inside + truth - inside * truth).sum(dim=(1, 2))
+    return entropy + 0.5 * (1 - (both + 1) / (union + 1)).mean()
+
+
+@torch.no_grad()
+def measured(
+    network: SilhouetteNetwork, captures: Sequence[np.ndarray]
+) -> tuple[list[float], list[tuple[float, float, int]]]:
+    """Return each capture's mean overlap; and predicted and true probability in ten bins."""
+    overlaps, counts = [], torch.zeros(10, 3, dtype=torch.float64)
+    for capture in captures:
+        of_views = []
+        for stored in capture:
+            values = torch.from_numpy(np.array(stored)).float()
+            inside = network((values[None, :-1] - 127.5) / LEVELS)[0].sigmoid()
+            truth = values[-1] > 0
+            of_views.append(float((truth & (inside > 0.5)).sum() / (truth | (inside > 0.5)).sum()))
+            index = (10 * inside).long().clamp_max(9).flatten()
+            for column, value in enumerate((inside, truth, torch.ones_like(inside))):
+                counts[:, column].index_add_(0, index, value.flatten().double())
+        overlaps.append(round(sum(of_views) / len(of_views), 4))
+    means = counts[:, :2] / counts[:, 2:].clamp_min(1)
+    rows = [
+        (round(a, 3), round(b, 3), int(n))
+        for (a, b), n in zip(means.tolist(), counts[:, 2].tolist(), strict=True)
+    ]
+    return overlaps, rows
+
+
+def say(line: str) -> None:
+    """Print a line."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
