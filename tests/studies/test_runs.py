@@ -40,6 +40,10 @@ RUNS = {
     "silhouettes": ("{scene}/photos={scene}/masks", "| {scene}/photos | 8 | "),
     "speed": ("{scene} --preset fast " + GIVEN, "| all | "),
     "strangers": ("{out} --num-views 8 --width 320 --sets one", "| one | "),
+    "train_silhouettes": (
+        "{out} --captures 2 --tests 1 --views 6 --size 160 120 --minutes 0.1",
+        "| first | 1 | 0.",
+    ),
     "turntable": ("{scene} --masks none", "| scene | none | 8 of 8 | "),
     "walk": ("--num-views 8 --width 240 --height 180 --renderings {out}", "| 8 | "),
 }
