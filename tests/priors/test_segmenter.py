@@ -100,6 +100,7 @@ def test_maps_are_kept_by_photograph_and_network(views, network, tmp_path, monke
         pt.segment(views, network, cache=cache)
 
 
+@pytest.mark.slow  # the first import of rembg compiles for minutes
 def test_a_name_is_run_by_rembg_and_nothing_is_downloaded_if_it_is_there(views, network, home):
     home.mkdir()
     network.rename(home / "u2net.onnx")
@@ -117,6 +118,7 @@ def test_a_name_is_run_by_rembg_and_nothing_is_downloaded_if_it_is_there(views, 
     assert torch.equal(again.inside, prior.inside)
 
 
+@pytest.mark.slow  # the first import of rembg compiles for minutes
 def test_large_photographs_get_maps_of_1024_pixels(network, home):
     home.mkdir()
     network.rename(home / "u2netp.onnx")
@@ -124,6 +126,7 @@ def test_large_photographs_get_maps_of_1024_pixels(network, home):
     assert pt.segment(large, "u2netp").sizes_px.tolist() == [[1024, 410]]
 
 
+@pytest.mark.slow  # the first import of rembg compiles for minutes
 def test_a_download_is_announced_and_its_failure_reported(views, home):
     missing = r"u2netp is not on this machine: rembg downloads it from .* to .*home.models.u2netp"
     with (
@@ -135,6 +138,7 @@ def test_a_download_is_announced_and_its_failure_reported(views, home):
         pt.segment(views, "u2netp")
 
 
+@pytest.mark.slow  # the first import of rembg compiles for minutes
 @pytest.mark.usefixtures("home")
 @pytest.mark.parametrize("name", ["u3net", "atlascloud", "sam", "u2net_custom"])
 def test_unusable_names_are_refused(name, views):
