@@ -72,7 +72,7 @@ class SilhouetteNetwork(nn.Module):
         return pixel_shuffle(self.last(x), 2)[:, 0, :height, :width]
 
 
-def load_network(path: Path) -> SilhouetteNetwork:
+def load_network(path: Path | str) -> SilhouetteNetwork:
     """Load a trained network for inference."""
     network = SilhouetteNetwork()
     network.load_state_dict({name: value.float() for name, value in load_file(path).items()})

@@ -44,7 +44,7 @@ class Body:
     meshes: tuple[Mesh, ...]
 
 
-def random_body(draws: Draws, meshes: Sequence[Path] = ()) -> Body:
+def random_body(draws: Draws, meshes: Sequence[Path | str] = ()) -> Body:
     """Draw an object: half of them from files, if any are given.
 
     Raises:

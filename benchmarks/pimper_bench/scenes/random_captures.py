@@ -62,7 +62,7 @@ class RandomCapture(Record):
 
 def render_random(
     seed: int,
-    meshes: Sequence[Path] = (),
+    meshes: Sequence[Path | str] = (),
     *,
     num_views: int = 14,
     width: int = 480,
