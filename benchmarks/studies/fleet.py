@@ -212,7 +212,7 @@ def options_of(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--meshes", type=Path, default=MESHES, help="folder of mesh files")
     parser.add_argument("--outlines", action="store_true", help="stop at silhouettes")
     parser.add_argument("--preset", default="default")
-    parser.add_argument("--evidence", type=Path, help="weights of train_silhouettes.py")
+    parser.add_argument("--evidence", type=Path, help="weights, for --outlines only")
     parser.add_argument("--all", action="store_true", help="every shape, path and material")
     parser.add_argument("--subset", action="store_true", help="six captures")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="names or patterns")

@@ -13,16 +13,15 @@ from pimper_torch.geometry.opencv import (
     grab_cut,
     without_specks,
 )
-from pimper_torch.geometry.visual_hull import margins, visual_hull
-from pimper_torch.records import SilhouettePrior, Silhouettes, SparseScene
-from pimper_torch.records.shapes import Map, Maps, Mask, Masks
+from pimper_torch.records import SilhouettePrior, SparseScene
+from pimper_torch.records.shapes import Map, Maps, Mask
 from pimper_torch.stages.silhouettes.cues import Cues, cues_of
+from pimper_torch.stages.silhouettes.cuts import hull_margins
 from pimper_torch.stages.silhouettes.parallax import of_views
 from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
 
 _SURE = 4.0  # log odds from which colours do not decide
 _DISC = 1 / 400  # of the longer side: around a matched point of the object
-_DISAGREEING = 0.05  # fraction of the views that may exclude a voxel of the hull
 _CERTAIN = 0.95  # probability of the object inside a cut
 
 
@@ -58,29 +57,8 @@ def second_reading(evidence: EvidenceMaps, odds: Maps) -> EvidenceMaps | None:
     """
     cues = evidence.cues
     masks = of_views(lambda view: cut_of_view(cues, view, odds[view]), len(odds))
-    margins_px = hull_margins(cues, masks)
+    margins_px = hull_margins(cues, masks.float())
     return None if margins_px is None else evidence_maps(cues, masks, margins_px)
-
-
-def hull_margins(cues: Cues, masks: Masks) -> Maps | None:
-    """Return distances inside the projection of the masks' hull; ``None`` if it is empty."""
-    everywhere = torch.ones(len(masks), dtype=torch.bool)
-    silhouettes = Silhouettes(inside=masks.float(), reliable=everywhere, source="found")
-    cameras = cues.pictures.cameras
-    hull = visual_hull(
-        silhouettes, cameras, cues.box_world, num_voxels=500_000, disagreeing=_DISAGREEING
-    )
-    if hull is None:
-        return None
-    if cues.plane is not None:
-        hull = hull.above(cues.plane.normal_world, cues.plane.offset)
-    height, width = masks.shape[1:]
-
-    def margin(view: int) -> Map:
-        pose = cameras.cam_from_world[view]
-        return margins(hull, cameras.intrinsics[view], pose, (width, height))
-
-    return of_views(margin, len(masks))
 
 
 def cut_of_view(cues: Cues, view: int, odds: Map) -> Mask:

@@ -12,7 +12,7 @@ from torch.nn.functional import conv2d, pad
 
 from pimper_bench.scenes.random_draws import Draws
 from pimper_bench.scenes.random_rooms import Room
-from pimper_bench.scenes.ray_tracing import TracedObjects
+from pimper_bench.scenes.ray_tracing import TracedObjects, steepness
 from pimper_bench.scenes.scene_lights import PointLight
 from pimper_bench.scenes.scene_settings import SensorConfig, expose
 from pimper_torch.geometry.pixels import pixel_centers
@@ -123,16 +123,9 @@ def _received(
 
 def _uneven(radiance: Float[Tensor, "height width 3"]) -> Bool[Tensor, " pixel"]:
     """Return the pixels that differ most from one next to them, row by row."""
-    brightness = radiance.clamp(0, 1).sqrt()
-    most = torch.zeros(radiance.shape[:2])
-    across = (brightness[:, 1:] - brightness[:, :-1]).abs().amax(dim=-1)
-    down = (brightness[1:] - brightness[:-1]).abs().amax(dim=-1)
-    most[:, 1:] = across
-    most[:, :-1] = torch.maximum(most[:, :-1], across)
-    most[1:] = torch.maximum(most[1:], down)
-    most[:-1] = torch.maximum(most[:-1], down)
+    most = steepness(radiance)
     rank = max(1, round((1 - _FINE) * most.numel()))
-    return most.reshape(-1) > max(_UNEVEN, float(most.reshape(-1).kthvalue(rank).values))
+    return most > max(_UNEVEN, float(most.kthvalue(rank).values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

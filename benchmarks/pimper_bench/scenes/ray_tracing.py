@@ -197,7 +197,9 @@ def render_frame(
     spots, shaded, radiances = zip(*traced, strict=True)
     radiance = torch.cat(radiances)
     if sensor.supersample > 1:
-        (uneven,) = torch.nonzero(_uneven(radiance.reshape(height, width, -1)), as_tuple=True)
+        (uneven,) = torch.nonzero(
+            steepness(radiance.reshape(height, width, -1)) > _UNEVEN, as_tuple=True
+        )
         steps = (torch.arange(sensor.supersample).to(centers) + 0.5) / sensor.supersample - 0.5
         offsets = torch.cartesian_prod(steps, steps)
         fine = [
@@ -225,14 +227,14 @@ def render_frame(
     )
 
 
-def _uneven(radiance: Float[Tensor, "height width channel"]) -> Bool[Tensor, " pixel"]:
-    """Return the pixels that differ from one next to them, row by row."""
+def steepness(radiance: Float[Tensor, "height width channel"]) -> Float[Tensor, " pixel"]:
+    """Return how far the root of radiance is from that of a pixel next to it, row by row."""
     brightness = radiance.clamp(0, 1).sqrt()
-    marked = torch.zeros(radiance.shape[:2], dtype=torch.bool)
-    across = (brightness[:, 1:] - brightness[:, :-1]).abs().amax(dim=-1) > _UNEVEN
-    down = (brightness[1:] - brightness[:-1]).abs().amax(dim=-1) > _UNEVEN
-    marked[:, 1:] |= across
-    marked[:, :-1] |= across
-    marked[1:] |= down
-    marked[:-1] |= down
-    return marked.reshape(-1)
+    most = torch.zeros(radiance.shape[:2])
+    across = (brightness[:, 1:] - brightness[:, :-1]).abs().amax(dim=-1)
+    down = (brightness[1:] - brightness[:-1]).abs().amax(dim=-1)
+    most[:, 1:] = across
+    most[:, :-1] = torch.maximum(most[:, :-1], across)
+    most[1:] = torch.maximum(most[1:], down)
+    most[:-1] = torch.maximum(most[:-1], down)
+    return most.reshape(-1)

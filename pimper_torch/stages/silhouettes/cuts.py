@@ -110,8 +110,8 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
     cues, voting = cues.without(rejected)
     for _ in range(_ITERATIONS):
         cues, masks, hidden = _compare(cues, masks)
-        abstain = by_view(torch.bitwise_or, unknown, hidden)
-        margins_px = _vote(cues, by_view(Tensor.float, masks).masked_fill_(abstain, 0.5), voting)
+        inside = by_view(lambda x, a, b: x.float().masked_fill_(a | b, 0.5), masks, unknown, hidden)
+        margins_px = hull_margins(cues, inside, voting)
         if margins_px is None:
             return None
         cues, voting = cues.inside_hull(margins_px), None
@@ -122,7 +122,7 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
         inside = by_view(
             lambda mask, plane: torch.where(mask, 1, miss_probability(plane)), masks, cues.agreement
         )
-    margins_px = _vote(cues, inside.masked_fill_(hidden, 0.5))
+    margins_px = hull_margins(cues, inside.masked_fill_(hidden, 0.5))
     if margins_px is None:
         return None
     masks = repaired(masks, margins_px, None if cues.plane is None else cues.pictures.grey)
@@ -257,7 +257,7 @@ def _rejected(cues: Cues, masks: Masks) -> ViewMask:
         return torch.zeros(len(masks), dtype=torch.bool)
     given = cues.soft.given
     for disagreeing in (_DISAGREEING, *_MORE_DISAGREEING):
-        margins_px = _vote(cues, masks.float(), given, disagreeing)
+        margins_px = hull_margins(cues, masks.float(), given, disagreeing)
         if margins_px is not None:
             common = margins_px > 0
             common_area, area = (part.sum(dim=(1, 2)).clamp_min(1) for part in (common, masks))
@@ -272,7 +272,7 @@ def miss_probability(agreement: Map) -> Map:
     return torch.where(agreement < _OFF_PLANE, MISS_OFF_PLANE, probability)
 
 
-def _vote(
+def hull_margins(
     cues: Cues, inside: Maps, voting: ViewMask | None = None, disagreeing: float = _DISAGREEING
 ) -> Maps | None:
     """Build the hull of seeded components above the plane; return its margins in every view.
