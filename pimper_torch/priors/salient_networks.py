@@ -50,20 +50,14 @@ def network_identity(network: str) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def announce_download(network: str) -> None:
-    """Warn if rembg will download the file of a network when it first uses it."""
-    if network_file(network) is None:
-        session = _session_class(network)
-        if session.resolve_existing(f"{session.name()}.onnx") is None:
-            caution(
-                f"The network {session.name()} is not on this machine: rembg downloads it from "
-                f"github.com/danielgatis/rembg to {session.model_dir()} when it is first used."
-            )
-
-
 def rembg_session(network: str) -> Any:  # noqa: ANN401 - a class of rembg
-    """Open a network of rembg, which downloads its file if it is missing."""
+    """Open a network of rembg, which downloads its file, after a warning, if it is missing."""
     session = _session_class(network)
+    if session.resolve_existing(f"{session.name()}.onnx") is None:
+        caution(
+            f"The network {session.name()} is not on this machine: rembg downloads it from "
+            f"github.com/danielgatis/rembg to {session.model_dir()}."
+        )
     import rembg
 
     try:

@@ -16,7 +16,6 @@ from pimper_torch.priors.from_maps import padded, silhouettes_from
 from pimper_torch.priors.network import Picture, onnx_session
 from pimper_torch.priors.salient_networks import (
     DEFAULT,
-    announce_download,
     network_file,
     network_identity,
     rembg_session,
@@ -63,7 +62,6 @@ def segment(
     """
     network, store = str(network), opened(cache)
     require_network(network)
-    announce_download(network)
     identity, path = network_identity(network), network_file(network)
     predict = _by_rembg(network) if path is None else _by_file(path)
 
