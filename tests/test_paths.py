@@ -16,7 +16,7 @@ SUBPACKAGES = (
     *("chains", "presets", "runtime.config", "io", "export.results", "export.reports"),
     *("records", "viz"),
 )
-EXPORTING = ("baselines", "datasets", "evidence", "metrics", "scenes")
+EXPORTING = ("baselines", "datasets", "metrics", "scenes")
 
 
 def functions() -> Iterator[typing.Any]:

@@ -29,11 +29,8 @@ from typing import Any
 import torch
 from fleet_captures import MESHES, SUBSET, fleet, rendered
 from silhouettes import known_masks, overlaps
-from silhouettes import soft_masks as given_masks
 
 from pimper_bench.datasets import read_rendered
-from pimper_bench.evidence.silhouette_network import load_network
-from pimper_bench.evidence.soft_masks import soft_masks
 from pimper_bench.metrics.in_view import compare_along_rays
 from pimper_bench.metrics.similarity import align_estimate, transfer
 from pimper_bench.metrics.surface_distances import TrueSurface
@@ -45,6 +42,8 @@ from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.errors import InputError, PimperWarning, ReconstructionError
 from pimper_torch.stages.sfm.reconstruct import placed_scene, structure_from_motion
+from pimper_torch.stages.silhouettes.find import FindSilhouettes
+from pimper_torch.stages.silhouettes.network import SilhouetteNetwork, load_network
 from pimper_torch.store import Store, kept
 
 Row = dict[str, Any]
@@ -53,17 +52,18 @@ MOST_DEG, LEAST_MET = 6.0, 96.0  # of a good result: normals, per cent of pixels
 # Parts of warnings that call the result bad; others are notes.
 ANNOUNCING = (
     *("is treated as the object", "have no point in common", "of the silhouette's area"),
+    "The silhouettes are uncertain",
     *("cameras are unreliable", "may be misplaced", "Give masks of the object"),
     *("Features hardly match", "No points", "keep the normals of the coarse mesh"),
 )
 MOST_LOST = 0.2  # of the photographs may be excluded or fail without announcement
 COLUMNS = (
-    *("evidence", "IoU", "worst", "lost %", "extra %", "reliable", "CPU s"),
+    *("IoU", "worst", "expected", "lost %", "extra %", "reliable", "CPU s"),
     *("normals °", "met %", "accuracy %", "completeness %", "good", "announced", "error"),
 )
 
 
-def outlines(place: Path, preset: str, weights: Path | None) -> Row:
+def outlines(place: Path, preset: str, network: SilhouetteNetwork | None) -> Row:
     """Find the silhouettes of a capture, and compare them with the true masks."""
     views, method = load_views(place / "photos"), load_chain(preset)
     with warnings.catch_warnings(record=True) as cautions:
@@ -73,10 +73,7 @@ def outlines(place: Path, preset: str, weights: Path | None) -> Row:
         model, _ = kept(store, key, SparseModel, lambda: structure_from_motion(views, config))
         scene, _ = locate(method, method.running(), placed_scene(views, model))
         began = time.process_time()
-        if weights is not None:
-            priors = (soft_masks(scene, load_network(weights)),)
-            scene = scene.replace(views=scene.views.replace(priors=priors))
-        found = method.silhouettes(scene)
+        found = FindSilhouettes(method.silhouettes.config, network)(scene)
         seconds = time.process_time() - began
     told = {
         "views": views.num_views,
@@ -86,8 +83,8 @@ def outlines(place: Path, preset: str, weights: Path | None) -> Row:
     }
     known = known_masks(str(place / "masks"), scene)
     figures = compared(found.masks, torch.stack(known))
-    if weights is not None:
-        figures["evidence"] = float(overlaps(given_masks(scene), known).mean())
+    if found.expected_overlap is not None:
+        figures["expected"] = float(found.expected_overlap.mean())
     reliable = f"{int(found.reliable.sum())} of {views.num_views}"
     return told | figures | {"reliable": reliable, "announced": announced(told), "CPU s": seconds}
 
@@ -151,12 +148,16 @@ def measured(place: Path, result: Path) -> Row:
 
 
 def judged(
-    row: Row, place: Path, result: Path | None, preset: str, weights: Path | None = None
+    row: Row,
+    place: Path,
+    result: Path | None,
+    preset: str,
+    network: SilhouetteNetwork | None = None,
 ) -> Row:
     """Add to a row what it lacks: silhouettes, and the surface if a folder is given for it."""
     try:
         if "IoU" not in row:
-            row |= outlines(place, preset, weights)
+            row |= outlines(place, preset, network)
         if result is not None:
             row |= reconstructed(place, result, preset)
             row |= measured(place, result)
@@ -212,7 +213,7 @@ def options_of(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--meshes", type=Path, default=MESHES, help="folder of mesh files")
     parser.add_argument("--outlines", action="store_true", help="stop at silhouettes")
     parser.add_argument("--preset", default="default")
-    parser.add_argument("--evidence", type=Path, help="weights, for --outlines only")
+    parser.add_argument("--weights", type=Path, help="of silhouettes, for --outlines only")
     parser.add_argument("--all", action="store_true", help="every shape, path and material")
     parser.add_argument("--subset", action="store_true", help="six captures")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="names or patterns")
@@ -236,6 +237,7 @@ def main(arguments: list[str] | None = None) -> None:
     git = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty")
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()
     tag, out = options.tag or commit or "now", options.out
+    network = options.weights and load_network(options.weights)
     for name in () if options.table else names:
         path = out / "rows" / tag / f"{name}.json"
         row = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -243,7 +245,7 @@ def main(arguments: list[str] | None = None) -> None:
             continue
         place = rendered(name, options.tiny, options.meshes, out)
         result = None if options.outlines else out / "results" / name
-        row = judged(row, place, result, options.preset, options.evidence)
+        row = judged(row, place, result, options.preset, network)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.with_suffix(".part").write_text(json.dumps(row, indent=1), encoding="utf-8")
         path.with_suffix(".part").rename(path)

@@ -1,10 +1,9 @@
 """Train the network that reads cues about the object's silhouette.
 
 Run as ``python benchmarks/studies/train_silhouettes.py OUT --meshes FILE ...``. Random captures are
-rendered with their truth to ``OUT/captures``, and their maps of cues are stored. The network is
-trained on them for half of ``--minutes``. Then it reads all captures once, and the hulls of its
-silhouettes are further maps in the second half. ``OUT/silhouettes.safetensors`` has the weights,
-and ``OUT/silhouettes.json`` their record. An interrupted run continues where it was.
+rendered with their truth, cut as without the network, and their maps are stored in
+``OUT/captures``. ``OUT/silhouettes.safetensors`` has the weights, and ``OUT/silhouettes.json``
+their record. An interrupted run continues where it was.
 """
 
 import argparse
@@ -22,13 +21,12 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
 
-from pimper_bench.evidence.evidence_maps import MAPS, evidence_maps
-from pimper_bench.evidence.silhouette_network import SilhouetteNetwork, read
-from pimper_bench.evidence.soft_masks import second_reading
 from pimper_bench.scenes.random_captures import render_random
 from pimper_torch.records import SparseScene
-from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.stages.silhouettes.cues import cues_of
+from pimper_torch.stages.silhouettes.cuts import cut_in_iterations
+from pimper_torch.stages.silhouettes.evidence import MAPS, Evidence
+from pimper_torch.stages.silhouettes.network import SilhouetteNetwork
 from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
 
 LEVELS = 42.0  # stored levels for a unit of a map, between -3 and 3
@@ -48,7 +46,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=14, help="of each capture")
     parser.add_argument("--size", type=int, nargs=2, default=(480, 360), help="of its photographs")
     parser.add_argument("--minutes", type=float, default=90, help="of a processor")
-    parser.add_argument("--only", choices=("render", "read", "train"), help="do a part")
+    parser.add_argument("--only", choices=("render", "train"), help="do a part")
     parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("REST", "OF"))
     options = parser.parse_args()
     folder = options.out / "captures"
@@ -56,41 +54,31 @@ def main() -> None:
     seeds, tests = range(options.captures), range(TESTS, TESTS + options.tests)
     rest, of = options.part
     mine = [seed for seed in (*tests, *seeds) if seed % of == rest]
-    only, run = options.only, Run(options.out, options.minutes)
-    for seed in mine if only in (None, "render") else ():
+    for seed in mine if options.only != "train" else ():
         meshes = options.meshes if seed < TESTS else options.held_out
         store(folder, seed, meshes, options.views, *options.size)
-    if only in (None, "train"):
-        run.train(lambda: existing(folder, seeds, "first"), until=0.5)
-    for seed in mine if only in (None, "read") else ():
-        store_second(folder, seed, run.network)
-    if only in (None, "train"):
-        both = ("first", "second")
-        run.train(lambda: [one for kind in both for one in existing(folder, seeds, kind)], until=1)
-        run.finish({kind: existing(folder, tests, kind) for kind in both})
+    if options.only != "render":
+        run = Run(options.out, options.minutes)
+        run.train(lambda: existing(folder, seeds))
+        run.finish(existing(folder, tests))
 
 
 def store(
     folder: Path, seed: int, meshes: Sequence[Path], num_views: int, width: int, height: int
 ) -> None:
-    """Render a capture, and store its scene and its maps of a first reading."""
-    if (folder / f"{seed}.first.npy").exists():
-        return
-    capture = render_random(seed, meshes, num_views=num_views, width=width, height=height)
-    save_record(capture.scene, folder / f"{seed}.scene.safetensors")
-    write(folder / f"{seed}.first.npy", maps_of(capture.scene), capture.foreground)
-    say(f"capture {seed}")
+    """Render a capture, and store its maps."""
+    if not (folder / f"{seed}.npy").exists():
+        capture = render_random(seed, meshes, num_views=num_views, width=width, height=height)
+        write(folder / f"{seed}.npy", maps_of(capture.scene), capture.foreground)
+        say(f"capture {seed}")
 
 
-def maps_of(scene: SparseScene, network: SilhouetteNetwork | None = None) -> Iterator[Tensor]:
-    """Return the maps of every view; of a second reading if there is a network."""
-    evidence = evidence_maps(cues_of(scene, SilhouetteConfig()))
-    if network is not None:
-        again = second_reading(evidence, read(evidence, network))
-        if again is None:
-            return iter(())
-        evidence = again
-    return map(evidence.of, range(evidence.cues.num_views))
+@torch.no_grad()
+def maps_of(scene: SparseScene) -> Iterator[Tensor]:
+    """Return the maps of every view, with the cuts of all views if these have a common hull."""
+    cues = cues_of(scene, SilhouetteConfig())
+    evidence = Evidence.of(cues, cut_in_iterations(cues))
+    return map(evidence.maps, range(cues.num_views))
 
 
 def write(path: Path, maps: Iterator[Tensor], foreground: Tensor) -> None:
@@ -98,30 +86,16 @@ def write(path: Path, maps: Iterator[Tensor], foreground: Tensor) -> None:
     part = path.with_suffix(".part")
     shape = (len(foreground), len(MAPS) + 1, *foreground.shape[1:])
     stored = np.lib.format.open_memmap(part, mode="w+", dtype=np.uint8, shape=shape)
-    view = -1
-    for view, (values, truth) in enumerate(zip(maps, foreground, strict=False)):
+    for view, (values, truth) in enumerate(zip(maps, foreground, strict=True)):
         stored[view, :-1] = (values * LEVELS + 127.5).round().clamp(0, 255).byte().numpy()
         stored[view, -1] = truth.numpy()
     del stored
-    if view >= 0:
-        part.rename(path)
-    else:
-        part.unlink()
+    part.rename(path)
 
 
-def store_second(folder: Path, seed: int, network: SilhouetteNetwork) -> None:
-    """Store the maps of a second reading of a capture."""
-    path = folder / f"{seed}.second.npy"
-    if not path.exists() and (folder / f"{seed}.first.npy").exists():
-        truth = torch.from_numpy(np.array(np.load(folder / f"{seed}.first.npy", "r")[:, -1]))
-        scene = load_record(SparseScene, folder / f"{seed}.scene.safetensors")
-        write(path, maps_of(scene, network.eval()), truth > 0)
-        say(f"second reading of {seed}")
-
-
-def existing(folder: Path, seeds: Sequence[int], kind: str) -> list[np.ndarray]:
+def existing(folder: Path, seeds: Sequence[int]) -> list[np.ndarray]:
     """Open the stored maps of captures."""
-    paths = (folder / f"{seed}.{kind}.npy" for seed in seeds)
+    paths = (folder / f"{seed}.npy" for seed in seeds)
     return [np.load(path, mmap_mode="r") for path in paths if path.exists()]
 
 
@@ -158,7 +132,7 @@ class Batches:
             values = values.flip(-1)
         maps, truth = (values[:-1] - 127.5) / LEVELS, values[-1]
         maps[0] += 0.3 * torch.randn(1, generator=self.generator)
-        dropped = {group for group in GROUPS if self._chance(0.08)}
+        dropped = {group for group in GROUPS if self._chance(0.1)}
         if self._chance(0.12):
             dropped.update(PLANE)
         for index, group in enumerate(MAPS.values()):
@@ -187,13 +161,13 @@ class Run:
         """Fraction of the time that is spent."""
         return self.spent / (60 * self.minutes)
 
-    def train(self, captures: Callable[[], list[np.ndarray]], until: float) -> None:
-        """Train until a fraction of the time is spent, on captures that may become more."""
+    def train(self, captures: Callable[[], list[np.ndarray]]) -> None:
+        """Train until the time is spent, on captures that may become more."""
         batches = Batches(captures(), torch.Generator().manual_seed(self.steps))
         self.network.train()
         recent: list[float] = []
         began = time.process_time()
-        while self.done < until:
+        while self.done < 1:
             small = float(torch.rand(1)) < (0.7 if self.done < 0.5 else 0.3)
             for group in self.optimizer.param_groups:
                 group["lr"] = 2e-3 * max(0.01, 0.5 * (1 + math.cos(math.pi * min(1, self.done))))
@@ -227,20 +201,17 @@ class Run:
         torch.save(state, self.out / "state.part")
         (self.out / "state.part").rename(self.out / "state.pt")
 
-    def finish(self, tests: dict[str, list[np.ndarray]]) -> None:
+    def finish(self, tests: Sequence[np.ndarray]) -> None:
         """Write the weights and their record."""
         self.network.eval()
         weights = {name: value.half() for name, value in self.network.state_dict().items()}
         save_file(weights, self.out / "silhouettes.safetensors")
         record: dict[str, object] = {"steps": self.steps, "minutes": self.minutes}
         record["loss of every hundredth step"] = [round(loss, 4) for loss in self.losses]
-        say("| reading | captures | overlap | worst |\n|---|--:|--:|--:|")
-        for kind, captures in tests.items():
-            overlaps, calibration = measured(self.network, captures)
-            record[f"{kind} reading"] = {"overlap": overlaps, "calibration": calibration}
-            if overlaps:
-                mean, worst = sum(overlaps) / len(overlaps), min(overlaps)
-                say(f"| {kind} | {len(overlaps)} | {mean:.3f} | {worst:.3f} |")
+        rows, calibration = measured(self.network, tests)
+        record |= {"overlap of cut and network": rows, "calibration": calibration}
+        say("| cut | network |\n|--:|--:|")
+        say("\n".join(f"| {cut:.3f} | {read:.3f} |" for cut, read in rows))
         (self.out / "silhouettes.json").write_text(json.dumps(record, indent=1) + "\n")
 
 
@@ -257,26 +228,32 @@ def loss_of(network: SilhouetteNetwork, maps: Tensor, truth: Tensor) -> Tensor:
 @torch.no_grad()
 def measured(
     network: SilhouetteNetwork, captures: Sequence[np.ndarray]
-) -> tuple[list[float], list[tuple[float, float, int]]]:
-    """Return each capture's mean overlap; and predicted and true probability in ten bins."""
-    overlaps, counts = [], torch.zeros(10, 3, dtype=torch.float64)
+) -> tuple[list[tuple[float, float]], list[tuple[float, float, int]]]:
+    """Return mean overlaps of captures, and predicted and true probabilities in ten bins.
+
+    Overlaps are those of the cuts, and of the network's reading.
+    """
+    rows, counts = [], torch.zeros(10, 3, dtype=torch.float64)
     for capture in captures:
         of_views = []
         for stored in capture:
             values = torch.from_numpy(np.array(stored)).float()
-            inside = network((values[None, :-1] - 127.5) / LEVELS)[0].sigmoid()
-            truth = values[-1] > 0
-            of_views.append(float((truth & (inside > 0.5)).sum() / (truth | (inside > 0.5)).sum()))
+            maps, truth = (values[None, :-1] - 127.5) / LEVELS, values[-1] > 0
+            inside = network(maps)[0].sigmoid()
+            masks = torch.stack([maps[0, -1] > 0, inside > 0.5])
+            shared, either = (masks & truth).sum(dim=(1, 2)), (masks | truth).sum(dim=(1, 2))
+            of_views.append(shared / either)
             index = (10 * inside).long().clamp_max(9).flatten()
             for column, value in enumerate((inside, truth, torch.ones_like(inside))):
                 counts[:, column].index_add_(0, index, value.flatten().double())
-        overlaps.append(round(sum(of_views) / len(of_views), 4))
+        cut, read = torch.stack(of_views).mean(dim=0).tolist()
+        rows.append((round(cut, 4), round(read, 4)))
     means = counts[:, :2] / counts[:, 2:].clamp_min(1)
-    rows = [
+    calibration = [
         (round(a, 3), round(b, 3), int(n))
         for (a, b), n in zip(means.tolist(), counts[:, 2].tolist(), strict=True)
     ]
-    return overlaps, rows
+    return rows, calibration
 
 
 def say(line: str) -> None:

@@ -11,11 +11,11 @@ from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.records import Record, SparseScene
 from pimper_torch.records.shapes import Points, Scalar, Scalars, Vectors
 
-# Maximum distance of a point on the plane, as a fraction of the cameras' distance; minimum fraction
-# of points on it, and maximum fraction below. Chosen on the four rendered scenes and the skull
-# (benchmarks/studies/silhouettes.py).
-PLANE_TOLERANCE = 0.004
-_MIN_ON, _MAX_BELOW = 0.08, 0.05
+# Fractions of the cameras' distance: greatest distance of a point on the plane, and side of the
+# cells in which points count together. Minimum fraction on the plane and maximum fraction below, of
+# the points or else of the cells: docs/decisions.md, "The supporting plane".
+PLANE_TOLERANCE, _CELL = 0.004, 0.05
+_OF_POINTS, _OF_CELLS = (0.08, 0.05), (0.4, 0.1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -79,38 +79,47 @@ def supporting_plane(
 ) -> Plane | None:
     """Find the supporting plane of the object by RANSAC.
 
+    Points count by the space in which they are, not by their number: the object usually has more
+    texture than the plane, and may itself have a flat base.
+
     Args:
         distance: Of the cameras from the fixation point, scene units.
 
     Returns:
-        The plane with most points, refitted to them; ``None`` if no plane has enough points on it
-        and few enough below.
+        The plane with most cells of points, refitted to them; ``None`` if no plane has enough of
+        them on it and few enough below.
     """
     count = len(points_world)
     if count < 20:
         return None
-    tolerance, generator = PLANE_TOLERANCE * distance, torch.Generator()
-    # If 15 % of the points are on the plane, no triple of them is drawn with probability 0.001.
-    triples = torch.randint(count, (2000, 3), generator=generator.manual_seed(0))
-    a, b, c = points_world[triples.to(points_world.device)].unbind(dim=1)
+    tolerance, generator = PLANE_TOLERANCE * distance, torch.Generator().manual_seed(0)
+    cells = (points_world / (_CELL * distance)).floor().long()
+    _, cell, counts = torch.unique(cells, dim=0, return_inverse=True, return_counts=True)
+    weight = 1 / (len(counts) * counts[cell].to(points_world))
+    # If 15 % of the cells are on the plane, no triple of them is drawn with probability 0.001.
+    triples = torch.multinomial(weight.cpu(), 6000, replacement=True, generator=generator)
+    a, b, c = points_world[triples.reshape(2000, 3).to(points_world.device)].unbind(dim=1)
     normals = normalize(torch.linalg.cross(b - a, c - a), dim=1)
     offsets = (normals * a).sum(dim=1)
     towards = (eyes_world @ normals.mT - offsets).mean(dim=0).sign()
     normals, offsets = towards[:, None] * normals, towards * offsets
     eyes_above = (eyes_world @ normals.mT > offsets).all(dim=0)
     height = points_world @ normals.mT - offsets
-    on = (height.abs() < tolerance).double().mean(dim=0)
-    below = (height < -tolerance).double().mean(dim=0)
+    shares = torch.stack([torch.full_like(weight, 1 / count), weight])
+    on = shares @ (height.abs() < tolerance).to(weight)
+    below = shares @ (height < -tolerance).to(weight)
+    least, most = weight.new_tensor([_OF_POINTS, _OF_CELLS]).mT[..., None]
     distinct = normals.norm(dim=1) > 0.5  # with a point drawn twice, the normal is rounding noise
-    fits = distinct & eyes_above & (on >= _MIN_ON) & (below < _MAX_BELOW)
+    fits = distinct & eyes_above & ((on >= least) & (below < most)).any(dim=0)
     if not bool(fits.any()):
         return None
-    best = torch.where(fits, on, -1).argmax()
+    best = torch.where(fits, on[1], -1).argmax()
     plane = Plane(normal_world=normals[best], offset=offsets[best])
     for _ in range(3):
-        close = points_world[plane.height_of(points_world).abs() < tolerance]
-        centre = close.mean(dim=0)
-        normal = torch.linalg.svd(close - centre, full_matrices=False).Vh[2]
+        near = plane.height_of(points_world).abs() < tolerance
+        close, share = points_world[near], weight[near, None] / weight[near].sum()
+        centre = (share * close).sum(dim=0)
+        normal = torch.linalg.svd(share.sqrt() * (close - centre), full_matrices=False).Vh[2]
         normal = normal * torch.where(normal @ plane.normal_world < 0, -1.0, 1.0).to(normal)
         plane = Plane(normal_world=normal, offset=normal @ centre)
     return plane

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pimper_torch.records.record import Record
-from pimper_torch.records.shapes import Masks, Points
+from pimper_torch.records.shapes import Masks, PerView, Points
 from pimper_torch.records.views import Views
 from pimper_torch.runtime.mapped import by_view
 
@@ -27,6 +27,8 @@ class Silhouettes(Record):
             above the supporting plane, one plane per capture session if the object was moved
             between sessions. Empty if silhouettes suffice or no plane is known.
         hidden: Pixels of the silhouette in which something occludes the object; ``None`` if none.
+        expected_overlap: With the truth, as intersection over union; ``None`` if it is not known,
+            such as without a supporting plane.
     """
 
     inside: Float[Tensor, "view height width"]
@@ -34,6 +36,7 @@ class Silhouettes(Record):
     source: Literal["masks", "found", "everything"]
     planes_world: Float[Tensor, "plane 4"] = field(default_factory=lambda: torch.zeros(0, 4))
     hidden: Masks | None = None
+    expected_overlap: PerView | None = None
 
     @classmethod
     def everything(
@@ -66,8 +69,9 @@ class Silhouettes(Record):
 
     def figures(self) -> dict[str, int | float]:
         """Return counts and fractions for the report of the stage."""
-        masks = self.masks
-        return {
+        masks, overlap = self.masks, self.expected_overlap
+        figures = {} if overlap is None else {"expected_overlap": float(overlap.mean())}
+        return figures | {
             "reliable_views": int(self.reliable.sum()),
             "object_fraction": int(masks.count_nonzero()) / max(1, masks.numel()),
         }

@@ -28,6 +28,7 @@ GUARDS: dict[str, tuple[What, str]] = {
     "silhouettes.disagreement": ("warning", "silhouettes contradict each other"),
     "silhouettes.by_session": ("warning", "no silhouettes found in a capture session"),
     "silhouettes.shadows": ("pixels", "dark and outside the visual hull"),
+    "silhouettes.read_again": ("pixels", "a network is sure that they are background"),
     "silhouettes.unreliable": ("photographs", "silhouette contradicts the others"),
     "silhouettes.empty": ("photographs", "silhouette is empty"),
     "contours.hull": ("warning", "silhouettes do not intersect"),

@@ -45,6 +45,21 @@ def test_a_plane_with_few_of_the_points_is_not_supporting(generator):
         assert (found is not None) is is_found
 
 
+def test_points_count_by_the_space_in_which_they_are(generator):
+    """A dense plate, its flat base above a table that has a tenth of the points."""
+    base = 0.4 * torch.rand(3000, 3, generator=generator).double() - 0.2
+    base[:, 1] = 0.1
+    rim = torch.nn.functional.normalize(base - torch.tensor([0, 0.1, 0]), dim=1) * 0.5
+    rim[:, 1] = 0.3
+    table = 4 * torch.rand(300, 3, generator=generator).double() - 2
+    table[:, 1] = 0.0
+    table = table[table.norm(dim=1) > 0.6]
+    found = supporting_plane(torch.cat([base, rim, table]), cameras().centers_world, 3.0)
+    assert found is not None
+    assert_close(found.offset, torch.tensor(0.0).double(), atol=1e-6, rtol=0)
+    assert_close(found.normal_world, torch.tensor([0.0, 1, 0]).double(), atol=1e-6, rtol=0)
+
+
 def test_look_at_aims_cameras_at_the_target():
     found = fixation(cameras().cam_from_world)
     assert_close(found.fixation_world, torch.tensor([0.1, 0.4, -0.2]).double(), atol=0.01, rtol=0)

@@ -1,16 +1,17 @@
-"""The maps that the network reads, and the network."""
+"""The maps that the network reads, the network, and cuts by its odds."""
 
 import pytest
 import torch
 from safetensors.torch import save_file
 from scenes import observing
 
-from pimper_bench.evidence.evidence_maps import MAPS, evidence_maps
-from pimper_bench.evidence.silhouette_network import SilhouetteNetwork, load_network, read
-from pimper_bench.evidence.soft_masks import cut_of_view, second_reading, soft_masks
-from pimper_torch.geometry.opencv import signed_distance
 from pimper_torch.stages.silhouettes.cues import cues_of
+from pimper_torch.stages.silhouettes.cuts import cut_in_iterations
+from pimper_torch.stages.silhouettes.evidence import MAPS, Evidence
 from pimper_torch.stages.silhouettes.find import FindSilhouettes
+from pimper_torch.stages.silhouettes.network import SilhouetteNetwork, load_network
+from pimper_torch.stages.silhouettes.read_again import overruled, read_again
+from tests.silhouettes import shapes
 from tests.silhouettes.conftest import SMALL, overlap
 
 GROUPS = list(MAPS.values())
@@ -18,7 +19,7 @@ GROUPS = list(MAPS.values())
 
 @pytest.fixture(scope="module")
 def evidence(staged):
-    return evidence_maps(cues_of(staged.scene, SMALL))
+    return Evidence.of(cues_of(staged.scene, SMALL), None)
 
 
 def of_group(maps, group):
@@ -26,36 +27,38 @@ def of_group(maps, group):
 
 
 def test_maps_are_finite_and_bounded(evidence, staged):
-    maps = evidence.of(3)
+    maps = evidence.maps(3)
     assert maps.shape == (len(MAPS), 180, 240)
     assert maps.isfinite().all()
     assert maps.abs().max() <= 3
-    assert not of_group(maps, "hull").any()
-    assert not of_group(maps, "background").any()
+    assert not of_group(maps, "cuts").any()
     near_object, near_others = of_group(maps, "points")
     assert near_object[staged.truth[3]].mean() > 2 * near_object[~staged.truth[3]].mean()
     assert near_others[~staged.truth[3]].mean() > 2 * near_others[staged.truth[3]].mean()
 
 
 def test_cues_that_are_unknown_are_zero(staged):
-    alone = evidence_maps(cues_of(observing(staged.scene, slice(0)), SMALL))
-    maps = alone.of(0)
-    for group in ("light", "texture", "background", "plane", "points", "hull"):
+    alone = Evidence.of(cues_of(observing(staged.scene, slice(0)), SMALL), None)
+    maps = alone.maps(0)
+    for group in ("light", "texture", "plane", "points", "cuts"):
         assert not of_group(maps, group).any()
     assert of_group(maps, "brightness").any()
     assert of_group(maps, "centre").any()
 
 
-def test_the_hull_is_a_map_of_the_second_reading(evidence, staged):
+def test_cuts_and_their_hull_are_maps(evidence, staged):
     margins = torch.where(staged.truth, 50.0, -2.0)
-    inside, known = of_group(evidence.replace(margins_px=margins).of(1), "hull")
+    cuts = shapes.cuts_of(staged.truth, margins)
+    hull, known, cut = of_group(evidence.replace(cuts=cuts).maps(1), "cuts")
     assert (known == 1).all()
-    assert (inside[staged.truth[1]] == 1).all()
-    assert inside[~staged.truth[1]] == pytest.approx(-0.2)
+    assert (hull[staged.truth[1]] == 1).all()
+    assert hull[~staged.truth[1]] == pytest.approx(-0.2)
+    assert torch.equal(cut > 0, staged.truth[1])
+    assert cut.min() == -1
 
 
 def test_distances_on_the_plane_are_those_of_its_places(evidence, staged):
-    apart, meets = of_group(evidence.of(5), "plane")
+    apart, meets = of_group(evidence.maps(5), "plane")
     assert (meets == 1).all()
     row, column = divmod(int(apart.argmin()), 240)
     # The foot of the fixation point, (0, 0, 0), is below the ball's centre.
@@ -69,35 +72,49 @@ class Points(torch.nn.Module):
     """Odds from the points nearby and, if it is known, the hull."""
 
     def forward(self, maps):
-        points, others, inside, _ = maps[:, -4:].unbind(dim=1)
-        return 3 * (points - others) - 1 + 4 * inside
+        points, others, hull, _, _ = maps[:, -5:].unbind(dim=1)
+        return 9 * (points - others) - 3 + 12 * hull
 
 
-def test_readings_and_colours_give_soft_masks(staged, evidence):
-    first = read(evidence, Points())
-    again = second_reading(evidence, first)
-    assert again is not None
-    assert again.margins_px is not None
-    second = read(again, Points())
-    assert overlap(second > 0, staged.truth).mean() > overlap(first > 0, staged.truth).mean()
-    prior = soft_masks(staged.scene, Points())
-    assert prior.names == staged.scene.views.names
-    assert overlap(prior.inside > 0.5, staged.truth).min() > 0.9
-    views = staged.scene.views.replace(priors=(prior,))
-    found = FindSilhouettes(SMALL)(staged.scene.replace(views=views))
+class Nothing(torch.nn.Module):
+    """Odds of photographs without an object."""
+
+    def forward(self, maps):
+        return torch.full_like(maps[:, 0], -9.0)
+
+
+def test_cuts_that_lost_a_part_are_mended(staged, evidence):
+    """The lower half of the ball is missing from a quarter of the cuts."""
+    cues = evidence.cues
+    cuts = cut_in_iterations(cues)
+    damaged = cuts.masks.clone()
+    damaged[::4, 100:] = False
+    again = read_again(cues, cuts.replace(masks=damaged), Points())
+    assert overlap(damaged, staged.truth).min() < 0.8
+    assert overlap(again.masks, staged.truth).min() > 0.93
+    assert overlap(again.margins_px > 0, staged.truth).min() > 0.9
+
+
+def test_cuts_stay_if_the_network_sees_no_object(evidence):
+    cuts = cut_in_iterations(evidence.cues)
+    assert read_again(evidence.cues, cuts, Nothing()) is cuts
+
+
+@pytest.mark.parametrize("network", [None, Points()])
+def test_the_ball_is_found_with_each_network(staged, network):
+    found = FindSilhouettes(SMALL, network)(staged.scene)
     assert overlap(found.masks, staged.truth).min() > 0.95
 
 
-def test_colours_decide_only_where_odds_are_not_clear(staged, evidence):
-    """The ball is red and the table grey."""
-    border = signed_distance(staged.truth[2])
-    unclear = torch.where(border > 8, 6.0, torch.where(border < -8, -6.0, -0.5))
-    cut = cut_of_view(evidence.cues, 2, unclear)
-    assert overlap(cut[None], staged.truth[2:3]) > 0.95
-    shifted = staged.truth[2].roll(60, 1)
-    clear = torch.where(shifted, 9.0, -9.0)
-    bare = evidence.cues.replace(object_px=(torch.zeros(0, 2),) * 12)
-    assert torch.equal(cut_of_view(bare, 2, clear), shifted)
+def test_sure_odds_change_wide_regions_and_no_outline(staged):
+    cut = staged.truth[2]
+    odds = torch.where(cut, 9.0, -9.0)
+    assert torch.equal(overruled(cut, odds.roll(1, 1)), cut)
+    assert torch.equal(overruled(cut, torch.full_like(odds, -2.0)), cut)
+    assert not overruled(cut, torch.full_like(odds, -9.0)).any()
+    lower = cut.clone()
+    lower[100:] = False
+    assert overlap(overruled(lower, odds)[None], cut[None]) > 0.97
 
 
 def test_a_network_reads_any_size_and_is_differentiable():

@@ -2,6 +2,7 @@ import pytest
 import torch
 from scenes import observing, trusted
 from sparse_models import views_of
+from torch import nn
 
 from pimper_torch.geometry.opencv import signed_distance
 from pimper_torch.geometry.pixels import pixel_centers
@@ -189,6 +190,12 @@ def test_silhouettes_that_contradict_each_other_are_not_trusted(staged):
         assert FindSilhouettes(SMALL)(scene).source == "everything"
 
 
+def as_they_are(_, cuts, network):
+    """Stand in for the reading of cuts by a network."""
+    assert isinstance(network, nn.Module)
+    return cuts
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
 def test_implausible_silhouettes_fall_back_to_everything_with_a_warning(
     staged, monkeypatch, fraction
@@ -200,6 +207,7 @@ def test_implausible_silhouettes_fall_back_to_everything_with_a_warning(
     masks[:, 60:120, 180 - int(fraction * 120) : 240] = True
     nonsense = shapes.cuts_of(masks, projections)
     monkeypatch.setattr(find, "cut_in_iterations", lambda _: nonsense)
+    monkeypatch.setattr(find, "read_again", as_they_are)
     overlap_percent = 100 * (fraction * 120 * 60) / ((240 - 60) * 60)
     with pytest.warns(
         PimperWarning, match=f"above the supporting plane.*by {overlap_percent:.0f}%"
@@ -221,6 +229,7 @@ def test_few_silhouettes_that_agree_are_not_enough(staged, monkeypatch):
     masks[:7, 60:120, 60:205] = True  # overlap 0.83, of which 0.83 is inside
     cuts = shapes.cuts_of(masks, projections)
     monkeypatch.setattr(find, "cut_in_iterations", lambda _: cuts)
+    monkeypatch.setattr(find, "read_again", as_they_are)
     with pytest.warns(PimperWarning, match="only 5 of 12 silhouettes agree"):
         assert FindSilhouettes(SMALL)(staged.scene).source == "everything"
 
@@ -238,6 +247,7 @@ def test_silhouettes_with_a_shared_error_are_not_trusted(staged, monkeypatch, gr
         return cuts_of(cues.relearned(masks), masks, margins, torch.zeros(12, dtype=torch.bool))
 
     monkeypatch.setattr(find, "cut_in_iterations", agreed)
+    monkeypatch.setattr(find, "read_again", as_they_are)
     with pytest.warns(PimperWarning, match=why):
         assert FindSilhouettes(SMALL)(staged.scene).source == "everything"
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from pimper_bench.evidence.lit_plane import lit_plane
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.supporting_plane import Plane, fixation
+from pimper_torch.stages.silhouettes.lit_plane import lit_plane
 from pimper_torch.stages.silhouettes.parallax import working_pictures
 
 PLANE = Plane(normal_world=torch.tensor([0.0, 0, 1]), offset=torch.tensor(0.0))

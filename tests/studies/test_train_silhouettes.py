@@ -5,7 +5,7 @@ import pytest
 import torch
 import train_silhouettes as study
 
-from pimper_bench.evidence.evidence_maps import MAPS
+from pimper_torch.stages.silhouettes.evidence import MAPS
 
 GROUPS = list(MAPS.values())
 
@@ -20,24 +20,23 @@ def stored(tmp_path, generator):
         truth = apart < 64
         maps = 0.1 * torch.randn(3, len(MAPS), 36, 48, generator=generator)
         maps[:, 0] += torch.where(truth, 1.0, -1.0)
-        study.write(tmp_path / f"{seed}.first.npy", iter(maps), truth)
+        study.write(tmp_path / f"{seed}.npy", iter(maps), truth)
     return tmp_path
 
 
 def test_stored_maps_are_those_written(tmp_path, generator):
     maps = 6 * torch.rand(2, len(MAPS), 8, 12, generator=generator) - 3
     truth = torch.rand(2, 8, 12, generator=generator) > 0.5
-    study.write(tmp_path / "0.first.npy", iter(maps), truth)
-    (read,) = study.existing(tmp_path, range(3), "first")
+    study.write(tmp_path / "0.npy", iter(maps), truth)
+    (read,) = study.existing(tmp_path, range(3))
     assert np.array_equal(read[:, -1] > 0, truth.numpy())
     back = (torch.from_numpy(np.array(read[:, :-1])).float() - 127.5) / study.LEVELS
     assert (back - maps).abs().max() < 0.6 / study.LEVELS
-    study.write(tmp_path / "1.first.npy", iter(()), truth)  # nothing in common
-    assert [path.name for path in tmp_path.iterdir()] == ["0.first.npy"]
+    assert [path.name for path in tmp_path.iterdir()] == ["0.npy"]
 
 
 def test_batches_are_crops_or_whole_views_with_groups_left_out(stored):
-    captures = study.existing(stored, range(2), "first")
+    captures = study.existing(stored, range(2))
     batches = study.Batches(captures, torch.Generator().manual_seed(0))
     maps, truth = batches.draw(small=False)
     assert maps.shape == (4, len(MAPS), 24, 32)
@@ -55,17 +54,20 @@ def test_batches_are_crops_or_whole_views_with_groups_left_out(stored):
 
 
 def test_training_lowers_the_loss_and_continues_where_it_was(stored, tmp_path):
-    captures = study.existing(stored, range(2), "first")
+    captures = study.existing(stored, range(2))
     run = study.Run(tmp_path, minutes=0.05)
     maps, truth = study.Batches(captures, torch.Generator().manual_seed(1)).draw(small=False)
     before = float(study.loss_of(run.network, maps, truth).detach())
-    run.train(lambda: captures, until=0.7)
+    run.train(
+        lambda: captures,
+    )
     assert float(study.loss_of(run.network, maps, truth).detach()) < 0.9 * before
     again = study.Run(tmp_path, minutes=0.05)
     assert again.steps == run.steps > 3
-    assert 0.7 <= again.done < 1.3
+    assert 1 <= again.done < 1.5
     for one, other in zip(run.network.parameters(), again.network.parameters(), strict=True):
         assert torch.equal(one, other)
     overlaps, calibration = study.measured(run.network.eval(), captures)
     assert len(overlaps) == 2
+    assert all(read > cut for cut, read in overlaps)  # the stored cuts are noise
     assert sum(count for _, _, count in calibration) == 2 * 3 * 36 * 48

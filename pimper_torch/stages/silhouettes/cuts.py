@@ -38,6 +38,7 @@ from pimper_torch.stages.silhouettes.parallax import DISPUTED, of_views
 # Chosen on the four rendered scenes and the skull (benchmarks/studies/silhouettes.py).
 _ITERATIONS = 2  # of cutting and voting after the first cut
 NUM_VOXELS = 500_000  # of the hull
+SPECK = 2e-4  # of the pixels: smaller parts and holes are noise
 _DISAGREEING = 0.05  # fraction of the views that may exclude a voxel of the hull
 
 # Larger fractions of disagreeing views, tried in turn until the common hull covers _COMMON of the
@@ -82,6 +83,7 @@ class Cuts(Record):
         rejected: Views whose soft mask was not used.
         agreement: With the backgrounds; ``None`` without any.
         hidden: Pixels of the cuts that show something in front of the object, or ``None``.
+        expected: Overlap with the truth that a network expects of each cut, or ``None``.
     """
 
     masks: Masks
@@ -91,6 +93,7 @@ class Cuts(Record):
     rejected: ViewMask
     agreement: Maps | None
     hidden: Masks | None = None
+    expected: PerView | None = None
 
 
 def cut_in_iterations(cues: Cues) -> Cuts | None:
@@ -101,8 +104,10 @@ def cut_in_iterations(cues: Cues) -> Cuts | None:
     views abstain from the first vote beyond the plane.
 
     Returns:
-        ``None`` if the cuts have nothing in common.
+        ``None`` if there are no cues, or the cuts have nothing in common.
     """
+    if cues.agreement is None and not cues.has_points and cues.soft is None:
+        return None
     masks, unknown = _initial_cuts(cues), torch.zeros_like(cues.pictures.grey, dtype=torch.bool)
     if cues.agreement is not None and not cues.has_points:
         unknown = by_view(Tensor.isnan, cues.agreement)  # such as beyond the plane
@@ -231,7 +236,7 @@ def _cut_again(cues: Cues, masks: Masks, margins_px: Maps, unknown: Masks) -> Ma
         if cues.soft is not None and cues.soft.given[view]:
             labels = labels_from_soft(labels, cues.soft.masks[view], margins_px[view])
         cut = _cut(grab_cut, cues, view, labels, margins_px[view])
-        return without_specks(cut, margins_px[view] > 0, round(2e-4 * cut.numel()))
+        return without_specks(cut, margins_px[view] > 0, round(SPECK * cut.numel()))
 
     return of_views(again, cues.num_views)
 

@@ -79,5 +79,9 @@ def silhouettes_of(cuts: Cuts, views: Views) -> Silhouettes:
         )
     _, reliable = agreement_of(cuts)
     return Silhouettes(
-        inside=probabilities, reliable=reliable.to(device), source="found", hidden=hidden
+        inside=probabilities,
+        reliable=reliable.to(device),
+        source="found",
+        hidden=hidden,
+        expected_overlap=None if cuts.expected is None else cuts.expected.to(device),
     )

@@ -1,4 +1,4 @@
-"""Maps of cues about the object in every view, which a network reads."""
+"""Maps of all that is known about a view's pixels, which a network reads."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,14 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_bench.evidence.lit_plane import LitPlane, lit_plane
-from pimper_torch.geometry.opencv import window_means
+from pimper_torch.geometry.opencv import signed_distance, window_means
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.records import Record
-from pimper_torch.records.shapes import Map, Maps, Masks
-from pimper_torch.stages.silhouettes import parallax
+from pimper_torch.records.shapes import Map
 from pimper_torch.stages.silhouettes.cues import Cues
+from pimper_torch.stages.silhouettes.cuts import Cuts
+from pimper_torch.stages.silhouettes.lit_plane import LitPlane, lit_plane
+from pimper_torch.stages.silhouettes.parallax import RATIO
 
 # Of every map, in order, and the group that is known or unknown together.
 MAPS = {
@@ -24,46 +25,49 @@ MAPS = {
     "residual to the lit plane": "light",
     "residual to the plane in cast shadow": "light",
     "certainty of the plane's albedo": "light",
-    "agreement with the plane's texture": "texture",
+    "agreement with the backgrounds' texture": "texture",
     "whether the agreement is known": "texture",
-    "agreement with a static background": "background",
-    "whether the static background is known": "background",
     "distance on the plane from the foot of the fixation point": "plane",
     "whether the ray meets the plane": "plane",
     "distance from the fixation point": "centre",
     "points of the object nearby": "points",
     "points of the background nearby": "points",
-    "distance inside the hull of the views": "hull",
-    "whether the hull is known": "hull",
+    "distance inside the hull of the cuts": "cuts",
+    "whether the cuts are known": "cuts",
+    "distance inside the cut": "cuts",
 }
 _POINT_WINDOW = 1 / 32  # of the longer side: spread of a point
 _RADIUS = 0.35  # of the cameras' distance: an object that fills photographs
-_HULL_REACH = 1 / 24  # of the longer side
+_REACH = 1 / 24  # of the longer side: greatest distance inside hull and cut
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class EvidenceMaps(Record):
+class Evidence(Record):
     """What the maps of all views are made from, at the working size of the cues.
 
     Attributes:
         lit: Appearance of the supporting plane; ``None`` without a plane.
-        texture: Agreement with the plane's texture; NaN where unknown.
-        background: Agreement with a static background; NaN where unknown.
-        margins_px: Distance inside the hull's projection; ``None`` before it is known.
+        cuts: Of all views, with the agreement that they led to; ``None`` if they are not known.
     """
 
     cues: Cues
     lit: LitPlane | None
-    texture: Maps | None
-    background: Maps | None
-    margins_px: Maps | None
+    cuts: Cuts | None
 
-    def of(self, view: int) -> Float[Tensor, "map height width"]:
+    @classmethod
+    def of(cls, cues: Cues, cuts: Cuts | None) -> "Evidence":
+        """Learn the plane's appearance where no cut hides it."""
+        lit, pictures = None, cues.pictures
+        if cues.plane is not None:
+            masks = None if cuts is None else cuts.masks
+            lit = lit_plane(pictures, cues.plane, cues.fixation, masks)
+        return cls(cues=cues, lit=lit, cuts=cuts)
+
+    def maps(self, view: int) -> Float[Tensor, "map height width"]:
         """Return the maps of a view, in the order of ``MAPS``; 0 where a cue is unknown."""
         grey = self.cues.pictures.grey[view]
-        shape, empty = grey.shape, torch.zeros_like(grey)
-        longer = max(shape)
-        ratios = (self.cues.pictures.opponent[view, ..., 1:].float() - 128) / parallax.RATIO
+        empty, longer = torch.zeros_like(grey), max(grey.shape)
+        ratios = (self.cues.pictures.opponent[view, ..., 1:].float() - 128) / RATIO
         layers = [grey - grey.median(), *(x - x.median() for x in ratios.unbind(dim=-1))]
         if self.lit is None:
             layers += [empty] * 3
@@ -71,18 +75,18 @@ class EvidenceMaps(Record):
             residual, support = self.lit.residual(view, grey)
             shadowed = (residual - self.lit.shadow[view]) * (support != 0)
             layers += [residual, shadowed, support]
-        for agreement in (self.texture, self.background):
-            values = empty if agreement is None else agreement[view]
-            known = empty if agreement is None else values.isfinite().float()
-            layers += [values.nan_to_num(0), known]
+        agreement = self.cues.agreement if self.cuts is None else self.cuts.agreement
+        values = torch.full_like(grey, torch.nan) if agreement is None else agreement[view]
+        layers += [values.nan_to_num(0), values.isfinite().float()]
         layers += [*self._on_plane(view), self._from_centre(view)]
         for pixels in (self.cues.object_px[view], self.cues.background_px[view]):
-            layers.append(_density(pixels, shape, 2 * round(_POINT_WINDOW * longer / 2) + 1))
-        if self.margins_px is None:
-            layers += [empty] * 2
+            layers.append(_density(pixels, grey.shape, 2 * round(_POINT_WINDOW * longer / 2) + 1))
+        if self.cuts is None:
+            layers += [empty] * 3
         else:
-            inside = self.margins_px[view] / (_HULL_REACH * longer)
-            layers += [inside.clamp(-1, 1), torch.ones_like(grey)]
+            inside = self.cuts.margins_px[view], signed_distance(self.cuts.masks[view])
+            hull, cut = (x.clamp(-_REACH * longer, _REACH * longer) for x in inside)
+            layers += [hull / (_REACH * longer), empty + 1, cut / (_REACH * longer)]
         return torch.stack(layers).clamp(-3, 3)
 
     def _on_plane(self, view: int) -> tuple[Map, Map]:
@@ -96,10 +100,8 @@ class EvidenceMaps(Record):
         rays = rays_through(
             pixels.reshape(-1, 2), cameras.cam_from_world[0], cameras.intrinsics[0]
         ).to(empty)
-        eye, middle = (
-            cameras.centers_world[0].to(empty),
-            self.cues.fixation.fixation_world.to(empty),
-        )
+        eye = cameras.centers_world[0].to(empty)
+        middle = self.cues.fixation.fixation_world.to(empty)
         foot = middle - height_of(middle) * self.cues.plane.normal_world
         along = -height_of(eye) / (rays @ self.cues.plane.normal_world)
         apart = (eye + along[:, None] * rays - foot).norm(dim=1) / self.cues.fixation.distance
@@ -114,27 +116,6 @@ class EvidenceMaps(Record):
         height, width = self.cues.pictures.grey.shape[1:]
         apart = pixel_centers(width, height, like=pixel) - pixel[0, 0]
         return apart.norm(dim=-1) / (_RADIUS * cameras.intrinsics[0, 0, 0])
-
-
-def evidence_maps(
-    cues: Cues, masks: Masks | None = None, margins_px: Maps | None = None
-) -> EvidenceMaps:
-    """Learn the backgrounds where no mask hides them.
-
-    Args:
-        masks: Of the object; ``None`` before the first reading.
-        margins_px: Distance inside the hull of these masks.
-    """
-    lit = texture = background = None
-    pictures, maps = cues.pictures, cues.background_from_view
-    if cues.plane is not None:
-        lit = lit_plane(pictures, cues.plane, cues.fixation, masks)
-        texture = parallax.plane_agreement(pictures, cues.plane, cues.fixation, masks)
-    if len(maps):
-        background = parallax.background_agreement(pictures, maps, masks)
-    return EvidenceMaps(
-        cues=cues, lit=lit, texture=texture, background=background, margins_px=margins_px
-    )
 
 
 def _density(pixels: Float[Tensor, "_ 2"], shape: Sequence[int], window: int) -> Map:

@@ -14,15 +14,16 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, pixel_shuffle, pixel_unshuffle, silu
 
-from pimper_bench.evidence.evidence_maps import MAPS, EvidenceMaps
 from pimper_torch.records.shapes import Map, Maps
+from pimper_torch.stages.silhouettes.evidence import MAPS, Evidence
 from pimper_torch.stages.silhouettes.parallax import of_views
 
+_WEIGHTS = Path(__file__).parents[2] / "data" / "silhouettes.safetensors"
 _SIZE_PX = 480  # longer side of the maps in training
 WIDTHS = (24, 40, 64, 96)  # channels at half the size, at a quarter, and so on
 
 
-class Block(nn.Module):
+class _Block(nn.Module):
     """Two convolutions with normalization."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -50,9 +51,9 @@ class SilhouetteNetwork(nn.Module):
     def __init__(self, maps: int = len(MAPS), widths: tuple[int, ...] = WIDTHS) -> None:
         super().__init__()
         self.enter = nn.Conv2d(4 * maps, widths[0], 1)
-        self.down = nn.ModuleList(map(Block, (widths[0], *widths), widths))
+        self.down = nn.ModuleList(map(_Block, (widths[0], *widths), widths))
         self.across = nn.ModuleList(nn.Conv2d(high, low, 1) for low, high in pairwise(widths))
-        self.up = nn.ModuleList(Block(low, low) for low in widths[:-1])
+        self.up = nn.ModuleList(_Block(low, low) for low in widths[:-1])
         self.last = nn.Conv2d(widths[0], 4, 1)
         self.steps = 2 ** len(widths)
 
@@ -72,23 +73,24 @@ class SilhouetteNetwork(nn.Module):
         return pixel_shuffle(self.last(x), 2)[:, 0, :height, :width]
 
 
-def load_network(path: Path | str) -> SilhouetteNetwork:
-    """Load a trained network for inference."""
+def load_network(path: Path | str = _WEIGHTS) -> SilhouetteNetwork:
+    """Load a trained network for inference, by default the package's own."""
     network = SilhouetteNetwork()
     network.load_state_dict({name: value.float() for name, value in load_file(path).items()})
     return network.eval().requires_grad_(False)
 
 
 @torch.no_grad()
-def read(evidence: EvidenceMaps, network: SilhouetteNetwork) -> Maps:
+def read(evidence: Evidence, network: nn.Module) -> Maps:
     """Return the log odds of the object at the working size; not differentiable."""
+    like = next(network.parameters(), torch.empty(0))
 
     def of_view(view: int) -> Map:
-        maps = evidence.of(view)[None]
+        maps = evidence.maps(view)[None]
         size = maps.shape[-2:]
         factor = min(1.0, _SIZE_PX / max(size))
         small = [max(1, round(factor * side)) for side in size]
-        odds = network(interpolate(maps, small, mode="area"))[:, None]
+        odds = network(interpolate(maps, small, mode="area").to(like))[:, None].to(maps)
         return interpolate(odds, size, mode="bilinear", align_corners=False)[0, 0]
 
     return of_views(of_view, evidence.cues.num_views)

@@ -1,0 +1,69 @@
+"""Cuts read again by a network that sees all cues, the cuts and their hull."""
+
+import torch
+from torch import Tensor, nn
+
+from pimper_torch.geometry.opencv import opening, without_specks
+from pimper_torch.records.shapes import Map, Mask, Scalar
+from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.mapped import by_view
+from pimper_torch.stages.silhouettes.cues import Cues
+from pimper_torch.stages.silhouettes.cuts import SPECK, Cuts, cuts_of, hull_margins
+from pimper_torch.stages.silhouettes.evidence import Evidence
+from pimper_torch.stages.silhouettes.network import read
+
+# The network contradicts a cut where its log odds are beyond the first in regions wider than the
+# second, of the longer side: outlines are finer than its pixels. docs/decisions.md, "Evidence that
+# is learned".
+_SURE, _WIDE = 2.0, 1 / 100
+# Fraction of the median cut that changed, above which the new cuts are read, too; and readings.
+_CHANGED, _READINGS = 0.03, 3
+_CALIBRATED = 0.72  # odds of captures not trained on are larger than right by the inverse
+
+
+def read_again(cues: Cues, cuts: Cuts, network: nn.Module) -> Cuts:
+    """Change cuts where the network is sure of the contrary, and vote on the hull again.
+
+    Args:
+        network: Maps the maps of one view, see :data:`.MAPS`, to log odds of the object.
+
+    Returns:
+        The last cuts that have something in common.
+    """
+    before, cues = cuts, cues.replace(agreement=cuts.agreement)
+    for _ in range(_READINGS):
+        odds = read(Evidence.of(cues, cuts), network)
+        masks = by_view(overruled, cuts.masks, odds)
+        inside = by_view(Tensor.float, masks)
+        if cuts.hidden is not None:
+            inside.masked_fill_(cuts.hidden, 0.5)
+        margins_px = hull_margins(cues, inside)
+        if margins_px is None:
+            break
+        masks = by_view(
+            lambda mask, margin: without_specks(mask, margin > 0, round(SPECK * mask.numel())),
+            masks,
+            margins_px,
+        )
+        changed = by_view(lambda old, new: (old ^ new).sum() / old.sum(), cuts.masks, masks)
+        again = bool(changed.median() > _CHANGED)
+        cues = cues.relearned(masks) if again else cues
+        hidden, expected = cuts.hidden, by_view(expected_overlap, masks, odds)
+        cuts = cuts_of(cues, masks, margins_px, cuts.rejected)
+        cuts = cuts.replace(hidden=hidden, expected=expected)
+        if not again:
+            break
+    leave_out("silhouettes.read_again", by_view(lambda x, y: x & ~y, before.masks, cuts.masks))
+    return cuts
+
+
+def expected_overlap(mask: Mask, odds: Map) -> Scalar:
+    """Return the expected intersection over union of a mask with the truth."""
+    inside = torch.sigmoid(_CALIBRATED * odds).double()
+    return inside[mask].sum() / (mask.sum() + inside[~mask].sum()).clamp_min(1)
+
+
+def overruled(mask: Mask, odds: Map) -> Mask:
+    """Return a cut, changed in wide regions where the odds are clearly against it."""
+    wrong = torch.where(mask, -odds, odds) > _SURE
+    return mask ^ opening(wrong, round(_WIDE / 2 * max(mask.shape)))
