@@ -203,7 +203,7 @@ class Run:
 
     def finish(self, tests: Sequence[np.ndarray]) -> None:
         """Write the weights and their record."""
-        self.network.eval()
+        calibrate(self.network.eval(), tests)
         weights = {name: value.half() for name, value in self.network.state_dict().items()}
         save_file(weights, self.out / "silhouettes.safetensors")
         record: dict[str, object] = {"steps": self.steps, "minutes": self.minutes}
@@ -223,6 +223,29 @@ def loss_of(network: SilhouetteNetwork, maps: Tensor, truth: Tensor) -> Tensor:
     both = (inside * truth).sum(dim=(1, 2))
     union = (inside + truth - inside * truth).sum(dim=(1, 2))
     return entropy + 0.5 * (1 - (both + 1) / (union + 1)).mean()
+
+
+def calibrate(network: SilhouetteNetwork, captures: Sequence[np.ndarray]) -> None:
+    """Scale and shift the odds of a network so that they are right on captures left out."""
+    samples = []
+    network.calibration.copy_(torch.tensor([1.0, 0.0]))
+    for stored in (view for capture in captures for view in capture[::3]):
+        values = torch.from_numpy(np.array(stored)).float()
+        with torch.no_grad():
+            odds = network((values[None, :-1] - 127.5) / LEVELS)[0]
+        samples.append(torch.stack([odds, values[-1]])[:, ::4, ::4].flatten(1))
+    odds, truth = torch.cat(samples, dim=1)
+    fit = torch.tensor([1.0, 0.0], requires_grad=True)
+    optimizer = torch.optim.LBFGS([fit], max_iter=50)
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        value = binary_cross_entropy_with_logits(fit[0] * odds + fit[1], truth)
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    network.calibration.copy_(fit.detach())
 
 
 @torch.no_grad()

@@ -5,12 +5,13 @@ import torch
 from safetensors.torch import save_file
 from scenes import observing
 
+from pimper_torch.runtime.errors import PimperWarning
 from pimper_torch.stages.silhouettes.cues import cues_of
 from pimper_torch.stages.silhouettes.cuts import cut_in_iterations
 from pimper_torch.stages.silhouettes.evidence import MAPS, Evidence
 from pimper_torch.stages.silhouettes.find import FindSilhouettes
 from pimper_torch.stages.silhouettes.network import SilhouetteNetwork, load_network
-from pimper_torch.stages.silhouettes.read_again import overruled, read_again
+from pimper_torch.stages.silhouettes.read_again import expected_overlap, overruled, read_again
 from tests.silhouettes import shapes
 from tests.silhouettes.conftest import SMALL, overlap
 
@@ -110,11 +111,37 @@ def test_sure_odds_change_wide_regions_and_no_outline(staged):
     cut = staged.truth[2]
     odds = torch.where(cut, 9.0, -9.0)
     assert torch.equal(overruled(cut, odds.roll(1, 1)), cut)
-    assert torch.equal(overruled(cut, torch.full_like(odds, -2.0)), cut)
+    assert torch.equal(overruled(cut, torch.full_like(odds, -1.0)), cut)
     assert not overruled(cut, torch.full_like(odds, -9.0)).any()
     lower = cut.clone()
     lower[100:] = False
     assert overlap(overruled(lower, odds)[None], cut[None]) > 0.97
+
+
+def test_the_expected_overlap_is_that_of_probable_truths():
+    mask = torch.zeros(40, 50, dtype=torch.bool)
+    mask[:10] = True
+    sure = torch.where(mask, 40.0, -40.0)
+    assert expected_overlap(mask, sure) == pytest.approx(1)
+    assert expected_overlap(mask, -sure) == pytest.approx(0)
+    even = torch.where(mask, 0.0, -40.0)
+    assert expected_overlap(mask, even) == pytest.approx(0.5)
+    assert expected_overlap(mask, torch.zeros(40, 50)) == pytest.approx(0.125 / (0.25 + 0.375))
+
+
+class Unsure(torch.nn.Module):
+    """No opinion."""
+
+    def forward(self, maps):
+        return torch.zeros_like(maps[:, 0])
+
+
+def test_uncertain_silhouettes_are_used_with_a_warning(staged):
+    with pytest.warns(PimperWarning, match=r"uncertain: expected is an overlap of \d+%.*0\d.png"):
+        found = FindSilhouettes(SMALL, Unsure())(staged.scene)
+    assert found.source == "found"
+    assert found.figures()["expected_overlap"] == pytest.approx(found.expected_overlap.mean())
+    assert found.expected_overlap.max() < 0.5
 
 
 def test_a_network_reads_any_size_and_is_differentiable():

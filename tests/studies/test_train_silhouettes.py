@@ -58,9 +58,7 @@ def test_training_lowers_the_loss_and_continues_where_it_was(stored, tmp_path):
     run = study.Run(tmp_path, minutes=0.05)
     maps, truth = study.Batches(captures, torch.Generator().manual_seed(1)).draw(small=False)
     before = float(study.loss_of(run.network, maps, truth).detach())
-    run.train(
-        lambda: captures,
-    )
+    run.train(lambda: captures)
     assert float(study.loss_of(run.network, maps, truth).detach()) < 0.9 * before
     again = study.Run(tmp_path, minutes=0.05)
     assert again.steps == run.steps > 3
@@ -71,3 +69,21 @@ def test_training_lowers_the_loss_and_continues_where_it_was(stored, tmp_path):
     assert len(overlaps) == 2
     assert all(read > cut for cut, read in overlaps)  # the stored cuts are noise
     assert sum(count for _, _, count in calibration) == 2 * 3 * 36 * 48
+
+
+def test_odds_are_calibrated_on_captures(stored):
+    captures = study.existing(stored, range(2))
+    torch.manual_seed(0)
+    network = study.SilhouetteNetwork().eval()
+    network.last.weight.data *= 40  # far too certain
+
+    def gap():
+        _, rows = study.measured(network, captures)
+        return sum(abs(read - true) * count for read, true, count in rows) / (2 * 3 * 36 * 48)
+
+    before = gap()
+    study.calibrate(network, captures)
+    after, found = gap(), network.calibration.clone()
+    assert after < 0.5 * before
+    study.calibrate(network, captures)
+    assert torch.allclose(network.calibration, found)

@@ -41,7 +41,7 @@ class _Block(nn.Module):
 
 
 class SilhouetteNetwork(nn.Module):
-    """A U-Net on half the maps' resolution.
+    """A U-Net on half the maps' resolution, whose odds are calibrated after training.
 
     Args:
         maps: Number of maps.
@@ -56,6 +56,7 @@ class SilhouetteNetwork(nn.Module):
         self.up = nn.ModuleList(_Block(low, low) for low in widths[:-1])
         self.last = nn.Conv2d(widths[0], 4, 1)
         self.steps = 2 ** len(widths)
+        self.register_buffer("calibration", torch.tensor([1.0, 0.0]))  # factor and summand of odds
 
     def forward(
         self, maps: Float[Tensor, "batch map height width"]
@@ -70,14 +71,15 @@ class SilhouetteNetwork(nn.Module):
         for level in reversed(range(len(self.up))):
             wide = interpolate(self.across[level](x), scale_factor=2.0, mode="nearest")
             x = self.up[level](kept[level] + wide)
-        return pixel_shuffle(self.last(x), 2)[:, 0, :height, :width]
+        factor, summand = self.calibration
+        return factor * pixel_shuffle(self.last(x), 2)[:, 0, :height, :width] + summand
 
 
 def load_network(path: Path | str = _WEIGHTS) -> SilhouetteNetwork:
     """Load a trained network for inference, by default the package's own."""
     network = SilhouetteNetwork()
     network.load_state_dict({name: value.float() for name, value in load_file(path).items()})
-    return network.eval().requires_grad_(False)
+    return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)
 
 
 @torch.no_grad()

@@ -15,10 +15,9 @@ from pimper_torch.stages.silhouettes.network import read
 # The network contradicts a cut where its log odds are beyond the first in regions wider than the
 # second, of the longer side: outlines are finer than its pixels. docs/decisions.md, "Evidence that
 # is learned".
-_SURE, _WIDE = 2.0, 1 / 100
+_SURE, _WIDE = 1.5, 1 / 80
 # Fraction of the median cut that changed, above which the new cuts are read, too; and readings.
 _CHANGED, _READINGS = 0.03, 3
-_CALIBRATED = 0.72  # odds of captures not trained on are larger than right by the inverse
 
 
 def read_again(cues: Cues, cuts: Cuts, network: nn.Module) -> Cuts:
@@ -59,7 +58,7 @@ def read_again(cues: Cues, cuts: Cuts, network: nn.Module) -> Cuts:
 
 def expected_overlap(mask: Mask, odds: Map) -> Scalar:
     """Return the expected intersection over union of a mask with the truth."""
-    inside = torch.sigmoid(_CALIBRATED * odds).double()
+    inside = torch.sigmoid(odds).double()
     return inside[mask].sum() / (mask.sum() + inside[~mask].sum()).clamp_min(1)
 
 
