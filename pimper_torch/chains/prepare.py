@@ -32,7 +32,7 @@ from pimper_torch.stages.sfm.poses import one_view_per_pose, with_poses
 from pimper_torch.stages.sfm.sparse_scene import sound
 from pimper_torch.stages.sfm.triangulation import FEW_OBSERVED, lacks_points
 from pimper_torch.stages.silhouettes.find import FindSilhouettes, masked, of_all_photographs
-from pimper_torch.stages.silhouettes.given import AS_THEY_ARE, right_reading
+from pimper_torch.stages.silhouettes.given import refuse_wrong_masks
 
 # The smallest number from which a surface is reconstructed.
 _MIN_VIEWS = 3
@@ -51,7 +51,7 @@ class Prepared(Record):
         coarse: The coarse surface.
         mesh: The given mesh in the scene's frame; ``None`` if none was given.
         held_out: Photographs used only to estimate cameras; ``None`` without any.
-        decisions: What was decided about cameras, points, masks, poses and held-out photographs,
+        decisions: What was decided about cameras, points, poses and held-out photographs,
             and why, as texts; without entries where there was nothing to decide.
         reports: Report of each stage that ran, in order.
         failures: Elements that failed and were skipped.
@@ -145,33 +145,11 @@ def locate(
     sparse_model: Path | str | None = None,
     mesh: Mesh | None = None,
 ) -> tuple[SparseScene, dict[str, str]]:
-    """Return photographs with their cameras, given or estimated, and what was decided.
+    """Return usable photographs with cameras, points and undistorted priors, and what was decided.
 
-    Masks of other photographs, or rotated or inverted ones, are corrected according to cameras and
-    points, and cameras are estimated again.
+    Raises:
+        InputError: Cameras are given twice, or cameras and points contradict the masks.
     """
-    scene, decisions = _located(chain, run, views, sparse_model, mesh)
-    finder = chain.silhouettes
-    if isinstance(finder, FindSilhouettes) and finder.config.object == "everything":
-        return scene, decisions
-    photographs = views if isinstance(views, Views) else views.views
-    reading = right_reading(scene, photographs)
-    if reading is AS_THEY_ARE:
-        return scene, decisions
-    photographs = reading.of(photographs)
-    views = photographs if isinstance(views, Views) else views.replace(views=photographs)
-    scene, decisions = _located(chain, run, views, sparse_model, mesh)
-    return scene, {**decisions, "masks": reading.description}
-
-
-def _located(
-    chain: Preparing,
-    run: ChainRun,
-    views: Views | SparseScene,
-    sparse_model: Path | str | None,
-    mesh: Mesh | None,
-) -> tuple[SparseScene, dict[str, str]]:
-    """Return usable photographs with cameras, points and undistorted priors."""
     if isinstance(views, Views):
         scene = run(chain.reconstruct, views, sparse_model)
         source = "structure from motion" if sparse_model is None else f"given in {sparse_model}"
@@ -190,7 +168,11 @@ def _located(
     if mesh is None and scene.cameras.num_views >= 3 and lacks_points(scene, FEW_OBSERVED):
         scene = run(chain.depth_points, scene)
         decisions["points"] = "from depth maps, since features hardly match"
-    return with_undistorted_priors(with_poses(sound(scene))), decisions
+    scene = with_undistorted_priors(with_poses(sound(scene)))
+    finder = chain.silhouettes
+    if not isinstance(finder, FindSilhouettes) or finder.config.object != "everything":
+        refuse_wrong_masks(scene, (views if isinstance(views, Views) else views.views).names)
+    return scene, decisions
 
 
 def in_scene(

@@ -1,4 +1,4 @@
-"""Masks stored in a different way than their photographs."""
+"""Masks that contradict their photographs are refused, with the likely cause."""
 
 import warnings
 
@@ -7,14 +7,13 @@ import torch
 from scenes import observed, observing
 from sparse_models import views_of
 from torch.nn.functional import normalize
-from torch.testing import assert_close
 
 import pimper_torch as pt
 from pimper_torch.chains.prepare import locate
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.decode import rotated
 from pimper_torch.records import CameraModel
-from pimper_torch.stages.silhouettes.given import AS_THEY_ARE, Reading, right_reading
+from pimper_torch.stages.silhouettes.given import refuse_wrong_masks
 from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
 from tests.silhouettes.shapes import FOCAL, HEIGHT, WIDTH, all_round, silhouettes_of
 
@@ -73,22 +72,30 @@ def soft(views, masks):
     return views.replace(masks=None, priors=(prior,))
 
 
-def read(views, reading):
-    """Return the masks in a reading."""
-    found = reading.of(views)
-    return found.priors[0].inside > 0.5 if found.masks is None else found.masks
-
-
 def order(*changed):
     """Return names in order, with some changed."""
     return torch.tensor([dict(changed).get(view, view) for view in range(VIEWS)])
 
 
+UPRIGHT = r"Needed: masks that are oriented like the photographs\. Turn or mirror the files"
+NAMED = r"Needed: masks named after the photographs that they show\. Rename the files\."
+
+
+def accept(scene, views):
+    refuse_wrong_masks(scene.replace(views=views), NAMES)
+
+
+def refuse(scene, views, cause, needed):
+    """Check the cause and the remedy that the error gives."""
+    found = r"The masks contradict cameras and points by [0-9.]+%, but by 0\.[0-9]% if they are "
+    with pytest.raises(pt.InputError, match=found + cause + r"\. " + needed):
+        accept(scene, views)
+
+
 @pytest.mark.parametrize("form", [hard, soft])
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "cause"),
     [
-        (torch.logical_not, "inverted"),
         (lambda masks: masks.flip(1, 2), "turned by a half turn"),
         (lambda masks: masks.flip(2), "mirrored"),
         (lambda masks: masks.flip(1), "mirrored upside down"),
@@ -98,24 +105,31 @@ def order(*changed):
             ],
             "in the stored orientation, not turned by EXIF",
         ),
-        (lambda masks: masks[order((3, 11), (11, 3))], r"exchanged between (03|11)\.png and"),
+        (
+            lambda masks: masks[order((3, 11), (11, 3))],
+            r"exchanged between (03|11)\.png and (03|11)\.png",
+        ),
         (
             lambda masks: masks.roll(7, 0),
             r"shifted by 7 in the list \(00\.png has that of 07\.png\)",
         ),
     ],
 )
-def test_cameras_and_points_select_the_reading_of_masks(scene, truth, form, wrong, said):
-    views = form(scene.views, wrong(truth))
-    with pytest.warns(pt.PimperWarning, match=f"if they are {said}.*, so they are read like that"):
-        reading = right_reading(scene.replace(views=views), views)
-    assert torch.equal(read(views, reading), truth)
-    if form is soft:  # with the same certainty
-        inside = reading.of(views).priors[0].inside
-        assert_close((inside - 0.5).abs().sum(), (views.priors[0].inside - 0.5).abs().sum())
+def test_masks_of_other_pixels_are_refused_with_their_cause(scene, truth, form, wrong, cause):
+    needed = NAMED if cause.startswith(("exchanged", "shifted")) else UPRIGHT
+    refuse(scene, form(scene.views, wrong(truth)), cause, needed)
 
 
-def test_correct_and_slightly_inaccurate_masks_are_unchanged(scene, truth):
+@pytest.mark.parametrize(
+    ("form", "remedy"),
+    [(hard, r"Invert the files, or give `--mask-object dark`\."), (soft, r"Invert the files\.")],
+)
+def test_inverted_masks_are_refused_with_their_cause(scene, truth, form, remedy):
+    needed = r"Needed: masks that are bright at the object\. " + remedy
+    refuse(scene, form(scene.views, ~truth), "inverted: they show the object dark", needed)
+
+
+def test_correct_and_slightly_inaccurate_masks_are_accepted(scene, truth):
     """Masks alternately a pixel too wide and too narrow, and those of four photographs only."""
     wide = torch.nn.functional.max_pool2d(truth.float(), 3, 1, 1) > 0
     narrow = torch.nn.functional.max_pool2d((~truth).float(), 3, 1, 1) == 0
@@ -128,57 +142,36 @@ def test_correct_and_slightly_inaccurate_masks_are_unchanged(scene, truth):
         scene.views.replace(priors=(few,)),
         scene.views,
     ):
-        assert right_reading(scene.replace(views=views), views) is AS_THEY_ARE
+        accept(scene, views)
 
 
-def test_shifted_names_of_soft_masks_are_corrected(scene, truth):
+def test_shifted_names_of_some_soft_masks_are_refused(scene, truth):
     prior = soft(scene.views, truth).priors[0].take(list(range(12))).replace(names=NAMES[1:13])
     views = scene.views.replace(priors=(prior,))
-    with pytest.warns(pt.PimperWarning, match=r"shifted by 1 in the list \(00\.png has that of 01"):
-        (found,) = right_reading(scene.replace(views=views), views).of(views).priors
-    order = [found.names.index(name) for name in NAMES[:12]]
-    assert len(found.names) == 12
-    assert torch.equal(found.inside[order], prior.inside)
-
-
-def test_clicks_are_unchanged(scene, truth):
-    """This includes photographs of different sizes, with rasters padded by 0."""
-    inside = torch.full((2, 40, 60), 0.5)
-    inside[0, :, 50:], inside[:, 10:13, 20:23] = 0, 1
-    sizes = torch.tensor([[50, 40], [60, 40]])
-    click = pt.SilhouettePrior(names=NAMES[2:4], sizes_px=sizes, inside=inside)
-    views = soft(scene.views, truth)
-    views = views.replace(priors=(click, *views.priors))
-    kept, inverted = Reading(inverted=True).of(views).priors
-    assert kept is click
-    assert torch.equal(inverted.inside > 0.5, ~truth)
+    refuse(scene, views, r"shifted by 1 in the list \(00\.png has that of 01\.png\)", NAMED)
 
 
 def test_only_inverted_masks_are_detected_on_an_untextured_object(scene, truth):
     bare = observing(scene, scene.observation_point >= len(scene.points_world) - 300)
     for wrong in (truth, truth.flip(1, 2)):
-        views = hard(scene.views, wrong)
         with pytest.warns(pt.PimperWarning, match="No point of the cloud is in the silhouettes"):
-            assert right_reading(bare.replace(views=views), views) is AS_THEY_ARE
-    views = soft(scene.views, ~truth)
-    with pytest.warns(pt.PimperWarning, match="if they are inverted"):
-        assert right_reading(bare.replace(views=views), views).inverted
+            accept(bare, hard(scene.views, wrong))
+    with pytest.raises(pt.InputError, match="if they are inverted"):
+        accept(bare, soft(scene.views, ~truth))
 
 
 def test_without_a_cloud_only_masks_are_compared(scene, truth):
-    bare, views = observing(scene, slice(0)), hard(scene.views, truth)
-    assert right_reading(bare.replace(views=views), views) is AS_THEY_ARE
-    views = hard(scene.views, truth[order((3, 11), (11, 3))])
-    with pytest.warns(pt.PimperWarning, match=r"exchanged between (03|11)\.png"):
-        reading = right_reading(bare.replace(views=views), views)
-    assert torch.equal(read(views, reading), truth)
+    bare = observing(scene, slice(0))
+    accept(bare, hard(scene.views, truth))
+    swapped = hard(scene.views, truth[order((3, 11), (11, 3))])
+    refuse(bare, swapped, r"exchanged between (03|11)\.png and (03|11)\.png", NAMED)
 
 
-def test_masks_of_an_object_that_fills_its_photographs_are_not_inverted(scene, truth):
+def test_masks_of_an_object_that_fills_its_photographs_are_accepted(scene, truth):
     """Its masks touch the borders; a cloud may have as many wrong points inside."""
     filling = hard(scene.views, torch.ones_like(truth))
     filling.masks[:, :9, :9] = False
-    assert right_reading(scene.replace(views=filling), filling) is AS_THEY_ARE
+    accept(scene, filling)
 
 
 @pytest.mark.parametrize("form", [hard, soft])
@@ -186,33 +179,32 @@ def test_masks_that_contradict_points_in_any_reading_are_rejected(scene, truth, 
     moved = [mask.roll((17 * view % 61, 23 * view % 83), (0, 1)) for view, mask in enumerate(truth)]
     views = form(scene.views, torch.stack(moved))
     with pytest.raises(pt.InputError, match=r"contradict [0-9]+% of the points in the median view"):
-        right_reading(scene.replace(views=views), views)
+        accept(scene, views)
 
 
-@pytest.mark.parametrize("turn", range(1, 9))
-def test_masks_are_rotated_like_photographs(turn):
-    masks = torch.rand(2, 5, 7, generator=torch.Generator().manual_seed(turn)) > 0.5
-    files = dict(zip("ab", masks, strict=True))
-    found = Reading(turns={"b": turn}).masks(files, files, torch.logical_not)
-    assert torch.equal(found["a"], masks[0])
-    assert torch.equal(found["b"], torch.from_numpy(rotated(masks[1].numpy(), turn)))
-
-
-def test_quarter_turns_of_square_masks_are_detected(scene, truth):
+@pytest.mark.parametrize(
+    ("turn", "upright", "cause"),
+    [
+        (5, 5, "mirrored and turned by a quarter turn"),
+        (8, 6, "turned by a quarter turn anticlockwise"),
+        (7, 7, "mirrored and turned by a quarter turn"),
+        (6, 8, "turned by a quarter turn clockwise"),
+    ],
+)
+def test_quarter_turns_of_square_masks_are_refused(scene, truth, turn, upright, cause):
     """Photographs are cropped to squares; their soft masks keep their size."""
     cut = slice((WIDTH - HEIGHT) // 2, (WIDTH + HEIGHT) // 2)
     sizes, cameras = torch.tensor([[HEIGHT, HEIGHT]] * VIEWS), scene.cameras
     intrinsics = cameras.intrinsics.clone()
     intrinsics[:, 0, 2] -= cut.start
-    upright = truth[:, :, cut]
+    masks = truth[:, :, cut]
     views = scene.views.replace(images=scene.views.images[..., cut], sizes_px=sizes)
-    views = soft(views, upright.mT.flip(1))
-    square = scene.replace(
-        views=views, cameras=cameras.replace(intrinsics=intrinsics, sizes_px=sizes)
-    )
-    with pytest.warns(pt.PimperWarning, match="turned by a quarter turn anticlockwise"):
-        reading = right_reading(square, views)
-    assert torch.equal(read(views, reading), upright)
+    files = [torch.from_numpy(rotated(mask.numpy(), turn)) for mask in masks]
+    restored = [torch.from_numpy(rotated(mask.numpy(), upright)) for mask in files]
+    assert torch.equal(torch.stack(restored), masks)
+    views = soft(views, torch.stack(files))
+    square = scene.replace(cameras=cameras.replace(intrinsics=intrinsics, sizes_px=sizes))
+    refuse(square, views, cause, UPRIGHT)
 
 
 class Placed(pt.Stage):
@@ -227,18 +219,15 @@ class Placed(pt.Stage):
         return self.scene.replace(views=views)
 
 
-def test_a_chain_recomputes_cameras_with_the_corrected_masks(scene, truth):
+def test_a_chain_refuses_wrong_masks_beside_photographs_and_beside_cameras(scene, truth):
     stage, views = Placed(scene), hard(scene.views, truth.flip(1, 2))
     chain = pt.CoarseToFine(reconstruct=stage)
-    with pytest.warns(pt.PimperWarning, match="half turn"):
-        placed = locate(chain, chain.running(), views)[0]
-    assert torch.equal(stage.asked[0].masks, views.masks)
-    assert torch.equal(stage.asked[1].masks, truth)
-    assert torch.equal(placed.views.masks, truth)
-    with pytest.warns(pt.PimperWarning, match="half turn"):
-        given = locate(chain, chain.running(), scene.replace(views=views))[0]
-    assert torch.equal(given.views.masks, truth)
-    assert len(stage.asked) == 2
+    for given in (views, scene.replace(views=views)):
+        with pytest.raises(pt.InputError, match="if they are turned by a half turn"):
+            locate(chain, chain.running(), given)
+    assert stage.asked == [views]
+    right = hard(scene.views, truth)
+    assert torch.equal(locate(chain, chain.running(), right)[0].views.masks, truth)
 
 
 def test_a_chain_without_silhouettes_ignores_masks(scene, truth):

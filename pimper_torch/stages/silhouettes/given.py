@@ -2,33 +2,35 @@
 
 If masks are correct, rays through the pixels of each mask meet a point that no mask excludes,
 points in one mask are in all of them, and views that observe any other point agree that it is
-outside. Files may show the object dark, be turned or mirrored, or belong to other photographs. Such
-a reading is chosen if it contradicts itself clearly less than the files as they are.
+outside. Files may show the object dark, be turned or mirrored, or belong to other photographs. They
+are refused if such a reading contradicts itself clearly less than the files as they are.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from heapq import nsmallest
 from itertools import combinations
 from operator import itemgetter
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from pimper_torch.geometry.mask_polarity import around_and_inside
+from pimper_torch.geometry.mask_polarity import Raster, around_and_inside
 from pimper_torch.geometry.opencv import area_resized, signed_distance
 from pimper_torch.geometry.pixels import grid_from_pixels, pixels_from_indices, scale_intrinsics
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.supporting_plane import well_tracked
 from pimper_torch.geometry.visual_hull import bounding_cube
-from pimper_torch.records import Cameras, SilhouettePrior, Silhouettes, SparseScene, Views
+from pimper_torch.records import Cameras, Silhouettes, SparseScene, Views
 from pimper_torch.records.shapes import Maps, Mask, PerView, ViewMask
 from pimper_torch.runtime.errors import InputError, caution
 from pimper_torch.runtime.mapped import by_view, zeros
 from pimper_torch.runtime.parallel import side_by_side
-from pimper_torch.stages.silhouettes.cues import points_at, soft_masks_of
+from pimper_torch.stages.silhouettes.cues import soft_masks_of
 
 # Longer side of the compared masks, number of points, and samples on each ray through their pixels:
 # choices.
@@ -42,7 +44,6 @@ _REFUSED = 0.5  # of the points in the masks of the median view; a choice
 # Most exchangeable masks, readings whose pixels are compared, and views for that: choices.
 _SUSPECTS, _TRIED, _VIEWS = 4, 4, 40
 
-Raster = Shaped[Tensor, "_ _"]
 Places = Bool[Tensor, "view other pixel place"]
 _TURNS = {
     2: "mirrored",
@@ -53,119 +54,63 @@ _TURNS = {
     7: "mirrored and turned by a quarter turn",
     8: "turned by a quarter turn clockwise",
 }
+_UPRIGHT = "masks that are oriented like the photographs. Turn or mirror the files accordingly."
+_NAMED = "masks named after the photographs that they show. Rename the files."
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """Interpretation of mask files.
+class _Reading(NamedTuple):
+    """Signed distances to small masks, by photograph; what the files are then; what is needed.
 
-    Attributes:
-        description: Property of the masks; completes the sentence "they are ...".
-        inverted: Whether they show the object dark.
-        turns: EXIF orientation that each photograph's mask lacks; none by default.
-        owners: Photograph whose file contains the mask of each photograph; itself by default.
+    ``bare`` is the fraction of contradicting points if its masks contain hardly any.
     """
 
-    description: str = ""
-    inverted: bool = False
-    turns: Mapping[str, int] = field(default_factory=dict)
-    owners: Mapping[str, str] = field(default_factory=dict)
-
-    def masks(
-        self, maps: Mapping[str, Raster], names: Iterable[str], inverse: Callable[[Raster], Raster]
-    ) -> dict[str, Raster]:
-        """Return the masks of photographs from unpadded maps, by file name."""
-        masks = {}
-        for name in names:
-            if (owner := self.owners.get(name, name)) in maps:
-                mask = _turned(maps[owner], self.turns.get(name, 1))
-                masks[name] = inverse(mask) if self.inverted else mask
-        return masks
-
-    def of(self, views: Views) -> Views:
-        """Return the photographs with masks and soft masks in this reading."""
-
-        def read(
-            names: Sequence[str],
-            sizes_px: Tensor,
-            maps: Tensor,
-            inverse: Callable[[Tensor], Tensor],
-        ) -> tuple[tuple[str, ...], Tensor, Tensor]:
-            files = {
-                name: padded[:high, :wide]
-                for name, padded, (wide, high) in zip(names, maps, sizes_px.tolist(), strict=True)
-            }
-            read_maps = self.masks(files, dict.fromkeys([*names, *views.names]), inverse)
-            shapes = [maps.shape[1:], *(x.shape for x in read_maps.values())]
-            size = [max(sides) for sides in zip(*shapes, strict=True)]
-            stack = zeros((len(read_maps), *size), maps.dtype, maps.device)
-            for into, x in zip(stack, read_maps.values(), strict=True):
-                into[: x.shape[0], : x.shape[1]] = x
-            return tuple(read_maps), stack, sizes_px.new_tensor([x[::-1] for x in shapes[1:]])
-
-        masks, priors = views.masks, list(views.priors)
-        if masks is not None:
-            _, masks, _ = read(views.names, views.sizes_px, masks, torch.logical_not)
-        for index, prior in enumerate(priors):
-            if not isinstance(prior, SilhouettePrior):
-                continue
-            sized = zip(prior.inside, prior.sizes_px.tolist(), strict=True)
-            if not all(points_at(padded[:high, :wide]) for padded, (wide, high) in sized):
-                result = read(prior.names, prior.sizes_px, prior.inside, lambda x: 1 - x)
-                names, inside, sizes = result
-                priors[index] = prior.replace(names=names, inside=inside, sizes_px=sizes)
-        return views.replace(masks=masks, priors=tuple(priors))
-
-
-AS_THEY_ARE = Reading()
+    borders: Mapping[str, Raster]
+    cause: str
+    needed: str
+    bare: float = 1.0
 
 
 def _turned(mask: Raster, turn: int) -> Raster:
-    """Return a map turned upright from an EXIF orientation."""
-    mask = mask.mT if turn >= 5 else mask
+    """Return a map turned upright from an EXIF orientation, or itself if its shape would change."""
+    turned = mask.mT if turn >= 5 else mask
     flipped = ((0, (3, 4, 7, 8)), (1, (2, 3, 6, 7)))
-    return mask.flip([axis for axis, turns in flipped if turn in turns])
+    fits = turned.shape == mask.shape
+    return turned.flip([axis for axis, turns in flipped if turn in turns]) if fits else mask
 
 
-def right_reading(scene: SparseScene, given: Views) -> Reading:
-    """Choose the reading of the masks, or else of the soft masks, of a scene.
+def refuse_wrong_masks(scene: SparseScene, names: Sequence[str]) -> None:
+    """Refuse the masks, or else the soft masks, of a scene that cameras and points contradict.
 
-    A warning is given if files show something other than their photographs, and if no point of the
-    cloud is in the silhouettes.
+    A warning is given if no point of the cloud is in the silhouettes.
 
     Args:
-        given: The photographs as loaded, including unregistered ones.
+        names: All photographs in their order, including unregistered ones.
 
     Raises:
-        InputError: Masks contradict the points in every reading.
+        InputError: The files are inverted, turned, mirrored, exchanged or shifted in the list, or
+            contradict the points in every reading.
     """
     evidence = _Evidence.of(scene)
     if evidence is None:
-        return AS_THEY_ARE
-    names = list(evidence.borders)
-    compared = names[:: math.ceil(len(names) / _VIEWS)]
-    pairs, (denied, involved) = evidence.of_points(), evidence.of_pixels(AS_THEY_ARE, compared)
-    share = evidence.share(pairs, AS_THEY_ARE)
+        return
+    share, by_view = evidence.of_points(evidence.borders)
+    denied, involved = evidence.of_pixels(evidence.borders)
     contradiction = (share + denied) / 2
     if contradiction < _LEAST:
-        return AS_THEY_ARE
-    by_view = pairs[:, 0] / pairs.sum(dim=1).clamp_min(1)
-    suspects = (by_view + involved).argsort(descending=True)[:_SUSPECTS].tolist()
-    suspect_names = [names[view] for view in suspects]
-    compared = list(dict.fromkeys([*compared, *suspect_names]))
+        return
+    worst = (by_view + involved).argsort(descending=True)[:_SUSPECTS].tolist()
+    suspects = [list(evidence.borders)[view] for view in worst]
     most = min(_CLEARLY * contradiction, _MOST)
-    readings = evidence.readings(given, suspect_names, ordered=scene.views.poses is None)
-    rated = [(evidence.share(evidence.of_points(r, compared), r) / 2, r) for r in readings]
-    likely = sorted((pair for pair in rated if pair[0] <= most), key=itemgetter(0))[:_TRIED]
-    totals = [(half + evidence.of_pixels(r, compared)[0] / 2, r) for half, r in likely]
-    best, reading = min(totals, key=itemgetter(0), default=(math.inf, AS_THEY_ARE))
-    if best <= most:
-        caution(
+    readings = evidence.readings(scene.views, names, suspects)
+    rated = ((evidence.of_points(one.borders, one.bare)[0] / 2, one) for one in readings)
+    likely = nsmallest(_TRIED, (pair for pair in rated if pair[0] <= most), key=itemgetter(0))
+    totals = [(half + evidence.of_pixels(one.borders)[0] / 2, one) for half, one in likely]
+    best, reading = min(totals, key=itemgetter(0), default=(math.inf, None))
+    if reading is not None and best <= most:
+        raise InputError(
             f"The masks contradict cameras and points by {contradiction:.1%}, but by {best:.1%} if "
-            f"they are {reading.description}, so they are read like that. Correct the files.",
-            stacklevel=3,
+            f"they are {reading.cause}. Needed: {reading.needed}"
         )
-        return reading
     refused = float(by_view.median())
     if refused > _REFUSED and denied > _IN_CONFLICT:
         raise InputError(
@@ -180,7 +125,6 @@ def right_reading(scene: SparseScene, given: Views) -> Reading:
             "object has no texture; otherwise check that the masks show it.",
             stacklevel=3,
         )
-    return AS_THEY_ARE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,86 +179,72 @@ class _Evidence:
             observed=scene.observed.cpu()[sampled].mT[chosen] & in_frame,
         )
 
-    def readings(self, views: Views, swapped: Sequence[str], *, ordered: bool) -> Iterator[Reading]:
-        """List possible readings of the files other than the photographs' own masks.
-
-        Args:
-            swapped: Photographs, two of which may have each other's masks.
-            ordered: Whether photographs may have masks of other ones.
-        """
-        names = views.names
-        around, inside = around_and_inside(list(self.borders.values()))
+    def readings(
+        self, views: Views, names: Sequence[str], suspects: Sequence[str]
+    ) -> Iterator[_Reading]:
+        """List possible readings of the files; two of the suspects may have each other's masks."""
+        files = self.borders
+        around, inside = around_and_inside(list(files.values()))
         # An object that fills its photographs covers their middle.
         if inside < 0.75 < around:
-            yield Reading(description="inverted", inverted=True)
-        same_size = ordered and bool((views.sizes_px == views.sizes_px[0]).all())
-        for first, second in combinations(swapped, 2) if same_size else ():
-            description = f"exchanged between {first} and {second}"
-            yield Reading(description=description, owners={first: second, second: first})
-        square = bool((views.sizes_px[:, 0] == views.sizes_px[:, 1]).all())
-        for turn, description in _TURNS.items():
-            if turn < 5 or square:
-                yield Reading(description=description, turns=dict.fromkeys(names, turn))
+            option = "" if views.masks is None else ", or give `--mask-object dark`"
+            needed = f"masks that are bright at the object. Invert the files{option}."
+            inverted = {name: -mask for name, mask in files.items()}
+            # An object without texture has no points.
+            yield _Reading(inverted, "inverted: they show the object dark", needed, bare=_MOST)
+        ordered = views.poses is None
+        for first, second in combinations(suspects, 2) if ordered else ():
+            swapped = {**files, first: files[second], second: files[first]}
+            yield _Reading(swapped, f"exchanged between {first} and {second}", _NAMED)
+        turns = [(dict.fromkeys(files, turn), cause) for turn, cause in _TURNS.items()]
         if views.orientations is not None:
-            exif = zip(names, views.orientations.tolist(), strict=True)
-            turns = {name: turn for name, turn in exif if turn < 5 or square}
-            yield Reading(description="in the stored orientation, not turned by EXIF", turns=turns)
-        for step in range(1, len(names)) if same_size else ():
-            owners = dict(zip(names, (*names[step:], *names[:step]), strict=True))
-            description = f"shifted by {step} in the list ({names[0]} has that of {names[step]})"
-            yield Reading(description=description, owners=owners)
+            exif = dict(zip(views.names, views.orientations.tolist(), strict=True))
+            turns.append((exif, "in the stored orientation, not turned by EXIF"))
+        for turn, cause in turns:
+            turned = {name: _turned(mask, turn[name]) for name, mask in files.items()}
+            yield _Reading(turned, cause, _UPRIGHT)
+        for step in range(1, len(names)) if ordered else ():
+            owners = zip(names, (*names[step:], *names[:step]), strict=True)
+            shifted = {x: files[owner] for x, owner in owners if x in files and owner in files}
+            cause = f"shifted by {step} in the list ({names[0]} has that of {names[step]})"
+            if 2 * len(shifted) > len(files):
+                yield _Reading(shifted, cause, _NAMED)
 
-    def read(self, reading: Reading, names: Iterable[str]) -> tuple[list[int], Maps]:
-        """Return the named views that have a mask in the reading, and signed distances to it."""
-        masks = reading.masks(self.borders, names, torch.neg)
+    def padded(self, borders: Mapping[str, Raster]) -> tuple[list[int], Maps]:
+        """Return the positions of the named views, and their signed distances as one raster."""
         high, wide = self.cameras.sizes_px.amax(dim=0).flip(0).tolist()
-        maps = torch.full((len(masks), high, wide), -1e3)
-        for into, x in zip(maps, masks.values(), strict=True):
+        maps = torch.full((len(borders), high, wide), -1e3)
+        for into, x in zip(maps, borders.values(), strict=True):
             into[: x.shape[0], : x.shape[1]] = x
-        all_names = list(self.borders)
-        return [all_names.index(name) for name in masks], maps
+        known = list(self.borders)
+        return [known.index(name) for name in borders], maps
 
-    def of_points(
-        self, reading: Reading = AS_THEY_ARE, names: Sequence[str] = ()
-    ) -> Int[Tensor, "view 2"]:
-        """Count, in each view, points that contradict a reading and points that confirm it.
+    def of_points(self, borders: Mapping[str, Raster], bare: float = 1.0) -> tuple[float, PerView]:
+        """Return the fraction of pairs of points and views that contradict masks, also by view.
 
         A point inside most masks of the views that observe it must be inside in all views, any
-        other one outside in all that observe it. The margin allows for masks drawn by hand.
+        other one outside in all that observe it. The margin allows for masks drawn by hand. A cloud
+        with hardly any observed point contradicts nothing.
 
         Args:
-            names: Of the compared views; all by default.
+            bare: Fraction if masks contain hardly any point.
         """
-        views, maps = self.read(reading, names or self.borders)
+        views, maps = self.padded(borders)
         column, row = self.pixels[views].unbind(dim=-1)
         value = maps[torch.arange(len(views))[:, None], row, column]
         seen, framed = self.observed[views], self.in_frame[views]
         margin = 0.01 * max(maps.shape[1:])
         inside = 2 * (seen & (value > 0)).sum(dim=0) > seen.sum(dim=0)
         contradicts = (framed & inside & (value < -margin)) | (seen & ~inside & (value > margin))
-        confirms = framed & inside & (value >= -margin)
-        return torch.stack([contradicts.sum(dim=1), confirms.sum(dim=1)], dim=1)
+        wrong = contradicts.sum(dim=1)
+        pairs = wrong + (framed & inside & (value >= -margin)).sum(dim=1)
+        share = bare if pairs.sum() < _FEWEST else float(wrong.sum() / pairs.sum())
+        return share if self.observed.sum() >= _FEWEST else 0.0, wrong / pairs.clamp_min(1)
 
-    def share(self, pairs: Int[Tensor, "view 2"], reading: Reading) -> float:
-        """Return the fraction of contradicting pairs; 1 if hardly any point is in the masks.
-
-        Inverted masks need not contain points, as an object without texture has none. A cloud with
-        hardly any observed point contradicts nothing.
-        """
-        contradicting, total = int(pairs[:, 0].sum()), int(pairs.sum())
-        if int(self.observed.sum()) < _FEWEST:
-            return 0.0
-        if total < _FEWEST:
-            return _MOST if reading.inverted else 1.0
-        return contradicting / total
-
-    def of_pixels(self, reading: Reading, names: Sequence[str]) -> tuple[float, PerView]:
-        """Return the fraction of the masks' pixels in conflict, and each view's involvement.
-
-        Args:
-            names: Of the compared views.
-        """
-        views, maps = self.read(reading, names)
+    def of_pixels(self, borders: Mapping[str, Raster]) -> tuple[float, PerView]:
+        """Return the fraction of masks' pixels in conflict, and each view's involvement."""
+        some = list(borders)[:: math.ceil(len(borders) / _VIEWS)]
+        views, maps = self.padded({name: borders[name] for name in some})
         involved = torch.zeros(len(self.borders))
         samples = _denied(maps, self.cameras.take(views), 40)
         if samples is None:
@@ -369,7 +299,7 @@ def contradictory(scene: SparseScene) -> ViewMask:
     evidence = _Evidence.of(scene)
     if evidence is None:
         return rejected
-    _, maps = evidence.read(AS_THEY_ARE, evidence.borders)
+    _, maps = evidence.padded(evidence.borders)
     samples = _denied(maps, evidence.cameras, 100)
     if samples is None:
         return rejected
