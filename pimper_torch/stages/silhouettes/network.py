@@ -48,6 +48,8 @@ class SilhouetteNetwork(nn.Module):
         widths: Channels of every level; all must be multiples of 8.
     """
 
+    calibration: Float[Tensor, "2"]
+
     def __init__(self, maps: int = len(MAPS), widths: tuple[int, ...] = WIDTHS) -> None:
         super().__init__()
         self.enter = nn.Conv2d(4 * maps, widths[0], 1)
@@ -79,7 +81,7 @@ def load_network(path: Path | str = _WEIGHTS) -> SilhouetteNetwork:
     """Load a trained network for inference, by default the package's own."""
     network = SilhouetteNetwork()
     network.load_state_dict({name: value.float() for name, value in load_file(path).items()})
-    return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)
+    return network.eval().requires_grad_(False)
 
 
 @torch.no_grad()
