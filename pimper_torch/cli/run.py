@@ -74,7 +74,7 @@ def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
         forecast.plan = _plan(job, views)
         chain = make_chain(job.config, table.observer, store)
-        chain.needed = tuple(given.measured_in(job.inputs.bars, job.inputs.distances))
+        chain.needed = tuple(given.measured_in(job.inputs.scale_bar, job.inputs.camera_distance))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
         chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
@@ -220,7 +220,7 @@ def bars_in_files(job: Job, views: Views) -> tuple[given.ScaleBar, ...]:
     """Return the scale bars with marks as from :func:`in_files`."""
     return tuple(
         replace(bar, first=in_files(job, views, bar.first), second=in_files(job, views, bar.second))
-        for bar in job.inputs.bars
+        for bar in job.inputs.scale_bar
     )
 
 
@@ -232,7 +232,7 @@ def sized(
     scale = find_scale(
         result,
         bars=bars,
-        camera_distances=inputs.distances,
+        camera_distances=inputs.camera_distance,
         markers=inputs.markers,
         unit=inputs.unit,
         own_frame=inputs.sparse is not None,

@@ -87,6 +87,11 @@ class ScaleBar:
     def __post_init__(self) -> None:
         _require_length(self.length, f"{self.first} to {self.second}")
 
+    @classmethod
+    def read(cls, first: str, second: str, length: str) -> "ScaleBar":
+        """Parse two marks and a length."""
+        return cls(first=Mark.read(first), second=Mark.read(second), length=float(length))
+
     @property
     def ends(self) -> tuple[Mark, Mark]:
         """Both end points."""
@@ -108,6 +113,11 @@ class CameraDistance:
 
     def __post_init__(self) -> None:
         _require_length(self.length, f"{self.first} to {self.second}")
+
+    @classmethod
+    def read(cls, first: str, second: str, length: str) -> "CameraDistance":
+        """Parse two names and a length."""
+        return cls(first=first, second=second, length=float(length))
 
 
 def measured_in(bars: Sequence[ScaleBar], distances: Sequence[CameraDistance]) -> dict[str, None]:
