@@ -12,7 +12,6 @@ import typing
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass
-from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -197,19 +196,11 @@ def _paragraph(message: str, name: str, options: Sequence[Option], arguments: Se
     invalid = re.match(r"Error parsing (?:-\w/)?(--[\w.-]+)", text)
     for option in options if invalid else ():
         if invalid and invalid[1] in option.names:  # tyro's text names Python types
-            text = f"{invalid[1]} is {_given(invalid[1], arguments)}; needed: {option.value}. "
+            spelt = "|".join(option.names).replace("-", "[-_]")
+            found = re.search(rf"(?:{spelt})[ =](.*?)(?= --|$)", " ".join(arguments))
+            text = f"{invalid[1]} is {found and found[1]!r}; needed: {option.value}. "
             text += option.meaning
     return f"{text} See `pimper {name} --help`."
-
-
-def _given(option: str, arguments: Sequence[str]) -> str:
-    """Return the value of an option as it was typed."""
-    for index, argument in enumerate(arguments):
-        name, equals, value = argument.partition("=")
-        if name.replace("_", "-") == option:
-            values = takewhile(lambda word: not word.startswith("--"), arguments[index + 1 :])
-            return repr(value if equals else " ".join(values))
-    return "something else"
 
 
 def page(name: str, about: str, options: Sequence[Option], listed: Sequence[Option]) -> str:

@@ -8,7 +8,6 @@ interrupted, 143 terminated; 1 anything unexpected, which is a bug of the packag
 """
 
 import ctypes
-import difflib
 import errno
 import gc
 import io
@@ -29,6 +28,7 @@ from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
 from pimper_torch.export.result_folder.files import require_name
 from pimper_torch.io.version import versions
+from pimper_torch.runtime.config import nearest
 from pimper_torch.runtime.cores import usable_cores
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperError, PimperWarning
 
@@ -180,9 +180,7 @@ def _no_command(name: str) -> str:
             f"`pimper {name}` comes with pimper-bench, which is not installed. Run `pip install "
             "./benchmarks` in a clone of the repository."
         )
-    near = difflib.get_close_matches(name, commands(), n=1)
-    hint = f" Did you mean `{near[0]}`?" if near else ""
-    return f"there is no command `{name}`.{hint} See `pimper --help`."
+    return f"there is no command `{name}`.{nearest(name, [*commands()])} See `pimper --help`."
 
 
 def _run(command: str, name: str, arguments: list[str], output: Output) -> None:

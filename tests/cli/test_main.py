@@ -132,7 +132,7 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
         (["--sede", "3"], "Unrecognized options: --sede, 3"),
         (["--reconstruct.starts", "many"], "--reconstruct.starts is 'many'; needed: INT."),
         (["--log-level", "loud"], "--log-level is 'loud'; needed: one of error"),
-        (["--log-level"], "--log-level is nothing"),
+        (["--log-level"], "--log-level is ''; needed: one of error"),
     ],
 )
 def test_a_user_error_is_one_message(reconstruct, chain, tmp_path, capsys, arguments, expected):
