@@ -14,7 +14,7 @@ from pimper_torch.runtime.config import require
 
 if TYPE_CHECKING:
     from pimper_torch.cli.doctor.forecast import Forecast
-    from pimper_torch.runtime.reporting import Observer, RunTable
+    from pimper_torch.runtime.reporting import RunTable
 
 Level = Literal["error", "warning", "info", "debug"]
 _LEVELS: tuple[Level, ...] = get_args(Level)
@@ -92,29 +92,25 @@ class Output:
         print_message("error", message)
 
     @contextmanager
-    def observer(self, forecast: "Forecast | None" = None) -> Iterator["RunTable"]:
+    def observer(self) -> Iterator[tuple["Forecast", "RunTable"]]:
         """Display the stages of the ``with`` block: a bar or a line per stage, or events.
 
-        Args:
-            forecast: Estimates the time left.
-
         Yields:
-            The reports of the stages, and their observer.
+            The observer of the stages, which estimates the time left, and their reports.
         """
         from rich.console import Console
 
         from pimper_torch.cli.bars import Bars, Events
         from pimper_torch.cli.doctor.forecast import Forecast
-        from pimper_torch.runtime.reporting import SilentObserver, observed
+        from pimper_torch.runtime.reporting import observed
 
-        forecast = forecast or Forecast()
-        display: AbstractContextManager[Observer] = nullcontext(SilentObserver())
+        display: AbstractContextManager[Forecast] = nullcontext(Forecast())
         if self.as_json:
-            display = nullcontext(Events(self.event, 0.5, forecast))
+            display = nullcontext(Events(self.event, 0.5))
         elif self.shows("info"):
-            display = Bars(Console(stderr=True), forecast, None if self.shows("debug") else 3)
+            display = Bars(Console(stderr=True), None if self.shows("debug") else 3)
         with display as observer, observed(observer) as table:
-            yield table
+            yield observer, table
 
 
 def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:

@@ -12,7 +12,6 @@ import torch
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.doctor.checks import examine_views
 from pimper_torch.cli.doctor.cost import planned
-from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.cli.options import Job
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.view import print_address
@@ -61,19 +60,19 @@ def carry_out(job: Job, output: Output) -> None:
 def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
     common = job.common
     imports = stage_report("import", time.perf_counter() - output.began)
-    lock, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
+    lock = held_output(job.out, "result", overwrite=common.overwrite)
     folder, limit = common.cache or job.out / STAGES, bytes_of(common.max_kept)
     store = Store(folder=folder, max_bytes=limit, fresh=common.fresh)
     warned = collected(Caution, passed_on=True)
-    with lock, output.observer(forecast) as table, warned as cautions:
+    with lock, output.observer() as (observer, table), warned as cautions:
         with stage("read") as figures:
             views = _read(job, store)
             figures["photographs"] = views.num_views
             _examine(job, views)
             bars = bars_in_files(job, views)
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
-        forecast.plan = _plan(job, views)
-        chain = make_chain(job.config, table.observer, store)
+        observer.plan = _plan(job, views)
+        chain = make_chain(job.config, observer, store)
         chain.needed = tuple(given.measured_in(job.inputs.scale_bar, job.inputs.camera_distance))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
         chain.watch = None if viewer is None else partial(add_found, viewer)

@@ -239,18 +239,13 @@ class _OnceLoader(yaml.SafeLoader):
     def construct_mapping(
         self, node: yaml.MappingNode, deep: bool = False
     ) -> dict[Hashable, object]:
-        keys: set[str] = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
+        keys = [key.value for key, _ in node.value]
+        for index, key in enumerate(keys):
+            if key in keys[:index]:
                 raise yaml.constructor.ConstructorError(
-                    problem="a key is a list or a section; needed: a name",
-                    problem_mark=key.start_mark,
+                    problem=f"the key `{key}` occurs twice",
+                    problem_mark=node.value[index][0].start_mark,
                 )
-            if key.value in keys:
-                raise yaml.constructor.ConstructorError(
-                    problem=f"the key `{key.value}` occurs twice", problem_mark=key.start_mark
-                )
-            keys.add(key.value)
         return super().construct_mapping(node, deep)
 
 
