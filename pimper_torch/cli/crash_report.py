@@ -10,6 +10,11 @@ from pathlib import Path
 
 from pimper_torch.io.version import versions
 
+SHRINK = (
+    "Shrink the photographs (`--max-size-px`), close other programs, or set a limit that is "
+    "checked early (`--max-memory`)."
+)
+
 
 def what_killed(ended: int) -> str:
     """Return a sentence about a process that ended without a message.

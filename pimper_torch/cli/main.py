@@ -23,7 +23,7 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from typing import Any
 
-from pimper_torch.cli.crash_report import write_report
+from pimper_torch.cli.crash_report import SHRINK, write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
 from pimper_torch.export.result_folder.files import require_name
@@ -251,10 +251,7 @@ def _failed(output: Output, error: BaseException) -> int:
 def _system_advice(error: BaseException) -> str | None:
     """Return advice for an error that is not a bug of the package; ``None`` for any other."""
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-        return (
-            "memory ran out; no result was written. Shrink the photographs (`--max-size-px`), "
-            "close other programs, or set a limit that is checked early (`--max-memory`)."
-        )
+        return f"memory ran out; no result was written. {SHRINK}"
     if isinstance(error, OSError) and error.errno in _REFUSALS:
         path = "" if error.filename is None else f"{error.filename}: "
         advice = " Free space." if error.errno in _FULL else ""

@@ -19,10 +19,6 @@ from contextlib import suppress
 from pimper_torch.cli.stopping import SIGNALS
 from pimper_torch.runtime.scratch import remove_scratch
 
-_SHRINK = (
-    "Shrink the photographs (`--max-size-px`), close other programs, or set a limit that is "
-    "checked early (`--max-memory`)."
-)
 _CONTINUES = "No result was written; the same command continues after the last finished stage."
 # Chosen so that every command ends within five seconds of SIGTERM.
 _PATIENCE_SECONDS = 4.0
@@ -74,7 +70,7 @@ def main() -> int:
     ended = os.waitstatus_to_exitcode(status)
     if ended >= 0:
         return ended
-    from pimper_torch.cli.crash_report import what_killed
+    from pimper_torch.cli.crash_report import SHRINK, what_killed
     from pimper_torch.cli.output import Output
 
     remove_scratch()
@@ -85,7 +81,7 @@ def main() -> int:
             "Interrupted", f"killed, as it did not stop in time. {_CONTINUES}", 128 - ended
         )
     else:
-        output.error("Killed", f"{what_killed(ended)} {_SHRINK} {_CONTINUES}", 128 - ended)
+        output.error("Killed", f"{what_killed(ended)} {SHRINK} {_CONTINUES}", 128 - ended)
     return 128 - ended
 
 
