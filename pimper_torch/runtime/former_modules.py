@@ -62,25 +62,19 @@ class FormerModules(MetaPathFinder, Loader):
         """Return how to load a module with a former path; ``None`` for others."""
         package, _, former = name.partition(".")
         present = present_path(former) if package == "pimper_torch" else None
-        if present is None:
-            return None
-        if former in ("doors", "ground", "method", "result"):
-            return ModuleSpec(name, self, is_package=True)
-        return ModuleSpec(name, self, loader_state=f"{package}.{present}")
+        present_name = f"{package}.{present}".removesuffix(".")
+        return None if present is None else ModuleSpec(name, self, loader_state=present_name)
 
-    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        """Import the present module; a folder that only held others is a new module."""
-        if spec.loader_state is None:
-            return None
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """Import the present module."""
         present = import_module(renamed(spec.name, spec.loader_state))
         spec.loader_state = present.__spec__
         return present
 
     def exec_module(self, module: ModuleType) -> None:
         """Restore the specification of the present module."""
-        spec = module.__spec__
-        if spec is not None and spec.loader_state is not None:
-            module.__spec__ = spec.loader_state
+        if module.__spec__ is not None:
+            module.__spec__ = module.__spec__.loader_state
 
 
 def install() -> None:
