@@ -318,7 +318,7 @@ def check(job: Job) -> Job:
         view_named(name, present)
     marked = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
     for name in (*given.measured_in(job.inputs.scale_bar, job.inputs.camera_distance), *marked):
-        given.number_of(name, present)
+        view_named(name, present)
     return job
 
 

@@ -31,6 +31,7 @@ from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene,
 from pimper_torch.runtime.config import bytes_of
 from pimper_torch.runtime.errors import ConfigError, caution
 from pimper_torch.runtime.events import Caution
+from pimper_torch.runtime.file_names import view_named
 from pimper_torch.runtime.ledger import closing_line
 from pimper_torch.runtime.reporting import stage, stage_report
 from pimper_torch.runtime.stream import collected
@@ -208,7 +209,7 @@ def in_files(job: Job, views: Views, mark: given.Mark) -> given.Mark:
     paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
     def sized_pointer(pointer: given.PixelMark) -> given.PixelMark:
-        header = read_header(paths[views.names[given.number_of(pointer.name, views.names)]])
+        header = read_header(paths[views.names[view_named(pointer.name, views.names)]])
         given.require_inside(pointer, header.width, header.height)
         return replace(pointer, size_px=(header.width, header.height))
 
