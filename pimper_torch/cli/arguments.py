@@ -68,7 +68,7 @@ def options_of(
         between: Separator of the values of one option.
         path: Prefix of the names of a settings object's fields.
     """
-    settings = _is_settings(command)
+    settings = dataclasses.is_dataclass(command) and not isinstance(command, type)
     documented: Any = type(command) if settings else command
     texts, hints = meanings(documented), typing.get_type_hints(documented, include_extras=True)
     for parameter in inspect.signature(documented).parameters.values():
@@ -78,7 +78,7 @@ def options_of(
         spec = next((mark for mark in marks if hasattr(mark, "aliases")), None)
         name = parameter.name if spec is None or spec.name is None else spec.name
         meaning = texts.get(parameter.name, "")
-        if _is_settings(default):
+        if dataclasses.is_dataclass(default):
             inner = f"{path}{name}." if name else path
             title = f"{inner[:-1]}: {summary(kind)}" if inner else meaning.lower()
             yield from options_of(default, between, title.rstrip(".") or "arguments", inner)
@@ -92,10 +92,6 @@ def options_of(
         if _POSITIONAL in marks:
             names, value = ((value if default is REQUIRED else f"[{value}]"),), ""
         yield Option(section=section, names=names, value=value, meaning=meaning, default=default)
-
-
-def _is_settings(value: object) -> bool:
-    return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
 def meanings(documented: object) -> dict[str, str]:
@@ -162,8 +158,8 @@ def read_arguments(
         ConfigError: Unknown or invalid arguments.
         SystemExit: After the help page.
     """
+    options = list(options_of(command, "," if levels else " "))
     if {"-h", "--help", "--help-all"} & {*arguments}:
-        options = list(options_of(command, "," if levels else " "))
         everything = "--help-all" in arguments
         listed = [
             option
@@ -182,7 +178,6 @@ def read_arguments(
                 config=(LEVELS,) if levels else (),
             )
     except SystemExit:
-        options = list(options_of(command, "," if levels else " "))
         raise ConfigError(_paragraph(message.getvalue(), name, options, arguments)) from None
 
 
