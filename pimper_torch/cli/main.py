@@ -12,20 +12,24 @@ import errno
 import gc
 import io
 import os
+import shlex
 import signal
 import sys
+import tempfile
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
-from pimper_torch.cli.crash_report import SHRINK, write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
+from pimper_torch.cli.supervise import SHRINK
 from pimper_torch.export.result_folder.files import require_name
 from pimper_torch.io.version import versions
 from pimper_torch.runtime.config import nearest
@@ -237,7 +241,7 @@ def _failed(output: Output, error: BaseException) -> int:
         kind = "MemoryError" if "can't allocate memory" in str(error) else kind
         output.error(kind, expected + notes, _BAD_INPUT)
         return _BAD_INPUT
-    report = write_report(error)
+    report = _write_report(error)
     if report is None:
         traceback.print_exception(error)
     text = (
@@ -246,6 +250,24 @@ def _failed(output: Output, error: BaseException) -> int:
     )
     output.error(kind, text, _UNEXPECTED)
     return _UNEXPECTED
+
+
+def _write_report(error: BaseException) -> Path | None:
+    """Write the traceback of an error to a file for bug reports, with versions and arguments.
+
+    Returns:
+        The file; ``None`` if it cannot be written.
+    """
+    lines = [f"{name} {version}" for name, version in versions().items()]
+    lines += [f"at {datetime.now(UTC).isoformat(' ', 'seconds')}", shlex.join(sys.argv), ""]
+    try:
+        with tempfile.NamedTemporaryFile(
+            *("w", -1, "utf-8"), prefix="pimper-", suffix=".txt", delete=False, errors="replace"
+        ) as file:
+            file.write("\n".join([*lines, *traceback.format_exception(error)]))
+    except OSError:
+        return None
+    return Path(file.name)
 
 
 def _system_advice(error: BaseException) -> str | None:
