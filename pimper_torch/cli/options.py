@@ -205,11 +205,9 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
     _refuse_others(command, arguments, name)
     verb = _command(command, load_config(name))
     job = read_arguments(verb, command, arguments, levels=True, rare=_RARE)
-    silhouettes = job.config.silhouettes
-    if job.inputs.object:
-        silhouettes = dataclasses.replace(silhouettes, object=job.inputs.object)
-    if job.inputs.region:
-        silhouettes = dataclasses.replace(silhouettes, region=tuple(map(float, job.inputs.region)))
+    shortcuts = {"object": job.inputs.object, "region": tuple(map(float, job.inputs.region))}
+    changes: dict[str, Any] = {name: value for name, value in shortcuts.items() if value}
+    silhouettes = dataclasses.replace(job.config.silhouettes, **changes)
     config = dataclasses.replace(job.config, silhouettes=silhouettes)
     if reference := job.common.reference:
         surface = dataclasses.replace(config.coarse_surface, reference=reference)
@@ -314,10 +312,9 @@ def check(job: Job) -> Job:
     references = [job.config.coarse_surface.reference]
     if isinstance(job.config, PublishedConfig):
         references.append(job.config.triangulate.reference)
-    for name in filter(None, references):
-        view_named(name, present)
     marked = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
-    for name in (*given.measured_in(job.inputs.scale_bar, job.inputs.camera_distance), *marked):
+    measured = given.measured_in(job.inputs.scale_bar, job.inputs.camera_distance)
+    for name in (*filter(None, references), *measured, *marked):
         view_named(name, present)
     return job
 
