@@ -154,7 +154,7 @@ def test_installed_presets_take_precedence_over_a_checkout(tmp_path, monkeypatch
         (b"a: &a [x, x]\nb: *a\n", "aliases .* are not supported"),
         (b"a: " + b"[" * 100_000, "nested too deeply"),
         (b"a: " + b"9" * 5000, "contains an invalid value"),
-        (b"? [a, b]\n: 1\n", "a key is a list or a section"),
+        (b"? [a, b]\n: 1\n", "found unhashable key"),
         (b"a: 2001-99-99\n", "contains an invalid value"),
         (b"# " + b"x" * 1_000_000, "1000002 bytes; needed: a YAML file with settings"),
     ],

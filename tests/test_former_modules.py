@@ -15,7 +15,7 @@ MOVED = [
 @pytest.mark.parametrize("former", MOVED)
 def test_a_former_path_is_the_present_module_and_warns(former):
     name = f"pimper_torch.{former}"
-    present = importlib.import_module(f"pimper_torch.{present_path(former)}")
+    present = importlib.import_module(f"pimper_torch.{present_path(former)}".removesuffix("."))
     spec = present.__spec__
     sys.modules.pop(name, None)
     with pytest.warns(DeprecationWarning, match=f"`{name}` is now `{present.__name__}`"):

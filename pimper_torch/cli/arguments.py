@@ -12,7 +12,6 @@ import typing
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass
-from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -69,7 +68,7 @@ def options_of(
         between: Separator of the values of one option.
         path: Prefix of the names of a settings object's fields.
     """
-    settings = _is_settings(command)
+    settings = dataclasses.is_dataclass(command) and not isinstance(command, type)
     documented: Any = type(command) if settings else command
     texts, hints = meanings(documented), typing.get_type_hints(documented, include_extras=True)
     for parameter in inspect.signature(documented).parameters.values():
@@ -79,7 +78,7 @@ def options_of(
         spec = next((mark for mark in marks if hasattr(mark, "aliases")), None)
         name = parameter.name if spec is None or spec.name is None else spec.name
         meaning = texts.get(parameter.name, "")
-        if _is_settings(default):
+        if dataclasses.is_dataclass(default):
             inner = f"{path}{name}." if name else path
             title = f"{inner[:-1]}: {summary(kind)}" if inner else meaning.lower()
             yield from options_of(default, between, title.rstrip(".") or "arguments", inner)
@@ -93,10 +92,6 @@ def options_of(
         if _POSITIONAL in marks:
             names, value = ((value if default is REQUIRED else f"[{value}]"),), ""
         yield Option(section=section, names=names, value=value, meaning=meaning, default=default)
-
-
-def _is_settings(value: object) -> bool:
-    return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
 def meanings(documented: object) -> dict[str, str]:
@@ -163,8 +158,8 @@ def read_arguments(
         ConfigError: Unknown or invalid arguments.
         SystemExit: After the help page.
     """
+    options = list(options_of(command, "," if levels else " "))
     if {"-h", "--help", "--help-all"} & {*arguments}:
-        options = list(options_of(command, "," if levels else " "))
         everything = "--help-all" in arguments
         listed = [
             option
@@ -183,7 +178,6 @@ def read_arguments(
                 config=(LEVELS,) if levels else (),
             )
     except SystemExit:
-        options = list(options_of(command, "," if levels else " "))
         raise ConfigError(_paragraph(message.getvalue(), name, options, arguments)) from None
 
 
@@ -197,19 +191,11 @@ def _paragraph(message: str, name: str, options: Sequence[Option], arguments: Se
     invalid = re.match(r"Error parsing (?:-\w/)?(--[\w.-]+)", text)
     for option in options if invalid else ():
         if invalid and invalid[1] in option.names:  # tyro's text names Python types
-            text = f"{invalid[1]} is {_given(invalid[1], arguments)}; needed: {option.value}. "
+            spelt = "|".join(option.names).replace("-", "[-_]")
+            found = re.search(rf"(?:{spelt})[ =](.*?)(?= --|$)", " ".join(arguments))
+            text = f"{invalid[1]} is {found and found[1]!r}; needed: {option.value}. "
             text += option.meaning
     return f"{text} See `pimper {name} --help`."
-
-
-def _given(option: str, arguments: Sequence[str]) -> str:
-    """Return the value of an option as it was typed."""
-    for index, argument in enumerate(arguments):
-        name, equals, value = argument.partition("=")
-        if name.replace("_", "-") == option:
-            values = takewhile(lambda word: not word.startswith("--"), arguments[index + 1 :])
-            return repr(value if equals else " ".join(values))
-    return "something else"
 
 
 def page(name: str, about: str, options: Sequence[Option], listed: Sequence[Option]) -> str:

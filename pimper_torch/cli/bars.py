@@ -11,7 +11,7 @@ from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.records import StageReport
 
 
-class Bars:
+class Bars(Forecast):
     """Observer that displays a bar for every stage, and the time left for the run.
 
     Without a terminal, it writes a line at the end of each stage, and per tenth of a long one.
@@ -21,10 +21,9 @@ class Bars:
         seconds: Minimum time between lines within a stage; chosen by hand.
     """
 
-    def __init__(
-        self, console: Console, forecast: Forecast, figures: int | None = 3, seconds: float = 10.0
-    ) -> None:
-        self.console, self._forecast = console, forecast
+    def __init__(self, console: Console, figures: int | None = 3, seconds: float = 10.0) -> None:
+        super().__init__()
+        self.console = console
         self._most, self._seconds = figures, seconds
         self._tenths, self._last = 0, 0.0
         self._progress = progress.Progress(
@@ -47,7 +46,7 @@ class Bars:
 
     def started(self, stage: str) -> None:
         """Start a bar; it pulses until the stage reports progress."""
-        self._forecast.started(stage)
+        super().started(stage)
         self._tenths, self._last = 0, time.perf_counter()
         self._task = self._progress.add_task(stage, total=None, text=self._left())
 
@@ -55,7 +54,7 @@ class Bars:
         """Advance the bar, or write a line."""
         if self._task is None:
             return
-        self._forecast.progressed(done, total)
+        super().progressed(done, total)
         self._progress.update(self._task, completed=done, total=total, text=self._left())
         tenths, now = 10 * done // total, time.perf_counter()
         if self._tenths < tenths < 10 and now - self._last >= self._seconds:
@@ -64,7 +63,7 @@ class Bars:
 
     def finished(self, report: StageReport) -> None:
         """Complete the bar, and display figures of the stage."""
-        self._forecast.finished(report)
+        super().finished(report)
         figures = list(report.figures.items())[: self._most]
         text = ", ".join(f"{name.replace('_', ' ')} {_short(value)}" for name, value in figures)
         if self._task is not None:
@@ -80,7 +79,7 @@ class Bars:
             self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def _left(self) -> str:
-        seconds = self._forecast.seconds_left()
+        seconds = self.seconds_left()
         return "" if seconds is None else f"about {minutes(seconds)} left"
 
 
@@ -88,7 +87,7 @@ def _short(value: float | int) -> str:
     return f"{value:,}" if isinstance(value, int) else f"{value:,.3g}"
 
 
-class Events:
+class Events(Forecast):
     """Observer that writes the start, progress and end of stages as events.
 
     Args:
@@ -96,40 +95,37 @@ class Events:
         seconds: Minimum time between progress events; the last one is always written.
     """
 
-    def __init__(self, write: Callable[..., None], seconds: float, forecast: Forecast) -> None:
-        self._write, self._forecast = write, forecast
-        self._seconds = seconds
-        self._stage = ""
-        self._last = 0.0
+    def __init__(self, write: Callable[..., None], seconds: float) -> None:
+        super().__init__()
+        self._write, self._seconds = write, seconds
+        self._stage, self._last = "", 0.0
 
     def started(self, stage: str) -> None:
         """Write the start of a stage."""
         self._stage, self._last = stage, time.perf_counter()
-        self._forecast.started(stage)
-        self._write("stage-begin", stage=stage, seconds_left=self._left())
+        super().started(stage)
+        self._event("stage-begin", stage=stage)
 
     def progressed(self, done: int, total: int) -> None:
         """Write the progress of the stage, at most once per interval."""
-        self._forecast.progressed(done, total)
+        super().progressed(done, total)
         now = time.perf_counter()
         if now - self._last >= self._seconds or done == total:
             self._last = now
-            left = self._left()
-            self._write("progress", stage=self._stage, done=done, total=total, seconds_left=left)
+            self._event("progress", stage=self._stage, done=done, total=total)
 
     def finished(self, report: StageReport) -> None:
         """Write the end of the stage with its cost and figures."""
-        self._forecast.finished(report)
-        self._write(
+        super().finished(report)
+        self._event(
             "stage-end",
             stage=report.name,
             seconds=round(report.seconds, 3),
             peak_memory_mb=round(report.peak_memory_mb, 1),
             figures=report.figures,
             kept=report.kept,
-            seconds_left=self._left(),
         )
 
-    def _left(self) -> float | None:
-        seconds = self._forecast.seconds_left()
-        return None if seconds is None else round(seconds, 1)
+    def _event(self, event: str, **about: object) -> None:
+        left = self.seconds_left()
+        self._write(event, **about, seconds_left=None if left is None else round(left, 1))

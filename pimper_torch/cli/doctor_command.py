@@ -35,14 +35,16 @@ class _Job:
 
 def run(job: _Job, output: Output) -> None:
     """Run ``doctor``: print one line per finding, with advice."""
-    from pimper_torch.cli.doctor.checks import examine_folder
+    from pimper_torch.cli.doctor.checks import examine_views
+    from pimper_torch.io.photographs import load_views
     from pimper_torch.runtime.reporting import stage
 
     findings = list(machine())
     _print(output, findings)
     if job.photos is not None:
         with output.observer(), stage("examine"):
-            photo_findings = examine_folder(job.photos, job.photographs, job.max_size_px)
+            views = load_views(job.photos, encoding=job.photographs, max_size_px=job.max_size_px)
+            photo_findings = examine_views(views, together=True)
         _print(output, photo_findings)
         findings += photo_findings
     warnings = [finding.check for finding in findings if finding.severity == "warning"]

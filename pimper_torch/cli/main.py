@@ -8,27 +8,31 @@ interrupted, 143 terminated; 1 anything unexpected, which is a bug of the packag
 """
 
 import ctypes
-import difflib
 import errno
 import gc
 import io
 import os
+import shlex
 import signal
 import sys
+import tempfile
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
-from pimper_torch.cli.crash_report import write_report
 from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
+from pimper_torch.cli.supervise import SHRINK
 from pimper_torch.export.result_folder.files import require_name
 from pimper_torch.io.version import versions
+from pimper_torch.runtime.config import nearest
 from pimper_torch.runtime.cores import usable_cores
 from pimper_torch.runtime.errors import ConfigError, InputError, PimperError, PimperWarning
 
@@ -180,9 +184,7 @@ def _no_command(name: str) -> str:
             f"`pimper {name}` comes with pimper-bench, which is not installed. Run `pip install "
             "./benchmarks` in a clone of the repository."
         )
-    near = difflib.get_close_matches(name, commands(), n=1)
-    hint = f" Did you mean `{near[0]}`?" if near else ""
-    return f"there is no command `{name}`.{hint} See `pimper --help`."
+    return f"there is no command `{name}`.{nearest(name, [*commands()])} See `pimper --help`."
 
 
 def _run(command: str, name: str, arguments: list[str], output: Output) -> None:
@@ -239,7 +241,7 @@ def _failed(output: Output, error: BaseException) -> int:
         kind = "MemoryError" if "can't allocate memory" in str(error) else kind
         output.error(kind, expected + notes, _BAD_INPUT)
         return _BAD_INPUT
-    report = write_report(error)
+    report = _write_report(error)
     if report is None:
         traceback.print_exception(error)
     text = (
@@ -250,13 +252,28 @@ def _failed(output: Output, error: BaseException) -> int:
     return _UNEXPECTED
 
 
+def _write_report(error: BaseException) -> Path | None:
+    """Write the traceback of an error to a file for bug reports, with versions and arguments.
+
+    Returns:
+        The file; ``None`` if it cannot be written.
+    """
+    lines = [f"{name} {version}" for name, version in versions().items()]
+    lines += [f"at {datetime.now(UTC).isoformat(' ', 'seconds')}", shlex.join(sys.argv), ""]
+    try:
+        with tempfile.NamedTemporaryFile(
+            *("w", -1, "utf-8"), prefix="pimper-", suffix=".txt", delete=False, errors="replace"
+        ) as file:
+            file.write("\n".join([*lines, *traceback.format_exception(error)]))
+    except OSError:
+        return None
+    return Path(file.name)
+
+
 def _system_advice(error: BaseException) -> str | None:
     """Return advice for an error that is not a bug of the package; ``None`` for any other."""
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-        return (
-            "memory ran out; no result was written. Shrink the photographs (`--max-size-px`), "
-            "close other programs, or set a limit that is checked early (`--max-memory`)."
-        )
+        return f"memory ran out; no result was written. {SHRINK}"
     if isinstance(error, OSError) and error.errno in _REFUSALS:
         path = "" if error.filename is None else f"{error.filename}: "
         advice = " Free space." if error.errno in _FULL else ""

@@ -26,26 +26,25 @@ from pimper_torch.scale import given
 from pimper_torch.viewer.server import require_viser
 
 
-def _word(kind: type, read: Callable[[str], object], metavar: str) -> Any:  # noqa: ANN401 - tyro's
+def _words(read: Callable[..., object], metavar: str) -> Any:  # noqa: ANN401 - tyro's
+    """Read as many words of the command line as the placeholder has as one value."""
     return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
+        nargs=len(metavar.split()),
         metavar=metavar,
-        instance_from_str=lambda words: read(words[0]),
-        is_instance=lambda value: isinstance(value, kind),
+        instance_from_str=lambda words: read(*words),
+        is_instance=lambda _: True,
         str_from_instance=lambda value: [str(value)],
     )
 
 
-_Place = Annotated[given.Mark, _word(given.Mark, given.Mark.read, "NAME,x,y")]
-_Name = Annotated[str, _word(str, str, "NAME")]
-_Bar = tuple[_Place, _Place, float]
-_Distance = tuple[_Name, _Name, float]
-Places = Annotated[tyro.conf.UseAppendAction[tuple[_Place, ...]], tyro.conf.arg(metavar="NAME,x,y")]
-ScaleBars = Annotated[
-    tyro.conf.UseAppendAction[tuple[_Bar, ...]], tyro.conf.arg(metavar="A,x,y B,x,y LENGTH")
-]
+_PLACE, _BAR, _DISTANCE = "NAME,x,y", "A,x,y B,x,y LENGTH", "A B LENGTH"
+_Place = Annotated[given.Mark, _words(given.Mark.read, _PLACE)]
+_Bar = Annotated[given.ScaleBar, _words(given.ScaleBar.read, _BAR)]
+_Distance = Annotated[given.CameraDistance, _words(given.CameraDistance.read, _DISTANCE)]
+Places = Annotated[tyro.conf.UseAppendAction[tuple[_Place, ...]], tyro.conf.arg(metavar=_PLACE)]
+ScaleBars = Annotated[tyro.conf.UseAppendAction[tuple[_Bar, ...]], tyro.conf.arg(metavar=_BAR)]
 CameraDistances = Annotated[
-    tyro.conf.UseAppendAction[tuple[_Distance, ...]], tyro.conf.arg(metavar="A B LENGTH")
+    tyro.conf.UseAppendAction[tuple[_Distance, ...]], tyro.conf.arg(metavar=_DISTANCE)
 ]
 Markers = Annotated[Literal["auto", "off"] | float, tyro.conf.arg(metavar="auto|off|MM")]
 
@@ -173,23 +172,6 @@ class InputOptions:
             str(self.silhouettes or self.segmenter or (*self.object_at, "")[0]),
             "no value together with --masks, which are used unchanged",
         )
-        _ = self.bars, self.distances  # refused before anything is read
-
-    @property
-    def bars(self) -> tuple[given.ScaleBar, ...]:
-        """Pairs of points in photographs with their distances."""
-        return tuple(
-            given.ScaleBar(first=first, second=second, length=length)
-            for first, second, length in self.scale_bar
-        )
-
-    @property
-    def distances(self) -> tuple[given.CameraDistance, ...]:
-        """Pairs of photographs with the distances between their cameras."""
-        return tuple(
-            given.CameraDistance(first=first, second=second, length=length)
-            for first, second, length in self.camera_distance
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,11 +205,9 @@ def parse(command: str, arguments: Sequence[str]) -> Job:
     _refuse_others(command, arguments, name)
     verb = _command(command, load_config(name))
     job = read_arguments(verb, command, arguments, levels=True, rare=_RARE)
-    silhouettes = job.config.silhouettes
-    if job.inputs.object:
-        silhouettes = dataclasses.replace(silhouettes, object=job.inputs.object)
-    if job.inputs.region:
-        silhouettes = dataclasses.replace(silhouettes, region=tuple(map(float, job.inputs.region)))
+    shortcuts = {"object": job.inputs.object, "region": tuple(map(float, job.inputs.region))}
+    changes: dict[str, Any] = {name: value for name, value in shortcuts.items() if value}
+    silhouettes = dataclasses.replace(job.config.silhouettes, **changes)
     config = dataclasses.replace(job.config, silhouettes=silhouettes)
     if reference := job.common.reference:
         surface = dataclasses.replace(config.coarse_surface, reference=reference)
@@ -332,11 +312,10 @@ def check(job: Job) -> Job:
     references = [job.config.coarse_surface.reference]
     if isinstance(job.config, PublishedConfig):
         references.append(job.config.triangulate.reference)
-    for name in filter(None, references):
-        view_named(name, present)
     marked = [pointer.name for mark in job.inputs.object_at for pointer in mark.pointers]
-    for name in (*given.measured_in(job.inputs.bars, job.inputs.distances), *marked):
-        given.number_of(name, present)
+    measured = given.measured_in(job.inputs.scale_bar, job.inputs.camera_distance)
+    for name in (*filter(None, references), *measured, *marked):
+        view_named(name, present)
     return job
 
 

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, cast, get_args
 
-from pimper_torch.runtime.errors import ConfigError
+from pimper_torch.runtime.config import require
 
 if TYPE_CHECKING:
     from pimper_torch.cli.doctor.forecast import Forecast
-    from pimper_torch.runtime.reporting import Observer, RunTable
+    from pimper_torch.runtime.reporting import RunTable
 
 Level = Literal["error", "warning", "info", "debug"]
 _LEVELS: tuple[Level, ...] = get_args(Level)
@@ -92,29 +92,25 @@ class Output:
         print_message("error", message)
 
     @contextmanager
-    def observer(self, forecast: "Forecast | None" = None) -> Iterator["RunTable"]:
+    def observer(self) -> Iterator[tuple["Forecast", "RunTable"]]:
         """Display the stages of the ``with`` block: a bar or a line per stage, or events.
 
-        Args:
-            forecast: Estimates the time left.
-
         Yields:
-            The reports of the stages, and their observer.
+            The observer of the stages, which estimates the time left, and their reports.
         """
         from rich.console import Console
 
         from pimper_torch.cli.bars import Bars, Events
         from pimper_torch.cli.doctor.forecast import Forecast
-        from pimper_torch.runtime.reporting import SilentObserver, observed
+        from pimper_torch.runtime.reporting import observed
 
-        forecast = forecast or Forecast()
-        display: AbstractContextManager[Observer] = nullcontext(SilentObserver())
+        display: AbstractContextManager[Forecast] = nullcontext(Forecast())
         if self.as_json:
-            display = nullcontext(Events(self.event, 0.5, forecast))
+            display = nullcontext(Events(self.event, 0.5))
         elif self.shows("info"):
-            display = Bars(Console(stderr=True), forecast, None if self.shows("debug") else 3)
+            display = Bars(Console(stderr=True), None if self.shows("debug") else 3)
         with display as observer, observed(observer) as table:
-            yield table
+            yield observer, table
 
 
 def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:
@@ -124,23 +120,16 @@ def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:
     >>> output.as_json, rest
     (True, ['photos', '-o', 'out'])
     """
-    level: str = "warning" if any(argument in _QUIET for argument in arguments) else "info"
-    rest, waiting = [], False
-    for argument in arguments:
-        name, equals, value = argument.partition("=")
-        if waiting or (name == "--log-level" and equals):
-            level, waiting = (argument if waiting else value), False
-        elif argument == "--log-level":
-            waiting = True
-        elif argument not in (*_QUIET, "--json"):
-            rest.append(argument)
-    chosen = next((valid for valid in _LEVELS if valid == level), None)
-    if chosen is None or waiting:
-        raise ConfigError(
-            f"--log-level is {'nothing' if waiting else repr(level)}; needed: one of "
-            f"{', '.join(_LEVELS)}."
-        )
-    return Output(as_json="--json" in arguments, level=chosen), rest
+    level, rest = "warning" if {*_QUIET} & {*arguments} else "info", []
+    words = iter(arguments)
+    for word in words:
+        name, equals, value = word.partition("=")
+        if name == "--log-level":
+            level = value if equals else next(words, "")
+        elif word not in (*_QUIET, "--json"):
+            rest.append(word)
+    require(level in _LEVELS, "--log-level", level, f"one of {', '.join(_LEVELS)}")
+    return Output(as_json="--json" in arguments, level=cast(Level, level)), rest
 
 
 def json_value(value: object) -> object:

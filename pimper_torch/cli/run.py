@@ -12,7 +12,6 @@ import torch
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.doctor.checks import examine_views
 from pimper_torch.cli.doctor.cost import planned
-from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.cli.options import Job
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.view import print_address
@@ -32,6 +31,7 @@ from pimper_torch.records import CoarseMesh, Prior, Reconstruction, SparseScene,
 from pimper_torch.runtime.config import bytes_of
 from pimper_torch.runtime.errors import ConfigError, caution
 from pimper_torch.runtime.events import Caution
+from pimper_torch.runtime.file_names import view_named
 from pimper_torch.runtime.ledger import closing_line
 from pimper_torch.runtime.reporting import stage, stage_report
 from pimper_torch.runtime.stream import collected
@@ -61,20 +61,20 @@ def carry_out(job: Job, output: Output) -> None:
 def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
     common = job.common
     imports = stage_report("import", time.perf_counter() - output.began)
-    lock, forecast = held_output(job.out, "result", overwrite=common.overwrite), Forecast()
+    lock = held_output(job.out, "result", overwrite=common.overwrite)
     folder, limit = common.cache or job.out / STAGES, bytes_of(common.max_kept)
     store = Store(folder=folder, max_bytes=limit, fresh=common.fresh)
     warned = collected(Caution, passed_on=True)
-    with lock, output.observer(forecast) as table, warned as cautions:
+    with lock, output.observer() as (observer, table), warned as cautions:
         with stage("read") as figures:
             views = _read(job, store)
             figures["photographs"] = views.num_views
             _examine(job, views)
             bars = bars_in_files(job, views)
             mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
-        forecast.plan = _plan(job, views)
-        chain = make_chain(job.config, table.observer, store)
-        chain.needed = tuple(given.measured_in(job.inputs.bars, job.inputs.distances))
+        observer.plan = _plan(job, views)
+        chain = make_chain(job.config, observer, store)
+        chain.needed = tuple(given.measured_in(job.inputs.scale_bar, job.inputs.camera_distance))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
         chain.watch = None if viewer is None else partial(add_found, viewer)
         result = chain(views.to(common.device), job.inputs.sparse, mesh)
@@ -209,7 +209,7 @@ def in_files(job: Job, views: Views, mark: given.Mark) -> given.Mark:
     paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
 
     def sized_pointer(pointer: given.PixelMark) -> given.PixelMark:
-        header = read_header(paths[views.names[given.number_of(pointer.name, views.names)]])
+        header = read_header(paths[views.names[view_named(pointer.name, views.names)]])
         given.require_inside(pointer, header.width, header.height)
         return replace(pointer, size_px=(header.width, header.height))
 
@@ -220,7 +220,7 @@ def bars_in_files(job: Job, views: Views) -> tuple[given.ScaleBar, ...]:
     """Return the scale bars with marks as from :func:`in_files`."""
     return tuple(
         replace(bar, first=in_files(job, views, bar.first), second=in_files(job, views, bar.second))
-        for bar in job.inputs.bars
+        for bar in job.inputs.scale_bar
     )
 
 
@@ -232,7 +232,7 @@ def sized(
     scale = find_scale(
         result,
         bars=bars,
-        camera_distances=inputs.distances,
+        camera_distances=inputs.camera_distance,
         markers=inputs.markers,
         unit=inputs.unit,
         own_frame=inputs.sparse is not None,

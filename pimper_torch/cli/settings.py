@@ -3,7 +3,7 @@
 import dataclasses
 import textwrap
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +13,7 @@ import tyro
 from pimper_torch.cli.arguments import meanings, options_of, read_arguments, summary
 from pimper_torch.cli.output import Output
 from pimper_torch.presets.load_config import Config, load_config
-from pimper_torch.runtime.config import nearest, presets, to_mapping, written
+from pimper_torch.runtime.config import nearest, presets, setting_paths, to_mapping, written
 from pimper_torch.runtime.errors import ConfigError
 
 
@@ -70,20 +70,13 @@ def checked(command: str, arguments: Sequence[str]) -> _Job:
 
 
 def _require_setting(settings: object, path: Sequence[str], name: str) -> None:
-    paths = ["", *_names(to_mapping(settings), "")]
+    paths = ["", *setting_paths(type(settings))]
     if ".".join(path) not in paths:
         ends = [other for other in paths if other.endswith(f".{path[-1]}")]
         hint = f" Did you mean `{ends[0]}`?" if ends else nearest(name, [*paths, *presets()])
         raise ConfigError(
             f"there is no setting or preset `{name}`.{hint} `pimper config` prints all settings."
         )
-
-
-def _names(settings: Mapping[str, object], stem: str) -> Iterator[str]:
-    for name, value in settings.items():
-        yield stem + name
-        if isinstance(value, dict):
-            yield from _names(value, f"{stem}{name}.")
 
 
 def _yaml(settings: object, path: Sequence[str], depth: int = 0) -> Iterator[str]:

@@ -19,7 +19,7 @@ from contextlib import suppress
 from pimper_torch.cli.stopping import SIGNALS
 from pimper_torch.runtime.scratch import remove_scratch
 
-_SHRINK = (
+SHRINK = (
     "Shrink the photographs (`--max-size-px`), close other programs, or set a limit that is "
     "checked early (`--max-memory`)."
 )
@@ -74,18 +74,13 @@ def main() -> int:
     ended = os.waitstatus_to_exitcode(status)
     if ended >= 0:
         return ended
-    from pimper_torch.cli.crash_report import what_killed
     from pimper_torch.cli.output import Output
 
     remove_scratch()
-    output = Output(as_json="--json" in sys.argv)
+    kind, text = "Killed", f"{what_killed(ended)} {SHRINK}"
     if first:
-        ended = -first[0][1]
-        output.error(
-            "Interrupted", f"killed, as it did not stop in time. {_CONTINUES}", 128 - ended
-        )
-    else:
-        output.error("Killed", f"{what_killed(ended)} {_SHRINK} {_CONTINUES}", 128 - ended)
+        ended, kind, text = -first[0][1], "Interrupted", "killed, as it did not stop in time."
+    Output(as_json="--json" in sys.argv).error(kind, f"{text} {_CONTINUES}", 128 - ended)
     return 128 - ended
 
 
@@ -109,3 +104,19 @@ def exit_with_parent(watcher: int) -> None:
         os._exit(128 + signal.SIGKILL)
 
     threading.Thread(target=look, daemon=True).start()
+
+
+def what_killed(ended: int) -> str:
+    """Return a sentence about a process that ended without a message.
+
+    Args:
+        ended: Its exit code; or the negative number of the signal that killed it.
+    """
+    if ended == -signal.SIGKILL:
+        return (
+            "the run was killed by the system or by somebody (SIGKILL), most likely because memory "
+            "ran out."
+        )
+    is_signal = -ended in {*signal.Signals}
+    name = signal.Signals(-ended).name if is_signal else f"exit code {ended}"
+    return f"the run crashed ({name}), most likely because memory ran out in a native library."

@@ -239,18 +239,13 @@ class _OnceLoader(yaml.SafeLoader):
     def construct_mapping(
         self, node: yaml.MappingNode, deep: bool = False
     ) -> dict[Hashable, object]:
-        keys: set[str] = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
+        keys = [key.value for key, _ in node.value]
+        for index, key in enumerate(keys):
+            if key in keys[:index]:
                 raise yaml.constructor.ConstructorError(
-                    problem="a key is a list or a section; needed: a name",
-                    problem_mark=key.start_mark,
+                    problem=f"the key `{key}` occurs twice",
+                    problem_mark=node.value[index][0].start_mark,
                 )
-            if key.value in keys:
-                raise yaml.constructor.ConstructorError(
-                    problem=f"the key `{key.value}` occurs twice", problem_mark=key.start_mark
-                )
-            keys.add(key.value)
         return super().construct_mapping(node, deep)
 
 
@@ -275,7 +270,7 @@ def _build(
             require(value == getattr(cls, key), f"{where}: {key}", value, repr(getattr(cls, key)))
             continue
         if key not in _names(cls):
-            paths = [path for path in _paths(root, "") if path.rpartition(".")[2] == key]
+            paths = [path for path in setting_paths(root) if path.rpartition(".")[2] == key]
             elsewhere = f" Did you mean `{'` or `'.join(paths)}`?"
             hint = elsewhere if paths else nearest(shortened(str(key)), _names(cls))
             parent = f"section `{section}`" if section else "the top level"
@@ -346,12 +341,12 @@ def _kind_names(cls: type[object]) -> tuple[str, ...]:
     return tuple(name for name in hints if typing.get_origin(hints[name]) is typing.ClassVar)
 
 
-def _paths(cls: type[object], section: str) -> Iterator[str]:
+def setting_paths(cls: type[object], section: str = "") -> Iterator[str]:
     """List all settings of a config, including nested ones, with dots between the names."""
     for name, hint in typing.get_type_hints(cls).items():
         yield _join(section, name)
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-            yield from _paths(hint, _join(section, name))
+            yield from setting_paths(hint, _join(section, name))
 
 
 def _join(section: str, name: str) -> str:

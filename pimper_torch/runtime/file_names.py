@@ -5,7 +5,7 @@ import re
 import unicodedata
 from collections.abc import Sequence
 
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.errors import InputError, some
 
 _SUFFIXES = re.compile(
     r"(\.(jpe?g|png|tiff?|bmp|webp|gif|hei[cf]|hif|avif|dng|cr[23w]|nef|nrw|arw|sr2|orf|raf|rw[2l]|pef|srw|3fr|iiq))+$",
@@ -135,11 +135,16 @@ def _common(first: str, second: str) -> int:
 
 
 def view_named(name: str, names: Sequence[str], of: str = "photographs") -> int:
-    """Return the index of the only photograph with a name, with or without suffix."""
-    matches = [index for index, file in enumerate(names) if name in (file, file.rsplit(".", 1)[0])]
+    """Return the index of the photograph with a name, which may lack its suffix.
+
+    >>> view_named("b", ["a.jpg", "b.jpg"])
+    1
+    """
+    exact = [index for index, candidate in enumerate(names) if name == candidate]
+    stems = [index for index, candidate in enumerate(names) if name == candidate.rpartition(".")[0]]
+    matches = exact or stems
     if len(matches) != 1:
         raise InputError(
-            f"reference view: {len(matches)} {of} are named {name!r}; needed: one of "
-            f"{', '.join(names)}."
+            f"{name!r}: {len(matches) or 'no'} {of} have this name; needed: one of {some(names)}."
         )
     return matches[0]

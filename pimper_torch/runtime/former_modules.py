@@ -7,11 +7,9 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
-# Former folders, and the present folder of what they held; the empty one is the package.
-_FOLDERS = {"doors": "", "ground": "", "method": "stages.", "published": "paper.", "result": ""}
-
-# Other changes of paths in the package; the longest one that matches counts.
+# Present paths; the longest former one that matches counts. The empty one is the package.
 _FORMER = {
+    **{"doors": "", "ground": "", "method": "stages", "published": "paper", "result": ""},
     "doors.camera_files": "io.cameras",
     "doors.export.openexr": "io.openexr",
     "doors.io.reports": "export.reports",
@@ -27,7 +25,6 @@ _FORMER = {
     "method.sfm.existing": "io.cameras.existing",
     "method.sfm.model": "records.sparse_model",
     "method.sfm.model_files": "io.cameras.model_files",
-    "published": "paper",
     "published.published_config": "paper.paper_config",
     "result.asset": "stages.texturing",
     "result.asset.finish": "stages.meshing.finish",
@@ -47,10 +44,7 @@ def present_path(former: str) -> str | None:
     parts = former.split(".")
     heads = (".".join(parts[:count]) for count in range(len(parts), 0, -1))
     head = next((head for head in heads if head in _FORMER), None)
-    if head is not None:
-        return _FORMER[head] + former[len(head) :]
-    folder, _, inside = former.partition(".")
-    return f"{_FOLDERS[folder]}{inside}" if folder in _FOLDERS else None
+    return None if head is None else f"{_FORMER[head]}{former[len(head) :]}".removeprefix(".")
 
 
 def renamed(old: str, new: str) -> str:
@@ -68,25 +62,19 @@ class FormerModules(MetaPathFinder, Loader):
         """Return how to load a module with a former path; ``None`` for others."""
         package, _, former = name.partition(".")
         present = present_path(former) if package == "pimper_torch" else None
-        if present is None:
-            return None
-        if former in _FOLDERS and former not in _FORMER:
-            return ModuleSpec(name, self, is_package=True)
-        return ModuleSpec(name, self, loader_state=f"{package}.{present}")
+        present_name = f"{package}.{present}".removesuffix(".")
+        return None if present is None else ModuleSpec(name, self, loader_state=present_name)
 
-    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        """Import the present module; a folder that only held others is a new module."""
-        if spec.loader_state is None:
-            return None
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """Import the present module."""
         present = import_module(renamed(spec.name, spec.loader_state))
         spec.loader_state = present.__spec__
         return present
 
     def exec_module(self, module: ModuleType) -> None:
         """Restore the specification of the present module."""
-        spec = module.__spec__
-        if spec is not None and spec.loader_state is not None:
-            module.__spec__ = spec.loader_state
+        if module.__spec__ is not None:
+            module.__spec__ = module.__spec__.loader_state
 
 
 def install() -> None:

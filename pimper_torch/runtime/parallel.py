@@ -55,7 +55,7 @@ def side_by_side(
             return work(item)
 
     workers = min(num_workers(), len(items))
-    results = _in_threads(apart, items, workers) if workers > 1 else _one_by_one(apart, items)
+    results = _in_threads(apart, items, workers) if workers > 1 else map(_threads(1)(apart), items)
     try:
         for done, result in enumerate(results, start=1):
             yield result
@@ -90,13 +90,6 @@ def over_rows(
 def _idle(workers: int) -> ThreadPoolExecutor:
     """Return a pool of threads that lives as long as the process."""
     return ThreadPoolExecutor(workers, thread_name_prefix="rows")
-
-
-def _one_by_one(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-    for item in items:
-        with _threads(1):
-            result = work(item)
-        yield result
 
 
 def _in_threads(

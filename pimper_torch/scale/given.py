@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pimper_torch.runtime.config import require
-from pimper_torch.runtime.errors import InputError, some
+from pimper_torch.runtime.errors import InputError
 
 Unit = Literal["mm", "cm", "m", "in"]
 """Units of length for results."""
@@ -87,6 +87,11 @@ class ScaleBar:
     def __post_init__(self) -> None:
         _require_length(self.length, f"{self.first} to {self.second}")
 
+    @classmethod
+    def read(cls, first: str, second: str, length: str) -> "ScaleBar":
+        """Parse two marks and a length."""
+        return cls(first=Mark.read(first), second=Mark.read(second), length=float(length))
+
     @property
     def ends(self) -> tuple[Mark, Mark]:
         """Both end points."""
@@ -109,31 +114,16 @@ class CameraDistance:
     def __post_init__(self) -> None:
         _require_length(self.length, f"{self.first} to {self.second}")
 
+    @classmethod
+    def read(cls, first: str, second: str, length: str) -> "CameraDistance":
+        """Parse two names and a length."""
+        return cls(first=first, second=second, length=float(length))
+
 
 def measured_in(bars: Sequence[ScaleBar], distances: Sequence[CameraDistance]) -> dict[str, None]:
     """List the names of photographs in lengths, as given and without duplicates."""
     named = [pointer.name for bar in bars for mark in bar.ends for pointer in mark.pointers]
     return dict.fromkeys(named + [name for pair in distances for name in (pair.first, pair.second)])
-
-
-def number_of(name: str, names: Sequence[str]) -> int:
-    """Return the index of the photograph with this name, which may lack its suffix.
-
-    Args:
-        names: Names of all photographs, without duplicates.
-
-    >>> number_of("b", ["a.jpg", "b.jpg"])
-    1
-    """
-    exact = [index for index, candidate in enumerate(names) if name == candidate]
-    stems = [index for index, candidate in enumerate(names) if name == candidate.rpartition(".")[0]]
-    matches = exact or stems
-    if len(matches) != 1:
-        raise InputError(
-            f"{name!r}: {len(matches) or 'no'} photographs have this name; needed: one of "
-            f"{some(names)}."
-        )
-    return matches[0]
 
 
 def require_inside(pointer: PixelMark, width: int, height: int) -> None:

@@ -14,7 +14,8 @@ from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes, SparseScene
 from pimper_torch.records.shapes import Vector
 from pimper_torch.runtime.errors import InputError, caution
-from pimper_torch.scale.given import Mark, PixelMark, number_of, require_inside
+from pimper_torch.runtime.file_names import view_named
+from pimper_torch.scale.given import Mark, PixelMark, require_inside
 
 # Confidence of the surface below which a warning is given. A choice: normals with an error of 8
 # degrees have one half.
@@ -28,12 +29,12 @@ _MIN_ANGLE_DEG = 1.0
 def view_of(name: str, scene: SparseScene) -> int:
     """Return the index of a photograph among those that have a camera."""
     names = scene.views.names
-    if number_of(name, (*names, *scene.unregistered)) >= len(names):
+    if view_named(name, (*names, *scene.unregistered)) >= len(names):
         raise InputError(
             f"{name}: this photograph has no camera; needed: a registered photograph. Measure in "
             "another one."
         )
-    return number_of(name, names)
+    return view_named(name, names)
 
 
 def place_of(mark: Mark, result: Reconstruction) -> Vector:

@@ -4,7 +4,6 @@ import pytest
 from rich.console import Console
 
 from pimper_torch.cli.bars import Bars
-from pimper_torch.cli.doctor.forecast import Forecast
 from pimper_torch.records import StageReport
 from pimper_torch.runtime.reporting import Observer
 
@@ -18,9 +17,8 @@ def show(terminal, plan=()):
         peak_memory_mb=9.0,
         figures={"samples": 12345, "missing_samples": 3086},
     )
-    forecast = Forecast()
-    forecast.plan = plan
-    with Bars(console, forecast) as bars:
+    with Bars(console) as bars:
+        bars.plan = plan
         assert isinstance(bars, Observer)
         bars.started("warp")
         bars.progressed(1, 4)
@@ -51,7 +49,7 @@ def test_a_log_file_has_one_line_per_stage():
 def test_a_log_file_has_each_tenth_of_a_long_stage_once(terminal, seconds, shown):
     text = io.StringIO()
     console = Console(file=text, force_terminal=terminal, width=120)
-    with Bars(console, Forecast(), seconds=seconds) as bars:
+    with Bars(console, seconds=seconds) as bars:
         bars.started("write")
         for done in (1, 2, 3, 4, 5, *range(10, 21)):
             bars.progressed(done, 20)

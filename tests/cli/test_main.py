@@ -124,7 +124,10 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
             ["--factorize.min-views", "5"],
             "photos: the number of photographs is 4; needed: at least",
         ),
-        (["--reference", "nosuch"], "0 photographs are named 'nosuch'; needed: one of 0.png, 1"),
+        (
+            ["--reference", "nosuch"],
+            "'nosuch': no photographs have this name; needed: one of 0.png",
+        ),
         (["--photographs.saturation", "x"], "is 'x'; needed: {auto}|FLOAT|FLOAT,FLOAT,FLOAT."),
         (["--scales", "x"], "--scales is 'x'; needed: FLOAT,.... Scale of the photographs"),
         (["--region", "1"], "--region is '1'; needed: FLOAT,.... Box around the object"),
@@ -132,7 +135,7 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
         (["--sede", "3"], "Unrecognized options: --sede, 3"),
         (["--reconstruct.starts", "many"], "--reconstruct.starts is 'many'; needed: INT."),
         (["--log-level", "loud"], "--log-level is 'loud'; needed: one of error"),
-        (["--log-level"], "--log-level is nothing"),
+        (["--log-level"], "--log-level is ''; needed: one of error"),
     ],
 )
 def test_a_user_error_is_one_message(reconstruct, chain, tmp_path, capsys, arguments, expected):

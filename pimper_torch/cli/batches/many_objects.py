@@ -67,24 +67,15 @@ def batch(
         for item in read_objects(objects)
         if not Path(item.photos).resolve().is_relative_to(out.resolve())
     ]
-    plan = planned_batch(items, out, settings, overwrite=overwrite)
+    limits = {"limit_s": 60 * (time_limit_min or 0), "mem_gb": mem_gb or 0}
+    plan = planned_batch(items, out, settings, overwrite=overwrite, **limits)
     if executor is None:
-        needs = [mem_gb or entry.mem_gb for entry in plan if isinstance(entry, Task)]
-        jobs = jobs or runs_at_once(needs)
+        jobs = jobs or runs_at_once([entry.mem_gb for entry in plan if isinstance(entry, Task)])
         cpus_per_task = cpus_per_task or max(1, usable_cores() // jobs)
-    plan = [_limited(entry, time_limit_min, mem_gb, cpus_per_task or 1) for entry in plan]
+    threads = cpus_per_task or 1
+    plan = [replace(e, threads=threads) if isinstance(e, Task) else e for e in plan]
     engine = ThreadPoolExecutor(jobs) if executor is None else nullcontext(executor)
     return _settled(plan, {item.name: item.photos for item in items}, out, engine, listener)
-
-
-def _limited(
-    entry: Task | Outcome, minutes: float | None, mem_gb: float | None, threads: int
-) -> Task | Outcome:
-    """Return an entry of the plan with given limits instead of the estimated ones."""
-    if isinstance(entry, Outcome):
-        return entry
-    limit_s = 60 * minutes if minutes else entry.limit_s
-    return replace(entry, limit_s=limit_s, mem_gb=mem_gb or entry.mem_gb, threads=threads)
 
 
 def _settled(

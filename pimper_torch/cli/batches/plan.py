@@ -26,12 +26,19 @@ _PATIENCE, _LEAST_S = 10.0, 3600.0
 
 
 def planned_batch(
-    objects: Sequence[Object], out: Path, settings: Sequence[str] = (), *, overwrite: bool = False
+    objects: Sequence[Object],
+    out: Path,
+    settings: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
+    limit_s: float = 0,
+    mem_gb: float = 0,
 ) -> list[Task | Outcome]:
     """Check every object as ``pimper reconstruct`` would, and estimate time and memory.
 
     Args:
         settings: Options of ``pimper reconstruct`` for every object; its own options follow them.
+        limit_s: Time limit of a try, like ``mem_gb`` instead of the estimate, if not 0.
 
     Returns:
         A task for each object; or its outcome, if it is already complete or refused.
@@ -52,8 +59,8 @@ def planned_batch(
                 arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
                 out=target,
                 key=_made_from(options, inputs_of(job)),
-                limit_s=max(_LEAST_S, _PATIENCE * seconds),
-                mem_gb=gigabytes,
+                limit_s=limit_s or max(_LEAST_S, _PATIENCE * seconds),
+                mem_gb=mem_gb or gigabytes,
             )
             if is_whole(task):
                 return Outcome(name=item.name, status="kept")

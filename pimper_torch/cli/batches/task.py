@@ -20,7 +20,7 @@ from platform import node
 from textwrap import shorten
 from typing import IO, Literal
 
-from pimper_torch.cli.crash_report import what_killed
+from pimper_torch.cli.supervise import what_killed
 from pimper_torch.export.result_folder.marker import MARKER, STAGES
 from pimper_torch.export.result_folder.stages import locked
 from pimper_torch.runtime.errors import OutputError

@@ -3,15 +3,12 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from statistics import median
 
 from pimper_torch.cli.doctor.cost import cost
 from pimper_torch.cli.doctor.findings import Finding, available_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
 from pimper_torch.cli.doctor.photograph import Photograph, summarize_views
-from pimper_torch.io.photographs import load_views
-from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import some
 
@@ -19,36 +16,19 @@ from pimper_torch.runtime.errors import some
 _BLUR_PX, _BLUR_RATIO = 1.5, 1.6  # absolute, and relative to the median of the folder
 
 
-def examine_folder(
-    folder: Path | str, encoding: Encoding = FROM_FILES, max_size_px: int = 0
-) -> list[Finding]:
-    """Check the photographs of a folder, in seconds.
+def examine_views(views: Views, *, together: bool = False) -> list[Finding]:
+    """Check photographs, in seconds: number, blur, saturation, exposure and cost.
 
-    Returns:
-        Findings on number, blur, saturation, exposure, overlap and cost.
-
-    Raises:
-        InputError: As for :func:`pimper_torch.io.photographs.load_views`.
+    Args:
+        together: Also check their overlap.
     """
-    photographs = summarize_views(load_views(folder, encoding=encoding, max_size_px=max_size_px))
-    matches = match_copies([photo.small for photo in photographs])
-    return [
-        *each_alone(photographs),
-        overlap([photo.name for photo in photographs], matches),
-        cost(photographs, available_gb()),
-    ]
-
-
-def examine_views(views: Views) -> list[Finding]:
-    """Check loaded photographs, without overlap."""
     photographs = summarize_views(views)
-    return [*each_alone(photographs), cost(photographs, available_gb())]
-
-
-def each_alone(photographs: Sequence[Photograph]) -> list[Finding]:
-    """Return the findings on each photograph alone."""
-    checks = (number, blur, saturation, exposure)
-    return [finding for check in checks if (finding := check(photographs)) is not None]
+    alone = (check(photographs) for check in (number, blur, saturation, exposure))
+    findings = [finding for finding in alone if finding is not None]
+    if together:
+        matches = match_copies([photo.small for photo in photographs])
+        findings.append(overlap(views.names, matches))
+    return [*findings, cost(photographs, available_gb())]
 
 
 def number(photographs: Sequence[Photograph]) -> Finding:

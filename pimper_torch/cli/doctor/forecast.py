@@ -7,7 +7,7 @@ from pimper_torch.records import StageReport
 
 
 class Forecast:
-    """Observer that scales planned seconds by measured ones.
+    """Observer that scales planned seconds by measured ones, and displays nothing.
 
     A stage that ran in an earlier pass is scaled by its own time; other stages by the time of all
     that ran, and of the running stage if it takes longer than planned.

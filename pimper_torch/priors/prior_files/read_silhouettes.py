@@ -11,7 +11,8 @@ from pimper_torch.priors.prior_files.folder import read_maps, single_channel
 from pimper_torch.priors.prior_files.map_file import Layer
 from pimper_torch.records import SilhouettePrior, Views
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.scale.given import Mark, number_of, require_inside
+from pimper_torch.runtime.file_names import view_named
+from pimper_torch.scale.given import Mark, require_inside
 
 _KINDS = ("mask", "silhouette", "alpha", "inside")  # prefixes of the names of arrays
 
@@ -60,7 +61,7 @@ def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
     """
     maps: dict[int, torch.Tensor] = {}
     for pointer in (pointer for mark in marks for pointer in mark.pointers):
-        view = number_of(pointer.name, views.names)
+        view = view_named(pointer.name, views.names)
         size = views.sizes_px[view].tolist()
         full = pointer.size_px or size
         require_inside(pointer, *full)
