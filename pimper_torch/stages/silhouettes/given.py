@@ -7,7 +7,7 @@ are refused if such a reading contradicts itself clearly less than the files as 
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import nsmallest
 from itertools import combinations
@@ -93,15 +93,18 @@ def refuse_wrong_masks(scene: SparseScene, names: Sequence[str]) -> None:
     evidence = _Evidence.of(scene)
     if evidence is None:
         return
-    share, by_view = evidence.of_points(evidence.borders)
-    denied, involved = evidence.of_pixels(evidence.borders)
+    files, known = evidence.borders, list(evidence.borders)
+    compared = known[:: math.ceil(len(known) / _VIEWS)]
+    share, by_view = evidence.of_points(files)
+    denied, involved = evidence.of_pixels({name: files[name] for name in compared})
     contradiction = (share + denied) / 2
     if contradiction < _LEAST:
         return
     worst = (by_view + involved).argsort(descending=True)[:_SUSPECTS].tolist()
-    suspects = [list(evidence.borders)[view] for view in worst]
+    suspects = [known[view] for view in worst]
     most = min(_CLEARLY * contradiction, _MOST)
-    readings = evidence.readings(scene.views, names, suspects)
+    files = {name: files[name] for name in (*compared, *suspects)}
+    readings = evidence.readings(scene.views, names, files, suspects)
     rated = ((evidence.of_points(one.borders, one.bare)[0] / 2, one) for one in readings)
     likely = nsmallest(_TRIED, (pair for pair in rated if pair[0] <= most), key=itemgetter(0))
     totals = [(half + evidence.of_pixels(one.borders)[0] / 2, one) for half, one in likely]
@@ -180,10 +183,13 @@ class _Evidence:
         )
 
     def readings(
-        self, views: Views, names: Sequence[str], suspects: Sequence[str]
+        self,
+        views: Views,
+        names: Sequence[str],
+        files: Mapping[str, Raster],
+        suspects: Iterable[str],
     ) -> Iterator[_Reading]:
-        """List possible readings of the files; two of the suspects may have each other's masks."""
-        files = self.borders
+        """List possible readings of files; two of the suspects may have each other's masks."""
         around, inside = around_and_inside(list(files.values()))
         # An object that fills its photographs covers their middle.
         if inside < 0.75 < around:
@@ -205,7 +211,7 @@ class _Evidence:
             yield _Reading(turned, cause, _UPRIGHT)
         for step in range(1, len(names)) if ordered else ():
             owners = zip(names, (*names[step:], *names[:step]), strict=True)
-            shifted = {x: files[owner] for x, owner in owners if x in files and owner in files}
+            shifted = {x: self.borders[y] for x, y in owners if x in files and y in self.borders}
             cause = f"shifted by {step} in the list ({names[0]} has that of {names[step]})"
             if 2 * len(shifted) > len(files):
                 yield _Reading(shifted, cause, _NAMED)
@@ -243,8 +249,7 @@ class _Evidence:
 
     def of_pixels(self, borders: Mapping[str, Raster]) -> tuple[float, PerView]:
         """Return the fraction of masks' pixels in conflict, and each view's involvement."""
-        some = list(borders)[:: math.ceil(len(borders) / _VIEWS)]
-        views, maps = self.padded({name: borders[name] for name in some})
+        views, maps = self.padded(borders)
         involved = torch.zeros(len(self.borders))
         samples = _denied(maps, self.cameras.take(views), 40)
         if samples is None:
