@@ -27,30 +27,17 @@ class Workspace:
     """A folder with the files of one run.
 
     Attributes:
+        images: Folder of the photographs.
         files: Names of the photographs in ``images``, in the order of the views.
-        masked: Whether ``masks`` contains a mask for each, under its name plus ``.png``, as COLMAP
-            requires.
+        masks: Folder with a mask of each, under its name plus ``.png``, as COLMAP requires.
+        database: COLMAP's database.
     """
 
     folder: Path
+    images: Path
     files: tuple[str, ...]
-    masked: bool
-    database_name: str = "database.db"
-
-    @property
-    def images(self) -> Path:
-        """Folder of the photographs."""
-        return self.folder / "images"
-
-    @property
-    def masks(self) -> Path:
-        """Folder of the masks."""
-        return self.folder / "masks"
-
-    @property
-    def database(self) -> Path:
-        """COLMAP's database."""
-        return self.folder / self.database_name
+    masks: Path | None
+    database: Path
 
 
 @contextmanager
@@ -60,30 +47,31 @@ def workspace(views: Views, threads: int) -> Iterator[Workspace]:
     Photographs are 8-bit gray in sRGB, without their padding.
     """
     with scratch() as folder:
-        space = Workspace(
-            folder=folder,
-            files=tuple(f"{index:06d}.png" for index in range(views.num_views)),
-            masked=views.masks is not None,
-        )
-        space.images.mkdir()
-        space.masks.mkdir()
+        (images := folder / "images").mkdir()
+        (masks := folder / "masks").mkdir()
+        files = tuple(f"{index:06d}.png" for index in range(views.num_views))
 
         def write(index: int) -> None:
             width, height = (int(side) for side in views.sizes_px[index])
             pixels = to_bytes(views.images[index, :, :height, :width].detach()).cpu()
             picture = Image.fromarray(pixels.movedim(0, -1).squeeze(-1).numpy()).convert("L")
             # Fast compression: the files live for seconds. COLMAP uses luma alone.
-            picture.save(space.images / space.files[index], compress_level=1)
+            picture.save(images / files[index], compress_level=1)
             if views.masks is not None:
                 mask = views.masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
-                path = space.masks / f"{space.files[index]}.png"
-                Image.fromarray(mask).save(path, compress_level=1)
+                Image.fromarray(mask).save(masks / f"{files[index]}.png", compress_level=1)
             drop_pages()
 
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(write, range(views.num_views)))
         release_memory()
-        yield space
+        yield Workspace(
+            folder=folder,
+            images=images,
+            files=files,
+            masks=None if views.masks is None else masks,
+            database=folder / "database.db",
+        )
 
 
 # Side of photographs below which COLMAP 4.2's covariant detector reads out of bounds.
@@ -125,7 +113,7 @@ def find_features(
     options.sift.estimate_affine_shape = settings.affine_shape
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = settings.camera_model
-    if space.masked:
+    if space.masks:
         reader.mask_path = str(space.masks)
     shared = len(set(lenses)) == 1
     mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
