@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.geometry.rigid import rotate, transform
-from pimper_torch.geometry.surfaces import carried_normals, unit_face_normals
+from pimper_torch.geometry.surfaces import carried_normals
 from pimper_torch.geometry.topology import corners_of
 from pimper_torch.io.assets.gltf import MATTE, glb, gltf_of
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
@@ -57,13 +57,9 @@ def write_ply(
         errors = getattr(mesh, name)
         if errors is not None:
             columns[name] = errors.float()[:, None]
-    arrays = {
-        name: column.detach().cpu().numpy()
-        for names, values in columns.items()
-        for name, column in zip(names.split(), values.unbind(dim=1), strict=True)
-    }
-    vertex_type = [(name, array.dtype.newbyteorder("<")) for name, array in arrays.items()]
-    vertices = np.rec.fromarrays(list(arrays.values()), dtype=vertex_type)
+    names = " ".join(columns).split()
+    arrays = [column.detach().cpu().numpy() for x in columns.values() for column in x.unbind(dim=1)]
+    vertices = np.rec.fromarrays(arrays, formats=None, names=names, byteorder="<")
     face = [("count", "u1"), ("corners", "<i4", 3)]
     faces = np.empty(len(mesh.faces), face if measured is None else [*face, ("measured", "u1")])
     faces["count"], faces["corners"] = 3, mesh.faces.cpu().numpy()
@@ -73,7 +69,7 @@ def write_ply(
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {len(vertices)}",
-        *(f"property {_KINDS[array.dtype.name]} {name}" for name, array in arrays.items()),
+        *(f"property {_KINDS[vertices[name].dtype.name]} {name}" for name in names),
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         *([] if measured is None else ["property uchar measured"]),
@@ -185,17 +181,12 @@ def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
     Args:
         offset_world: Written to the header, not added; see ``SparseScene.offset_world``.
     """
-    corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
-    normals = unit_face_normals(mesh.vertices_world, mesh.faces).detach().cpu()
-    triangle_type = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
-    triangles = np.zeros(len(corners), triangle_type)
-    triangles["normal"], triangles["corners"] = normals.numpy(), corners.numpy()
+    vertices, faces = mesh.vertices_world.detach().cpu().numpy(), mesh.faces.cpu().numpy()
+    data = trimesh.exchange.stl.export_stl(trimesh.Trimesh(vertices, faces, process=False))
     header = b"pimper_torch"
     if offset_world != NO_OFFSET:
         header = "offset {} {} {}".format(*offset_world).encode("ascii")
-    with Path(path).open("wb") as file:
-        file.write(header.ljust(80)[:80] + np.uint32(len(triangles)).tobytes())
-        triangles.tofile(file)
+    Path(path).write_bytes(header.ljust(80)[:80] + data[80:])
 
 
 def write_obj(
