@@ -119,9 +119,7 @@ def find_features(
     mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
     with quiet():
         pycolmap.Database.open(space.database).close()
-        _import(space, reader, lenses)
-        with pycolmap.Database.open(space.database) as database:
-            _set_focals(database, dict(zip(space.files, focals_px, strict=True)))
+        _import(space, reader, focals_px, lenses)
         step = 2 * settings.num_threads  # photographs between two reports of progress
         for start in track(range(0, len(space.files), step)):
             pycolmap.extract_features(
@@ -143,7 +141,12 @@ def image_ids(database: Any, space: Workspace) -> list[int]:  # noqa: ANN401 - p
     return [ids[file] for file in space.files]
 
 
-def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # noqa: ANN401 - no types
+def _import(
+    space: Workspace,
+    reader: Any,  # noqa: ANN401 - pycolmap is untyped
+    focals_px: Sequence[float | None],
+    lenses: Sequence[int],
+) -> None:
     """Add photographs to the database in their order, each with the camera of its lens."""
     pycolmap = loaded()
     cameras: dict[int, int] = {}
@@ -156,18 +159,13 @@ def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # no
             with pycolmap.Database.open(space.database) as database:
                 cameras[lens] = database.read_image_with_name(files[0]).camera_id
     reader.existing_camera_id = -1
-
-
-def _set_focals(database: Any, focals_px: dict[str, float | None]) -> None:  # noqa: ANN401 - no types
-    focals_of: dict[int, list[float]] = {}
-    for image in database.read_all_images():
-        if (focal := focals_px[image.name]) is not None:
-            focals_of.setdefault(image.camera_id, []).append(focal)
-    for camera in database.read_all_cameras():
-        if camera.camera_id not in focals_of:
-            continue
-        params = np.array(camera.params)
-        params[list(camera.focal_length_idxs())] = np.median(focals_of[camera.camera_id])
-        camera.params = params
-        camera.has_prior_focal_length = True
-        database.update_camera(camera)
+    with pycolmap.Database.open(space.database) as database:
+        for number, camera_id in cameras.items():
+            pairs = zip(focals_px, lenses, strict=True)
+            if known := [focal for focal, lens in pairs if lens == number and focal is not None]:
+                camera = database.read_camera(camera_id)
+                params = np.array(camera.params)
+                params[list(camera.focal_length_idxs())] = np.median(known)
+                camera.params = params
+                camera.has_prior_focal_length = True
+                database.update_camera(camera)
