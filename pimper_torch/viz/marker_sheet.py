@@ -39,12 +39,10 @@ def draw_sheet(side_mm: int = SIDE_MM, paper: Paper = "a4") -> "Figure":
     """
     # Imported here so that importing the package does not load matplotlib; Figure without pyplot
     # leaves no global state.
-    from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.figure import Figure
 
     width, height = PAPERS_MM[paper]
     figure = Figure(figsize=(width / 25.4, height / 25.4))
-    FigureCanvasPdf(figure)
     axes: Any = figure.add_axes((0, 0, 1, 1))
     axes.set_axis_off()
     axes.set_xlim(0, width)
