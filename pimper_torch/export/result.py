@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, local_origin, to_local
+from pimper_torch.geometry.local_frame import Offset, local_origin, to_local
 from pimper_torch.geometry.undistortion import pinholes_for
 from pimper_torch.io.cameras.layout import DataSetPath
 from pimper_torch.io.cameras.model_files import read_model
@@ -55,9 +55,7 @@ class WrittenResult(Record):
     @property
     def mesh_cameras(self) -> Cameras:
         """Cameras in the frame of the mesh; float32."""
-        poses = self.cameras.cam_from_world
-        if self.offset_world != NO_OFFSET:
-            poses = to_local(poses, self.offset_world)
+        poses = to_local(self.cameras.cam_from_world, self.offset_world)
         return self.cameras.replace(cam_from_world=poses).to(torch.float32)
 
 

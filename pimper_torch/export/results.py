@@ -11,6 +11,7 @@ from PIL import Image
 
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.export import reports
+from pimper_torch.export.picture_files import write_mask
 from pimper_torch.export.result_folder.folders import written_whole
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.io.assets.mesh_files import MeshFiles as MeshFiles
@@ -24,7 +25,7 @@ from pimper_torch.radiometry import to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import FinishedMesh, Reconstruction, Relighting, TexturedMesh
 from pimper_torch.runtime.config import read_mapping, to_yaml
-from pimper_torch.runtime.mapped import each
+from pimper_torch.runtime.mapped import drop_pages
 from pimper_torch.runtime.progress import part
 from pimper_torch.runtime.reporting import stage_report
 from pimper_torch.scale.given import MILLIMETRES
@@ -207,13 +208,10 @@ def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
     write_model(result.scene, folder / "sparse")
     if result.silhouettes.source != "everything":
         (folder / "masks").mkdir()
-        masks, sizes = each(result.silhouettes.shown), result.cameras.sizes_px.tolist()
-        names = result.scene.views.names
-        for name, (mask,), (width, height) in zip(names, masks, sizes, strict=True):
-            levels = mask[:height, :width].to(torch.uint8) * 255
-            path = mask_path(folder / "masks", name)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(levels.numpy()).save(path)
+        views = result.scene.views.replace(masks=result.silhouettes.shown)
+        for index, name in enumerate(views.names):
+            write_mask(views, index, mask_path(folder / "masks", name))
+            drop_pages()
     with part(2, _PARTS):
         _write_maps(result, folder)
     reports.write_json(reports.lights_report(result), folder / "lights.json", indent=None)

@@ -17,9 +17,9 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.geometry.rigid import rotate, transform
-from pimper_torch.geometry.surfaces import carried_normals, side_lengths, unit_face_normals
+from pimper_torch.geometry.surfaces import carried_normals
 from pimper_torch.geometry.topology import corners_of
-from pimper_torch.io.assets.gltf import MATTE, gltf_of
+from pimper_torch.io.assets.gltf import MATTE, glb, gltf_of
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.radiometry.base_color import base_color
 from pimper_torch.records import Mesh
@@ -31,9 +31,9 @@ from pimper_torch.runtime.errors import InputError
 _ERRORS = ("confidence", "expected_error")
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
 _NEEDED = "PLY, OBJ, STL, OFF or GLB"
-# Largest shift of a vertex by rounding, as a fraction of a short edge (the 10th percentile). A
-# choice. A cloud's spacing is assumed to be a thousandth of its radius.
-_MAX_ROUNDING, _CLOUD_SPACING = 1e-3, 1e-3
+# Largest shift of a vertex by rounding, as a fraction of the mesh's size: a thousandth of a short
+# edge of a fine mesh. A choice.
+_MAX_ROUNDING = 1e-6
 _KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's names
 
 
@@ -43,8 +43,8 @@ def write_ply(
     """Write a binary PLY with vertex normals, albedo as 8-bit sRGB colour, and errors.
 
     Errors are the properties ``confidence`` and ``expected_error``, the latter in scene units.
-    Positions are ``double`` if ``float`` would move a vertex by more than a thousandth of a short
-    edge, as it does far from the origin.
+    Positions are ``double`` if ``float`` would move a vertex by more than a millionth of the mesh's
+    size, as it does far from the origin.
 
     Args:
         offset_world: Added to the vertices; see ``SparseScene.offset_world``.
@@ -57,13 +57,9 @@ def write_ply(
         errors = getattr(mesh, name)
         if errors is not None:
             columns[name] = errors.float()[:, None]
-    arrays = {
-        name: column.detach().cpu().numpy()
-        for names, values in columns.items()
-        for name, column in zip(names.split(), values.unbind(dim=1), strict=True)
-    }
-    vertex_type = [(name, array.dtype.newbyteorder("<")) for name, array in arrays.items()]
-    vertices = np.rec.fromarrays(list(arrays.values()), dtype=vertex_type)
+    names = " ".join(columns).split()
+    arrays = [column.detach().cpu().numpy() for x in columns.values() for column in x.unbind(dim=1)]
+    vertices = np.rec.fromarrays(arrays, formats=None, names=names, byteorder="<")
     face = [("count", "u1"), ("corners", "<i4", 3)]
     faces = np.empty(len(mesh.faces), face if measured is None else [*face, ("measured", "u1")])
     faces["count"], faces["corners"] = 3, mesh.faces.cpu().numpy()
@@ -73,7 +69,7 @@ def write_ply(
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {len(vertices)}",
-        *(f"property {_KINDS[array.dtype.name]} {name}" for name, array in arrays.items()),
+        *(f"property {_KINDS[vertices[name].dtype.name]} {name}" for name in names),
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         *([] if measured is None else ["property uchar measured"]),
@@ -92,14 +88,9 @@ def _positions(mesh: Mesh, offset_world: Offset) -> Vertices:
     single = shifted.float()
     if len(vertices) == 0:
         return single
-    if len(mesh.faces):
-        lengths = side_lengths(vertices[mesh.faces.clamp(0, len(vertices) - 1)]).flatten()
-        short = float(lengths.kthvalue(max(1, len(lengths) // 10)).values)
-    else:
-        distance = (vertices - vertices.median(dim=0).values).norm(dim=1)
-        short = _CLOUD_SPACING * float(distance.median())
-    rounding = float((shifted - single).abs().max())
-    return single if rounding <= _MAX_ROUNDING * short else shifted
+    size = (vertices.amax(dim=0) - vertices.amin(dim=0)).norm()
+    rounded = (shifted - single).abs().max() > _MAX_ROUNDING * size
+    return shifted if bool(rounded) else single
 
 
 def read_mesh(path: Path | str) -> Mesh:
@@ -190,17 +181,12 @@ def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) ->
     Args:
         offset_world: Written to the header, not added; see ``SparseScene.offset_world``.
     """
-    corners = mesh.vertices_world.detach().cpu().double()[mesh.faces.cpu()]
-    normals = unit_face_normals(mesh.vertices_world, mesh.faces).detach().cpu()
-    triangle_type = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
-    triangles = np.zeros(len(corners), triangle_type)
-    triangles["normal"], triangles["corners"] = normals.numpy(), corners.numpy()
+    vertices, faces = mesh.vertices_world.detach().cpu().numpy(), mesh.faces.cpu().numpy()
+    data = trimesh.exchange.stl.export_stl(trimesh.Trimesh(vertices, faces, process=False))
     header = b"pimper_torch"
     if offset_world != NO_OFFSET:
         header = "offset {} {} {}".format(*offset_world).encode("ascii")
-    with Path(path).open("wb") as file:
-        file.write(header.ljust(80)[:80] + np.uint32(len(triangles)).tobytes())
-        triangles.tofile(file)
+    Path(path).write_bytes(header.ljust(80)[:80] + data[80:])
 
 
 def write_obj(
@@ -324,7 +310,7 @@ def _readable(path: Path, suffix: str) -> bytes:
 
 def _with_raw_colors(path: Path, data: bytes) -> bytes:
     """Rename colours in a GLB file, except of points, whose custom attributes trimesh drops."""
-    length, size = struct.unpack_from("<2I", data, 8)
+    (size,) = struct.unpack_from("<I", data, 12)
     tree = json.loads(data[20 : 20 + size])
     if any("sparse" in item or "bufferView" not in item for item in tree.get("accessors", [])):
         raise InputError(
@@ -335,7 +321,4 @@ def _with_raw_colors(path: Path, data: bytes) -> bytes:
         for part in mesh["primitives"]:
             if _COLORS in part["attributes"] and part.get("mode") != 0:
                 part["attributes"][_RAW_COLORS] = part["attributes"].pop(_COLORS)
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    sizes = struct.pack("<2I", length - size + len(text), len(text))
-    return data[:8] + sizes + data[16:20] + text + data[20 + size :]
+    return glb(tree, data[28 + size :])

@@ -17,12 +17,22 @@ from pimper_torch.runtime.errors import InputError, caution, some
 
 MIN_PHOTOGRAPHS = 3  # fewer do not separate shape, light and viewpoint
 # Files that users may expect to be read, though not in SUFFIXES: images and camera raw; video.
-_PICTURES = re.compile(
-    r"\.(gif|hei[cf]|avif|webp|bmp|jp2|jxl|psd|exr|hdr|p[pg]m"
-    r"|cr[23w]|n(ef|rw)|arw|sr2|dng|orf|raf|rw[2l]|pef|srw|3fr|iiq|raw|hif)",
-    re.IGNORECASE,
-)
-_VIDEO = re.compile(r"\.(mp4|mov|avi|mkv|m4v|webm|mts)", re.IGNORECASE)
+_OTHERS = [
+    ".gif",
+    ".avif",
+    ".webp",
+    ".bmp",
+    ".jp2",
+    ".jxl",
+    ".psd",
+    ".exr",
+    ".hdr",
+    ".ppm",
+    ".pgm",
+    ".raw",
+]
+_PICTURES = (*HEIC_SUFFIXES, *RAW_SUFFIXES, *_OTHERS)
+_VIDEO = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts")
 # Folders next to those of poses, with masks and maps of photographs.
 _MAPS = re.compile(
     r"(masks?|silhouettes?|mattes?|segmentations?|normals?|depths?|disparit(y|ies))", re.IGNORECASE
@@ -113,7 +123,7 @@ def _readable(entries: Sequence[Path]) -> list[Path]:
 def _refuse_video(entries: Sequence[Path]) -> None:
     """Raise an error for a video, with the command that extracts photographs."""
     for path in sorted(entries):
-        if path.is_file() and _VIDEO.fullmatch(path.suffix):
+        if path.is_file() and path.suffix.lower() in _VIDEO:
             raise InputError(
                 f"{path}: is a video; needed: a folder of images. Extract photographs with `pimper "
                 f"frames {path} -o photos/`."
@@ -163,8 +173,7 @@ def _kind(path: Path) -> str:
         return "broken link"
     if path.is_dir():
         return "folder of images" if _has_images(path) else ""
-    match = _PICTURES.fullmatch(path.suffix) or _VIDEO.fullmatch(path.suffix)
-    return path.suffix[1:].upper() if match else ""
+    return path.suffix[1:].upper() if path.suffix.lower() in (*_PICTURES, *_VIDEO) else ""
 
 
 def _has_images(folder: Path) -> bool:
@@ -172,7 +181,7 @@ def _has_images(folder: Path) -> bool:
         suffixes = {path.suffix.lower() for path in folder.iterdir()}
     except OSError:
         return False
-    return any(suffix in SUFFIXES or _PICTURES.fullmatch(suffix) for suffix in suffixes)
+    return not suffixes.isdisjoint((*SUFFIXES, *_PICTURES))
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

@@ -117,7 +117,8 @@ def _listed(folder: Path, max_size_px: int) -> _Files:
         )
     warn_of_skipped_files(folder, paths)
     headers = [read_header(path) for path in paths]
-    return _Files(folder, paths, headers, [shrunk_size(header, max_size_px) for header in headers])
+    sizes = [shrunk_size(header.width, header.height, max_size_px) for header in headers]
+    return _Files(folder, paths, headers, sizes)
 
 
 def _fill_masks(
@@ -178,13 +179,10 @@ def _poses(paths: Sequence[Path], folder: Path) -> Int[Tensor, " view"] | None:
     return torch.tensor([folders.index(path.parent) for path in paths])
 
 
-def shrunk_size(header: Header, max_size_px: int) -> tuple[int, int]:
-    """Return width and height after shrinking to a longer side; 0 shrinks nothing."""
-    longer = max(header.width, header.height)
-    if not 0 < max_size_px < longer:
-        return header.width, header.height
-    factor = max_size_px / longer
-    return max(1, round(header.width * factor)), max(1, round(header.height * factor))
+def shrunk_size(width: int, height: int, longest: int) -> tuple[int, int]:
+    """Return both sides after shrinking until the longer one is ``longest``; 0 shrinks nothing."""
+    factor = min(1.0, longest / max(width, height)) if longest else 1.0
+    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def shrunk_focals(headers: Sequence[Header], sizes: Sequence[tuple[int, int]]) -> PerView:
@@ -222,9 +220,8 @@ def read_mask(path: Path | str, max_size_px: int = 0) -> Mask:
     """Return a mask by the rules of :func:`load_views`, shrunk like photographs."""
     path = Path(path)
     inside = _threshold([_brightness(path)])[0]
-    if max_size_px == 0:
-        return inside > 0
-    return resized_mask(inside, *shrunk_size(read_header(path), max_size_px))
+    height, width = inside.shape
+    return resized_mask(inside, *shrunk_size(width, height, max_size_px))
 
 
 def _read_masks(

@@ -29,15 +29,6 @@ _ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}
 # Widths of the windows of linear interpolation, for Bayer patterns and X-Trans.
 _WINDOWS = {2: 3, 6: 7}
 _SOURCE = "camera raw"
-# XYZ of sRGB's primaries under D65 in dcraw, for which LibRaw's matrices were made.
-_XYZ_FROM_SRGB = torch.tensor(
-    [
-        [0.412453, 0.357580, 0.180423],
-        [0.212671, 0.715160, 0.072169],
-        [0.019334, 0.119193, 0.950227],
-    ],
-    dtype=torch.float64,
-)
 _UNKNOWN_CAMERA = "is from a camera of unknown colours; albedo keeps the colours of the sensor"
 
 
@@ -165,10 +156,13 @@ def _saturated(raw: Any, white: int) -> np.ndarray | None:  # noqa: ANN401 - as 
 
 def _srgb_from_sensor(raw: Any) -> Matrix3 | None:  # noqa: ANN401 - as above
     """Return the matrix from sensor colours to linear sRGB, with the camera's white balance."""
+    from skimage.color.colorconv import xyz_from_rgb  # slow to import
+
     matrix = torch.tensor(np.asarray(raw.color_matrix), dtype=torch.float64)[:3, :3]
     if not _keeps_white(matrix):
         sensor = torch.tensor(np.asarray(raw.rgb_xyz_matrix), dtype=torch.float64)[:3]
-        sensor = sensor @ _XYZ_FROM_SRGB
+        # Of D65, with dcraw's digits, for which LibRaw's matrices were made.
+        sensor = sensor @ torch.from_numpy(xyz_from_rgb)
         if float(sensor.det().abs()) < 1e-6:
             return None
         matrix = (sensor / sensor.sum(dim=1, keepdim=True)).inverse()

@@ -1,6 +1,7 @@
 """Responses of photographs: measured curves, and contradictions with the files' metadata."""
 
 import csv
+import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,8 @@ _LAYOUT = (
     "one column of radiance, or three for red, green and blue, for the levels 0, 1, 2, ...; or two "
     "or four columns, the first with the level"
 )
+
+_NUMBER = re.compile(r"\s*([-+.\d]|nan\b|inf\b)", re.IGNORECASE)  # its start
 
 
 def response_of(encoding: Encoding) -> Response:
@@ -85,7 +88,7 @@ def _read_csv(path: Path) -> np.ndarray:
     text = path.read_text(encoding="utf-8-sig")
     comma = ";" if ";" in text else ","
     rows = [row for row in csv.reader(text.splitlines(), delimiter=comma) if any(row)]
-    if rows and not any(_is_number(cell) for cell in rows[0]):
+    if rows and not any(_NUMBER.match(cell) for cell in rows[0]):
         rows = rows[1:]
     if len({len(row) for row in rows}) != 1:
         raise ValueError("it has no rows, or rows of different lengths")
@@ -99,14 +102,6 @@ def _read_npy(path: Path) -> np.ndarray:
     if table.ndim == 3 and table.shape[1] == 1:  # OpenCV's layout
         table = table[:, 0]
     return (table[:, None] if table.ndim == 1 else table).astype(np.float64)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 # Part of the warning that the files' metadata differ from the given response.

@@ -247,8 +247,7 @@ class CoarseMesh(Record):
         mesh: The facets, with vertex normals smoothed over the mesh.
         reference: The frontal view, in which the facets were triangulated.
         is_point: True for vertices that are points of the sparse cloud.
-        covariance_world: Of each vertex that is a point, scene units squared; zero for other
-            vertices. ``None`` for a given mesh.
+        covariance_world: Of each vertex, scene units squared; ``None`` unless all are points.
         points: The cloud between the vertices; ``None`` for a given mesh.
         support: The best evidence of each facet's position, a value of :class:`Support`; ``None``
             if unknown.

@@ -73,7 +73,8 @@ def scaled(record: AnyRecord, factor: float) -> AnyRecord:
 def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: ANN401 - of any field
     """Scale the value of a field; each object is copied once."""
     if isinstance(value, records.StageReport):
-        return _scaled_report(value, factor)
+        lengths = {name: factor * value.figures[name] for name in _FIGURES if name in value.figures}
+        return value.replace(figures=value.figures | lengths) if lengths else value
     if isinstance(value, tuple) and any(isinstance(item, Record | Event) for item in value):
         return tuple(_copy(item, factor, copies) for item in value)
     if not isinstance(value, Record):
@@ -96,10 +97,3 @@ def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: AN
     if isinstance(record, records.SparseScene):
         changes["offset_world"] = tuple(factor * length for length in record.offset_world)
     return copies.setdefault(id(record), record.replace(**changes) if changes else record)
-
-
-def _scaled_report(report: records.StageReport, factor: float) -> records.StageReport:
-    """Scale the figures of a report that are lengths."""
-    figures = report.figures
-    scaled = {name: factor * figures[name] for name in _FIGURES if name in figures}
-    return report.replace(figures=figures | scaled) if scaled else report

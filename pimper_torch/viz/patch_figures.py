@@ -216,9 +216,6 @@ def _cropped(patch: AnyPatch, panels: list[tuple[str, Tensor]]) -> list[tuple[st
 def _figure(count: int) -> "Figure":
     # Imported here so that importing the package does not load matplotlib; without pyplot, no
     # global state remains.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(2.2 * max(1, count), 2.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(2.2 * max(1, count), 2.2), layout="constrained")

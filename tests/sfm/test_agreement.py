@@ -48,7 +48,7 @@ def rotated(model, view, angle=0.6):
 def test_a_misplaced_view_is_identified(generator):
     model, points = scene(generator)
     pairs = pairs_of(model, points)
-    found = verify_model(rotated(model, 3), model.names, pairs, 4.0).misplaced
+    found = verify_model(rotated(model, 3), model.names, pairs, 4.0)[1]
     judges = [agreement(rotated(model, 3), pair, 4.0) for pair in pairs if 3 in pair.views]
     assert found.keys() == {"3.png"}
     assert min(judges) <= found["3.png"] <= max(judges) < 0.5
@@ -58,18 +58,16 @@ def test_the_inlier_ratio_counts_matches_of_missing_photographs_as_outliers(gene
     model, points = scene(generator)
     pairs = pairs_of(model, points)
     counts = torch.tensor([pair.num_matches for pair in pairs]).double()
-    right = verify_model(model, model.names, pairs, 0.01)  # with lens distortion
-    assert right.inlier_ratio == 1
-    assert right.misplaced == {}
+    assert verify_model(model, model.names, pairs, 0.01) == (1, {})  # with lens distortion
     wrong = rotated(model, 3)
     fractions = torch.tensor([agreement(wrong, pair, 4.0) for pair in pairs]).double()
-    inlier_ratio = verify_model(wrong, model.names, pairs, 4.0).inlier_ratio
+    inlier_ratio = verify_model(wrong, model.names, pairs, 4.0)[0]
     assert inlier_ratio == pytest.approx(float((counts * fractions).sum() / counts.sum()))
     views = [0, 1, 2, *range(4, model.num_views)]
     there = torch.tensor([3 not in pair.views for pair in pairs])
-    inlier_ratio = verify_model(select_views(model, views), model.names, pairs, 0.01).inlier_ratio
+    inlier_ratio = verify_model(select_views(model, views), model.names, pairs, 0.01)[0]
     assert inlier_ratio == pytest.approx(float(counts[there].sum() / counts.sum()))
-    assert verify_model(model, model.names, [], 4.0).inlier_ratio == 0
+    assert verify_model(model, model.names, [], 4.0)[0] == 0
 
 
 def test_pairs_with_few_matches_do_not_count(generator):
@@ -79,7 +77,7 @@ def test_pairs_with_few_matches_do_not_count(generator):
         for pair in pairs_of(model, points, {(0, 4): 20, (0, 5): 20})
     ]
     assert agreement(model, pairs[4], 4.0) < 0.5
-    assert verify_model(model, model.names, pairs, 4.0).misplaced == {}
+    assert verify_model(model, model.names, pairs, 4.0)[1] == {}
 
 
 def test_photographs_missing_from_the_model_do_not_count(generator):
@@ -90,7 +88,5 @@ def test_photographs_missing_from_the_model_do_not_count(generator):
         for pair in pairs_of(model, points)
     ]
     stray = pairs[0].replace(views=(0, 1), first=pairs[0].first.flip(0))
-    assert verify_model(model, files, [stray, *pairs], 4.0).misplaced == {}
-    assert verify_model(rotated(model, 5), files, [stray, *pairs], 4.0).misplaced.keys() == {
-        "5.png"
-    }
+    assert verify_model(model, files, [stray, *pairs], 4.0)[1] == {}
+    assert verify_model(rotated(model, 5), files, [stray, *pairs], 4.0)[1].keys() == {"5.png"}

@@ -8,7 +8,7 @@ import torch
 from pimper_torch.records.sparse_model import select_views
 from pimper_torch.runtime.errors import PimperWarning
 from pimper_torch.stages.sfm import registration
-from pimper_torch.stages.sfm.diagnose import MatchConsistency, count_views_with_depth
+from pimper_torch.stages.sfm.diagnose import count_views_with_depth
 from pimper_torch.stages.sfm.features import Workspace
 from pimper_torch.stages.sfm.matching import VerifiedPair, all_pairs
 from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
@@ -40,14 +40,12 @@ class Scripted:
 
     def map(self, space, seed, *, pairs_count):
         self.mapped.append((seed, pairs_count))
-        self.databases.append(space.database_name)
+        self.databases.append(space.database.name)
         return [self.models.pop(0)]
 
     def judge(self, model, files, pairs, max_error_px):
-        return MatchConsistency(
-            inlier_ratio=self.inlier_ratio.pop(0) if self.inlier_ratio else 1.0,
-            misplaced=self.misplaced.pop(0) if self.misplaced else {},
-        )
+        inlier_ratio = self.inlier_ratio.pop(0) if self.inlier_ratio else 1.0
+        return inlier_ratio, self.misplaced.pop(0) if self.misplaced else {}
 
 
 @pytest.fixture
@@ -92,7 +90,13 @@ def scripted(model, monkeypatch):
 @pytest.fixture
 def space(model, tmp_path):
     (tmp_path / "database.db").write_bytes(b"features and matches")
-    return Workspace(folder=tmp_path, files=model.names, masked=False)
+    return Workspace(
+        folder=tmp_path,
+        images=tmp_path,
+        files=model.names,
+        masks=None,
+        database=tmp_path / "database.db",
+    )
 
 
 NEIGHBOURS = (True, [(0, 1), (1, 2), (2, 3), (3, 4)])

@@ -37,7 +37,7 @@ def read_photographs(
     if max_size_px < 0:
         raise InputError(f"max_size_px is {max_size_px}; needed: 0, or the longest side in pixels.")
     headers = [read_header(existing(path)) for path in paths]
-    sizes = [shrunk_size(header, max_size_px) for header in headers]
+    sizes = [shrunk_size(header.width, header.height, max_size_px) for header in headers]
     warn_of_responses(paths[0].parent, paths, headers, encoding)
     images, transparent = read_pictures(paths, headers, sizes, encoding)
     files = [None] * len(paths) if masks is None else masks

@@ -206,12 +206,11 @@ def with_relocated_points(
 
     No vertex is a point of the cloud, as all have moved.
     """
-    points, covariance, vertices = coarse.points, coarse.covariance_world, mesh.vertices_world
+    points = coarse.points
     return CoarseMesh(
         mesh=mesh,
         reference=coarse.reference,
-        is_point=torch.zeros_like(vertices[:, 0], dtype=torch.bool),
-        covariance_world=None if covariance is None else covariance.new_zeros(len(vertices), 3, 3),
+        is_point=torch.zeros_like(mesh.vertices_world[:, 0], dtype=torch.bool),
         points=None if points is None else _relocated(coarse, points, split, index),
         support=None if coarse.support is None else coarse.support[split.parent[index >= 0]],
     )

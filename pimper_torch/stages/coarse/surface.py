@@ -178,7 +178,6 @@ def _with_points(
         mesh=mesh.replace(normals_world=smoothed_normals(vertices, faces)),
         reference=reference,
         is_point=torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device),
-        covariance_world=torch.zeros_like(vertices)[:, :, None].expand(-1, 3, 3),
         points=FacetPoints(
             points_world=scene.points_world[reliable[near]],
             covariance_world=point_covariances(scene, reliable[near]),

@@ -13,8 +13,7 @@ a misplaced view do not. Pairs with few matches are no evidence: a third of a ca
 the correct model, because its sides look alike.
 """
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import torch
@@ -194,21 +193,6 @@ def following_fraction(model: SparseModel) -> float:
 _MIN_AGREEMENT = 0.5
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MatchConsistency:
-    """Agreement of a model with the verified matches of its photographs.
-
-    Attributes:
-        inlier_ratio: Fraction of all verified matches that agree with the model's epipolar
-            geometry; matches of photographs that the model lacks count as outliers.
-        misplaced: By name, views that contradict most matches of their strongest pairs, with the
-            fraction that agrees.
-    """
-
-    inlier_ratio: float
-    misplaced: Mapping[str, float]
-
-
 def pairs_in(
     model: SparseModel, names: Sequence[str], pairs: Sequence[VerifiedPair]
 ) -> list[VerifiedPair]:
@@ -223,8 +207,14 @@ def pairs_in(
 
 def verify_model(
     model: SparseModel, files: Sequence[str], pairs: Sequence[VerifiedPair], max_error_px: float
-) -> MatchConsistency:
-    """Compute the agreement of a model with verified matches."""
+) -> tuple[float, dict[str, float]]:
+    """Compute the agreement of a model with the verified matches of its photographs.
+
+    Returns:
+        The fraction of all matches that agree with the model's epipolar geometry, those of
+        photographs that the model lacks counted as outliers; and, by name, views that contradict
+        most matches of their strongest pairs, with the fraction that agrees.
+    """
     inside = pairs_in(model, files, pairs)
     agrees = match_errors(model, inside) <= max_error_px
     counts = [pair.num_matches for pair in inside]
@@ -240,8 +230,7 @@ def verify_model(
             misplaced[name] = fraction
     total = sum(pair.num_matches for pair in pairs)
     compared = sum(count for count, _ in agreeing.values())
-    inlier_ratio = _agreeing_fraction(agreeing.values()) * compared / total if total else 0.0
-    return MatchConsistency(inlier_ratio=inlier_ratio, misplaced=misplaced)
+    return _agreeing_fraction(agreeing.values()) * compared / total if total else 0.0, misplaced
 
 
 def _agreeing_fraction(pairs: Collection[tuple[int, float]]) -> float:

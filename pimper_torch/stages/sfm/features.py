@@ -27,30 +27,17 @@ class Workspace:
     """A folder with the files of one run.
 
     Attributes:
+        images: Folder of the photographs.
         files: Names of the photographs in ``images``, in the order of the views.
-        masked: Whether ``masks`` contains a mask for each, under its name plus ``.png``, as COLMAP
-            requires.
+        masks: Folder with a mask of each, under its name plus ``.png``, as COLMAP requires.
+        database: COLMAP's database.
     """
 
     folder: Path
+    images: Path
     files: tuple[str, ...]
-    masked: bool
-    database_name: str = "database.db"
-
-    @property
-    def images(self) -> Path:
-        """Folder of the photographs."""
-        return self.folder / "images"
-
-    @property
-    def masks(self) -> Path:
-        """Folder of the masks."""
-        return self.folder / "masks"
-
-    @property
-    def database(self) -> Path:
-        """COLMAP's database."""
-        return self.folder / self.database_name
+    masks: Path | None
+    database: Path
 
 
 @contextmanager
@@ -60,30 +47,31 @@ def workspace(views: Views, threads: int) -> Iterator[Workspace]:
     Photographs are 8-bit gray in sRGB, without their padding.
     """
     with scratch() as folder:
-        space = Workspace(
-            folder=folder,
-            files=tuple(f"{index:06d}.png" for index in range(views.num_views)),
-            masked=views.masks is not None,
-        )
-        space.images.mkdir()
-        space.masks.mkdir()
+        (images := folder / "images").mkdir()
+        (masks := folder / "masks").mkdir()
+        files = tuple(f"{index:06d}.png" for index in range(views.num_views))
 
         def write(index: int) -> None:
             width, height = (int(side) for side in views.sizes_px[index])
             pixels = to_bytes(views.images[index, :, :height, :width].detach()).cpu()
             picture = Image.fromarray(pixels.movedim(0, -1).squeeze(-1).numpy()).convert("L")
             # Fast compression: the files live for seconds. COLMAP uses luma alone.
-            picture.save(space.images / space.files[index], compress_level=1)
+            picture.save(images / files[index], compress_level=1)
             if views.masks is not None:
                 mask = views.masks[index, :height, :width].cpu().numpy().astype(np.uint8) * 255
-                path = space.masks / f"{space.files[index]}.png"
-                Image.fromarray(mask).save(path, compress_level=1)
+                Image.fromarray(mask).save(masks / f"{files[index]}.png", compress_level=1)
             drop_pages()
 
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(write, range(views.num_views)))
         release_memory()
-        yield space
+        yield Workspace(
+            folder=folder,
+            images=images,
+            files=files,
+            masks=None if views.masks is None else masks,
+            database=folder / "database.db",
+        )
 
 
 # Side of photographs below which COLMAP 4.2's covariant detector reads out of bounds.
@@ -125,15 +113,13 @@ def find_features(
     options.sift.estimate_affine_shape = settings.affine_shape
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = settings.camera_model
-    if space.masked:
+    if space.masks:
         reader.mask_path = str(space.masks)
     shared = len(set(lenses)) == 1
     mode = pycolmap.CameraMode.SINGLE if shared else pycolmap.CameraMode.PER_IMAGE
     with quiet():
         pycolmap.Database.open(space.database).close()
-        _import(space, reader, lenses)
-        with pycolmap.Database.open(space.database) as database:
-            _set_focals(database, dict(zip(space.files, focals_px, strict=True)))
+        _import(space, reader, focals_px, lenses)
         step = 2 * settings.num_threads  # photographs between two reports of progress
         for start in track(range(0, len(space.files), step)):
             pycolmap.extract_features(
@@ -155,7 +141,12 @@ def image_ids(database: Any, space: Workspace) -> list[int]:  # noqa: ANN401 - p
     return [ids[file] for file in space.files]
 
 
-def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # noqa: ANN401 - no types
+def _import(
+    space: Workspace,
+    reader: Any,  # noqa: ANN401 - pycolmap is untyped
+    focals_px: Sequence[float | None],
+    lenses: Sequence[int],
+) -> None:
     """Add photographs to the database in their order, each with the camera of its lens."""
     pycolmap = loaded()
     cameras: dict[int, int] = {}
@@ -168,18 +159,13 @@ def _import(space: Workspace, reader: Any, lenses: Sequence[int]) -> None:  # no
             with pycolmap.Database.open(space.database) as database:
                 cameras[lens] = database.read_image_with_name(files[0]).camera_id
     reader.existing_camera_id = -1
-
-
-def _set_focals(database: Any, focals_px: dict[str, float | None]) -> None:  # noqa: ANN401 - no types
-    focals_of: dict[int, list[float]] = {}
-    for image in database.read_all_images():
-        if (focal := focals_px[image.name]) is not None:
-            focals_of.setdefault(image.camera_id, []).append(focal)
-    for camera in database.read_all_cameras():
-        if camera.camera_id not in focals_of:
-            continue
-        params = np.array(camera.params)
-        params[list(camera.focal_length_idxs())] = np.median(focals_of[camera.camera_id])
-        camera.params = params
-        camera.has_prior_focal_length = True
-        database.update_camera(camera)
+    with pycolmap.Database.open(space.database) as database:
+        for number, camera_id in cameras.items():
+            pairs = zip(focals_px, lenses, strict=True)
+            if known := [focal for focal, lens in pairs if lens == number and focal is not None]:
+                camera = database.read_camera(camera_id)
+                params = np.array(camera.params)
+                params[list(camera.focal_length_idxs())] = np.median(known)
+                camera.params = params
+                camera.has_prior_focal_length = True
+                database.update_camera(camera)

@@ -154,7 +154,7 @@ def register_photographs(space: Workspace, settings: ReconstructConfig) -> Regis
     missing or misplaced photographs with all others.
     """
     match_pairs(space, pairs_to_match(space), settings)
-    other = replace(space, database_name="other.db")  # for an alternative hypothesis
+    other = replace(space, database=space.folder / "other.db")  # for an alternative hypothesis
     shutil.copyfile(space.database, other.database)
     plain = _registered(space, settings)
     if plain.sound:
@@ -247,12 +247,13 @@ def _mapped(
             models=(), spread=(), missing=space.files, misplaced={}, inlier_ratio=0.0
         )
     # Twice the distance of verification: the lens is now that of the model.
-    consistency = verify_model(models[0], space.files, verified, 2 * settings.max_error_px)
+    max_error_px = 2 * settings.max_error_px
+    inlier_ratio, misplaced = verify_model(models[0], space.files, verified, max_error_px)
     unreliable = bool(diagnose(models[0], len(space.files)))
     return Registration(
         models=models,
         spread=tuple(spread for spread, _ in counted),
         missing=tuple(file for file in space.files if file not in models[0].names),
-        misplaced=consistency.misplaced,
-        inlier_ratio=0.0 if unreliable else consistency.inlier_ratio,
+        misplaced=misplaced,
+        inlier_ratio=0.0 if unreliable else inlier_ratio,
     )

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.lens_models import photographed, pinhole_lenses
-from pimper_torch.geometry.local_frame import NO_OFFSET, from_local, local_origin, to_local
+from pimper_torch.geometry.local_frame import from_local, local_origin, to_local
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.undistortion import undistort
@@ -33,11 +33,10 @@ def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
         its origin, such as a georeferenced one, is shifted, see ``SparseScene.offset_world``.
     """
     offset = local_origin(model.cam_from_world, model.points_world)
-    if offset != NO_OFFSET:
-        model = model.replace(
-            cam_from_world=to_local(model.cam_from_world, offset),
-            points_world=model.points_world - model.points_world.new_tensor(offset),
-        )
+    model = model.replace(
+        cam_from_world=to_local(model.cam_from_world, offset),
+        points_world=model.points_world - model.points_world.new_tensor(offset),
+    )
     undistorted, intrinsics = undistort(registered_views(views, model), model.lenses)
     like = views.images
     scene = SparseScene(

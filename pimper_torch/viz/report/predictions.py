@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pimper_torch.geometry.pixels import scale_intrinsics
+from pimper_torch.io.photographs import shrunk_size
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.records import Mesh, Record, Relighting, Silhouettes, SparseScene, ViewLights
 from pimper_torch.records.shapes import Map
@@ -36,13 +37,7 @@ def shrunk_to(
 ) -> Float[Tensor, "channel shorter narrower"]:
     """Shrink an image by averaging until its longer side is ``longest`` pixels, if it is larger."""
     height, width = image.shape[-2:]
-    return interpolate(image[None], size=_sides(height, width, longest), mode="area")[0]
-
-
-def _sides(first: int, second: int, longest: int) -> tuple[int, int]:
-    """Return the sides of an image that is shrunk until both are at most ``longest``."""
-    factor = min(1.0, longest / max(first, second))
-    return max(1, round(factor * first)), max(1, round(factor * second))
+    return interpolate(image[None], size=shrunk_size(height, width, longest), mode="area")[0]
 
 
 def jpeg(radiance: Float[Tensor, "channel height width"]) -> str:
@@ -98,7 +93,7 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
     def of_view(view: int) -> Prediction:
         light, camera = relighting.lights.take([view]), scene.cameras.take([view])
         width, height = camera.sizes_px[0].tolist()
-        sides = _sides(width, height, longest)
+        sides = shrunk_size(width, height, longest)
         camera = camera.replace(
             intrinsics=scale_intrinsics(camera.intrinsics, sides[0] / width, sides[1] / height),
             sizes_px=torch.tensor([sides]),
