@@ -28,12 +28,12 @@ _COMPUTE = (
 
 @cache
 def code() -> str:
-    """Return a hash of all source files of the package and of the versions it computes with."""
+    """Return a hash of all code and weights of the package and of the versions it computes with."""
     hashed = hashlib.blake2b(digest_size=16)
     for name in _COMPUTE:
         with suppress(PackageNotFoundError):  # optional, or installed without metadata
             hashed.update(f"{name} {version(name)} ".encode())
-    for path in sorted(_PACKAGE.rglob("*.py")):
+    for path in sorted([*_PACKAGE.rglob("*.py"), *_PACKAGE.rglob("*.safetensors")]):
         hashed.update(path.relative_to(_PACKAGE).as_posix().encode() + path.read_bytes())
     return hashed.hexdigest()
 

@@ -19,7 +19,7 @@ WITHOUT = {
     "Views": {"images", "focals_px"},
     "Cameras": {"intrinsics"},
     "SparseScene": {"reprojection_errors_px", "observation_pixels", "background_from_view"},
-    "Silhouettes": {"inside"},
+    "Silhouettes": {"inside", "expected_overlap"},
     "Mesh": {"normals_world", "albedo", "confidence"},
     "Templates": {"barycentric", "normals_patch"},
     "Photometry": {"normals_patch", "albedo", "lights_patch", "information", "exposure"},

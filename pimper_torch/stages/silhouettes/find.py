@@ -20,7 +20,7 @@ from pimper_torch.runtime.mapped import by_view
 from pimper_torch.stages.silhouettes.cues import Cues, cues_of
 from pimper_torch.stages.silhouettes.cuts import NUM_VOXELS, Cuts, cut_in_iterations
 from pimper_torch.stages.silhouettes.given import contradictory
-from pimper_torch.stages.silhouettes.network import load_network
+from pimper_torch.stages.silhouettes.network import own_network
 from pimper_torch.stages.silhouettes.read_again import read_again
 from pimper_torch.stages.silhouettes.reliability import (
     MAX_EXPOSED,
@@ -59,7 +59,7 @@ class FindSilhouettes(Stage):
     ) -> None:
         super().__init__()
         self.config = config or SilhouetteConfig()
-        self.network = load_network() if network is None else network
+        self.network = network
 
     @torch.no_grad()
     def forward(self, scene: SparseScene) -> Silhouettes:
@@ -128,7 +128,7 @@ class FindSilhouettes(Stage):
             cuts, reason = _cut(cues.seed_at_fixation())
         unguided = cues.soft is None and not self.config.region
         if cuts is not None and cues.plane is not None and unguided:
-            cuts = read_again(cues, cuts, self.network)
+            cuts = read_again(cues, cuts, self.network or own_network())
             reason = _unreliable_reason(cuts)
         leave_out("silhouettes.disagreement", bool(reason))
         if cuts is None or reason:

@@ -5,6 +5,7 @@ Trained on rendered captures by ``benchmarks/studies/train_silhouettes.py``.
 Source: Ronneberger, Fischer & Brox, U-Net, MICCAI 2015, for the architecture.
 """
 
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -82,6 +83,12 @@ def load_network(path: Path | str = _WEIGHTS) -> SilhouetteNetwork:
     network = SilhouetteNetwork()
     network.load_state_dict({name: value.float() for name, value in load_file(path).items()})
     return network.eval().requires_grad_(False)
+
+
+@cache
+def own_network() -> SilhouetteNetwork:
+    """Return the package's own network; loaded once, as a chain has no parameters of its own."""
+    return load_network()
 
 
 @torch.no_grad()
