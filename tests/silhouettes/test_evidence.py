@@ -96,6 +96,26 @@ def test_cuts_that_lost_a_part_are_mended(staged, evidence):
     assert overlap(again.margins_px > 0, staged.truth).min() > 0.9
 
 
+class Holed(Points):
+    """Points, but sure of a hole."""
+
+    def forward(self, maps):
+        odds = super().forward(maps)
+        odds[:, 80:95, 110:130] = -9
+        return odds
+
+
+def test_occluded_pixels_stay_in_the_cut(staged, evidence):
+    cuts = cut_in_iterations(evidence.cues)
+    hidden = torch.zeros_like(cuts.masks)
+    hidden[0, 80:95, 110:130] = True
+    assert (staged.truth[:2, 80:95, 110:130]).all()
+    again = read_again(evidence.cues, cuts.replace(hidden=hidden), Holed())
+    assert again.masks[0, 80:95, 110:130].all()
+    assert not again.masks[1, 83:92, 113:127].any()
+    assert torch.equal(again.hidden, hidden)
+
+
 def test_cuts_stay_if_the_network_sees_no_object(evidence):
     cuts = cut_in_iterations(evidence.cues)
     assert read_again(evidence.cues, cuts, Nothing()) is cuts

@@ -128,7 +128,8 @@ class FindSilhouettes(Stage):
             cuts, reason = _cut(cues.seed_at_fixation())
         unguided = cues.soft is None and not self.config.region
         if cuts is not None and cues.plane is not None and unguided:
-            cuts = read_again(cues, cuts, self.network or own_network())
+            network = own_network() if self.network is None else self.network
+            cuts = read_again(cues, cuts, network)
             reason = _unreliable_reason(cuts)
         leave_out("silhouettes.disagreement", bool(reason))
         if cuts is None or reason:

@@ -1,7 +1,7 @@
 """Cuts read again by a network that sees all cues, the cuts and their hull."""
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from pimper_torch.geometry.opencv import opening, without_specks
 from pimper_torch.records.shapes import Map, Mask, Scalar
@@ -30,13 +30,11 @@ def read_again(cues: Cues, cuts: Cuts, network: nn.Module) -> Cuts:
         The last cuts that have something in common.
     """
     before, cues = cuts, cues.replace(agreement=cuts.agreement)
+    hidden = torch.zeros_like(cuts.masks) if cuts.hidden is None else cuts.hidden
     for _ in range(_READINGS):
         odds = read(Evidence.of(cues, cuts), network)
-        masks = by_view(overruled, cuts.masks, odds)
-        inside = by_view(Tensor.float, masks)
-        if cuts.hidden is not None:
-            inside.masked_fill_(cuts.hidden, 0.5)
-        margins_px = hull_margins(cues, inside)
+        masks = by_view(overruled, cuts.masks, odds) | hidden
+        margins_px = hull_margins(cues, masks.float().masked_fill_(hidden, 0.5))
         if margins_px is None:
             break
         masks = by_view(
@@ -44,15 +42,15 @@ def read_again(cues: Cues, cuts: Cuts, network: nn.Module) -> Cuts:
             masks,
             margins_px,
         )
-        changed = by_view(lambda old, new: (old ^ new).sum() / old.sum(), cuts.masks, masks)
-        again = bool(changed.median() > _CHANGED)
+        areas = cuts.masks.sum(dim=(1, 2)).clamp_min(1)
+        again = bool(((masks ^ cuts.masks).sum(dim=(1, 2)) / areas).median() > _CHANGED)
         cues = cues.relearned(masks) if again else cues
-        hidden, expected = cuts.hidden, by_view(expected_overlap, masks, odds)
+        expected = by_view(expected_overlap, masks, odds)
         cuts = cuts_of(cues, masks, margins_px, cuts.rejected)
-        cuts = cuts.replace(hidden=hidden, expected=expected)
+        cuts = cuts.replace(hidden=before.hidden, expected=expected)
         if not again:
             break
-    leave_out("silhouettes.read_again", by_view(lambda x, y: x & ~y, before.masks, cuts.masks))
+    leave_out("silhouettes.read_again", before.masks & ~cuts.masks)
     return cuts
 
 
