@@ -116,10 +116,9 @@ def supporting_plane(
     best = torch.where(fits, on[1], -1).argmax()
     plane = Plane(normal_world=normals[best], offset=offsets[best])
     for _ in range(3):
-        near = plane.height_of(points_world).abs() < tolerance
-        close, share = points_world[near], weight[near, None] / weight[near].sum()
-        centre = (share * close).sum(dim=0)
-        normal = torch.linalg.svd(share.sqrt() * (close - centre), full_matrices=False).Vh[2]
+        close = points_world[plane.height_of(points_world).abs() < tolerance]
+        centre = close.mean(dim=0)
+        normal = torch.linalg.svd(close - centre, full_matrices=False).Vh[2]
         normal = normal * torch.where(normal @ plane.normal_world < 0, -1.0, 1.0).to(normal)
         plane = Plane(normal_world=normal, offset=normal @ centre)
     return plane
