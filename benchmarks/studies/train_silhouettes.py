@@ -226,9 +226,11 @@ def loss_of(network: SilhouetteNetwork, maps: Tensor, truth: Tensor) -> Tensor:
 
 
 def calibrate(network: SilhouetteNetwork, captures: Sequence[np.ndarray]) -> None:
-    """Scale and shift the odds of a network so that they are right on captures left out."""
+    """Scale and shift the odds of a network so that they are right on captures left out, if any."""
     samples = []
     network.calibration.copy_(torch.tensor([1.0, 0.0]))
+    if not captures:
+        return
     for stored in (view for capture in captures for view in capture[::3]):
         values = torch.from_numpy(np.array(stored)).float()
         with torch.no_grad():

@@ -6,6 +6,7 @@ import torch
 import train_silhouettes as study
 
 from pimper_torch.stages.silhouettes.evidence import MAPS
+from pimper_torch.stages.silhouettes.network import load_network
 
 GROUPS = list(MAPS.values())
 
@@ -87,3 +88,9 @@ def test_odds_are_calibrated_on_captures(stored):
     assert after < 0.5 * before
     study.calibrate(network, captures)
     assert torch.allclose(network.calibration, found)
+
+
+def test_weights_are_written_without_captures_to_test_on(tmp_path):
+    study.Run(tmp_path, minutes=1).finish([])
+    network = load_network(tmp_path / "silhouettes.safetensors")
+    assert network.calibration.tolist() == [1, 0]
