@@ -152,7 +152,8 @@ def meshes(tmp_path):
 def test_six_captures_are_judged_once_and_printed_again(meshes, tmp_path, capsys, monkeypatch):
     common = ["--out", str(tmp_path / "out"), "--meshes", str(meshes), "--tiny", "--tag", "now"]
     run = [*common, "--outlines", "--preset", "fast"]
-    study.main([*run, "--subset"])
+    weights = Path(pimper_torch.__file__).parent / "data" / "silhouettes.safetensors"
+    study.main([*run, "--subset", "--weights", str(weights)])
     rows = sorted((tmp_path / "out" / "rows" / "now").iterdir())
     assert [path.stem for path in rows] == sorted(SUBSET)
     found = [json.loads(path.read_text(encoding="utf-8")) for path in rows]
