@@ -219,7 +219,7 @@ def camera_formats(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
 
 def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
     scene, _ = ball.photographed((0.0, 0.3, 1.0), views=3)
-    chain = pimper_torch.load_chain("default")
+    chain = pimper_torch.load_chain("default", judge=pimper_torch.stages.Given(None))
     result = Found(
         mesh=ball.ball_mesh(),
         scene=scene,

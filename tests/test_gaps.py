@@ -28,7 +28,7 @@ GAPS = {
         *("gauge", "integrate", "align", "refine", "extract"),
     ),
 }
-FINISHING = ("simplify", "relight", "texture", "judge_textures")
+FINISHING = ("simplify", "relight", "texture", "judge_textures", "judge")
 
 
 class Mine(nn.Module):
@@ -116,7 +116,7 @@ def test_a_module_after_a_finishing_stage_receives_its_record():
     result = chain.finish(chain(views))
     assert all(own.handed for own in mine.values())
     assert torch.equal(result.asset.normal, plain.finish(plain(views)).asset.normal)
-    assert [report.name for report in result.report][-5:] == [
+    assert [report.name for report in result.report][-6:] == [
         *FINISHING,
         "between stages",
     ]

@@ -32,6 +32,7 @@ from pimper_torch.records import (
     Surface,
     SweptPatches,
     TexturedMesh,
+    Verdict,
     Views,
 )
 from pimper_torch.runtime.config import nearest
@@ -46,6 +47,7 @@ from pimper_torch.stages.meshing.finish import Simplify
 from pimper_torch.stages.relighting.held_out import JudgeTextures, Relight
 from pimper_torch.stages.stage import Stage, check_handed
 from pimper_torch.stages.texturing.bake import Texture
+from pimper_torch.stages.verdict.judge import Judge
 from pimper_torch.store import Store
 
 
@@ -136,6 +138,7 @@ class Chain(Stage):
         self.relight: Callable[..., Relighting] = Relight()
         self.texture: Callable[[Mesh, Mesh, Relighting], TexturedMesh] = Texture()
         self.judge_textures: Callable[..., Relighting] = JudgeTextures()
+        self.judge: Callable[[Reconstruction], Verdict] = Judge()
         self.preview: Callable[[SparseScene, CoarseMesh], None] | None = None
         self.watch: Callable[[SparseScene | Step], None] | None = None
         self.needed: tuple[str, ...] = ()
@@ -294,7 +297,7 @@ class Chain(Stage):
         """Prepare a result for export, on the CPU.
 
         Adds a mesh with fewer vertices, the lights and materials that predict the photographs (the
-        held-out ones, if any), and textures for a mesh of few faces.
+        held-out ones, if any), textures for a mesh of few faces, and the verdict.
         """
         result = result.to("cpu")
         scene, held_out, silhouettes = result.scene, result.held_out, result.silhouettes
@@ -306,11 +309,11 @@ class Chain(Stage):
             # Against the same photographs as the mesh.
             references = (scene, silhouettes) if held_out is None else (held_out, None)
             relighting = run(self.judge_textures, relighting, asset, *references)
+            result = result.replace(finished=finished, relighting=relighting, asset=asset)
+            verdict = run(self.judge, result)
             warn_of(entries)
         return result.replace(
-            finished=finished,
-            relighting=relighting,
-            asset=asset,
+            verdict=verdict,
             report=table_of([*result.report, *table.reports]),
             failures=(*result.failures, *failures_of(entries)),
             left_out=(*result.left_out, *left_out_of(entries)),

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +161,7 @@ def _summary(result: Reconstruction, about: Mapping[str, Any]) -> dict[str, Any]
         **({"caps": ready.caps} if ready.caps else {}),
         "asset": asset.summary,
         "relighting": reports.relighting_report(relighting),
+        "verdict": None if result.verdict is None else asdict(result.verdict),
         "thumbnails": thumbnails(result.scene.views),
     }
 

@@ -5,6 +5,7 @@ from pimper_torch.records.finished import FinishedMesh as FinishedMesh
 from pimper_torch.records.finished import Materials as Materials
 from pimper_torch.records.finished import Relighting as Relighting
 from pimper_torch.records.finished import TexturedMesh as TexturedMesh
+from pimper_torch.records.finished import Verdict as Verdict
 from pimper_torch.records.finished import ViewErrors as ViewErrors
 from pimper_torch.records.finished import ViewLights as ViewLights
 from pimper_torch.records.heights import AlignStatus as AlignStatus

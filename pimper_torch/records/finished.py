@@ -161,3 +161,23 @@ class TexturedMesh(Record):
         height, width = self.normal.shape[:2]
         faces = len(self.mesh.faces)
         return {"faces": faces, "charts": self.charts, "width_px": width, "height_px": height}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Verdict(Record):
+    """Whether a result can be trusted, by figures of the run.
+
+    Attributes:
+        score: In [0, 1]: at least 0.5 for a good result, 0 for one that is not usable.
+        text: In one or two sentences, with the reasons and the worst photograph.
+        scores: Of each figure; the least one is that of the result.
+    """
+
+    score: float
+    text: str
+    scores: dict[str, float]
+
+    @property
+    def good(self) -> bool:
+        """Whether no figure is worse than those of good results."""
+        return self.score >= 0.5

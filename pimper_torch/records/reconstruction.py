@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from pimper_torch.records.finished import FinishedMesh, Relighting, TexturedMesh
+from pimper_torch.records.finished import FinishedMesh, Relighting, TexturedMesh, Verdict
 from pimper_torch.records.heights import DepthPatches, SweptPatches
 from pimper_torch.records.record import Record
 from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
@@ -26,8 +26,8 @@ class Reconstruction(Record):
         failures: Items that failed and were skipped.
         left_out: Items that guards removed or reported, in order.
         held_out: Photographs for evaluation, used only to estimate cameras; ``None`` without any.
-        finished: The surface as written. ``finished``, ``relighting`` and ``asset`` are ``None``
-            until :meth:`~pimper_torch.chains.chain.Chain.finish` has made them.
+        finished: The surface as written. ``finished``, ``relighting``, ``asset`` and ``verdict``
+            are ``None`` until :meth:`~pimper_torch.chains.chain.Chain.finish` has made them.
     """
 
     mesh: Mesh
@@ -42,6 +42,7 @@ class Reconstruction(Record):
     finished: FinishedMesh | None = None
     relighting: Relighting | None = None
     asset: TexturedMesh | None = None
+    verdict: Verdict | None = None
 
     @property
     def cameras(self) -> Cameras:

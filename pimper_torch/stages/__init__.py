@@ -4,7 +4,7 @@
 ``TraceContours``, ``CoarseSurface`` and ``DepthFromLight``; for each scale ``Decompose``, ``Warp``,
 ``FitLight``, ``Factorize``, ``Sweep``, ``FixGauge``, ``Fuse``, ``Repair`` and ``Remesh``; then
 ``Extract``.
-``Chain.finish`` runs ``Simplify``, ``Relight`` and ``Texture``.
+``Chain.finish`` runs ``Simplify``, ``Relight``, ``Texture``, ``JudgeTextures`` and ``Judge``.
 """
 
 import sys

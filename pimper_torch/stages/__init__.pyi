@@ -28,3 +28,4 @@ from .stage import Stage as Stage
 from .stage import Then as Then
 from .sweep.sweep import Sweep as Sweep
 from .texturing.bake import Texture as Texture
+from .verdict.judge import Judge as Judge

@@ -93,7 +93,7 @@ def test_values_that_do_not_match_the_patches_are_refused(lift):
 def test_the_repr_of_a_result_has_a_few_lines(reconstruction):
     shown = str(reconstruction)
     assert len(shown) < 600
-    assert len(shown.splitlines()) == 13
+    assert len(shown.splitlines()) == 14
     assert "  mesh: Mesh(vertex 225, face 392, channel 3)" in shown
     assert "  patches: DepthPatches(patch 2)" in shown
     assert "  report: 2 StageReport" in shown

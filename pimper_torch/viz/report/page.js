@@ -144,6 +144,7 @@
   const some = (names) => names.slice(0, 8).join(", ") + (names.length > 8 ? ` and ${names.length - 8} more` : "");
 
   const warnings = [...(summary.diagnosis ? [summary.diagnosis] : []), ...(summary.warnings || [])];
+  if (summary.verdict) section("Verdict", make("p", {}, ...prose(summary.verdict.text)));
   section("Warnings", warnings.length
     ? make("ul", {}, ...warnings.map((text) => make("li", {}, ...prose(text)))) : faint("None."));
 

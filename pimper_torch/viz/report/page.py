@@ -31,7 +31,7 @@ _PLACE = re.compile(r"/\*\{([a-z.]+)\}\*/|\{(data|asset)\}")
 
 # Keys of summary.json on the page; paths on the run's machine are excluded, as pages are shared.
 _SHOWN = (
-    *("diagnosis", "warnings", "failures", "stages", "seconds", "peak_memory_mb"),
+    *("verdict", "diagnosis", "warnings", "failures", "stages", "seconds", "peak_memory_mb"),
     *("peak_memory_stage", "registered", "views", "triangles", "vertices", "simplified"),
     *("reduced", "relighting"),
 )

@@ -1,0 +1,1 @@
+"""Verdict on a result, from the figures of its run."""

@@ -1,0 +1,160 @@
+"""The stage that says whether a result is good, and if not, why."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pimper_torch.geometry.coverage import coverage_by
+from pimper_torch.records import Reconstruction, SilhouetteCoverage, Silhouettes, Verdict
+from pimper_torch.stages.stage import Stage
+
+# Values of each figure that score 0, a half and 1: unusable, the last of good results, and best.
+# Fitted to half of a fleet of rendered captures: docs/decisions.md, "The verdict".
+LIMITS = {
+    "registered": (0.4, 0.8, 1.0),
+    "reliable": (0.2, 0.7, 1.0),
+    "expected_overlap": (0.6, 0.855, 1.0),
+    "covered": (0.7, 0.95, 1.0),
+    "sticking_out": (0.3, 0.04, 0.0),
+    "predicted_db": (12.0, 22.0, 40.0),
+    "determined": (0.0, 0.4, 1.0),
+}
+
+_MASKS = "Check masks/, correct them, and give them by `--masks`."
+
+
+class Judge(Stage):
+    """Compare figures of a run with those of good results. Not differentiable."""
+
+    @torch.no_grad()
+    def forward(self, result: Reconstruction) -> Verdict:
+        """Return the verdict, which is that of the least favourable figure.
+
+        Args:
+            result: With relighting, see :meth:`~pimper_torch.chains.chain.Chain.finish`.
+        """
+        figures = {each.name: each for each in _figures(result)}
+        scores = {name: score_of(name, each.value) for name, each in figures.items()}
+        worst = figures[min(scores, key=lambda name: scores[name])]
+        score = scores[worst.name]
+        if result.scene.diagnosis:
+            return Verdict(score=0.0, text=f"Not usable: {result.scene.diagnosis}", scores=scores)
+        if score >= 0.5:
+            text = f"Good: {_praise(result)}."
+        else:
+            word = f"Look at {worst.photograph}" if score > 0 else "Not usable"
+            text = f"{word}: {worst.reason}. {worst.advice}"
+        return Verdict(score=score, text=text, scores=scores)
+
+
+class _Figure(NamedTuple):
+    """A figure of a run, and the sentences that are said if it is bad."""
+
+    name: str
+    value: float
+    photograph: str
+    reason: str
+    advice: str
+
+
+def _praise(result: Reconstruction) -> str:
+    """Return what a good result is made of, and how accurate it should be."""
+    mesh, count = result.mesh, len(result.scene.views.names)
+    text = f"from {count} of {count + len(result.scene.unregistered)} photographs"
+    if mesh.expected_error is not None:
+        extent = (mesh.vertices_world.amax(dim=0) - mesh.vertices_world.amin(dim=0)).norm()
+        text += (
+            f", with an expected error of {mesh.expected_error.median() / extent:.2%} of the extent"
+        )
+    return text
+
+
+def score_of(name: str, value: float) -> float:
+    """Return the score of a figure, linear between its :data:`LIMITS`."""
+    limits = LIMITS[name]
+    sign = 1 if limits[0] < limits[-1] else -1
+    return float(np.interp(sign * value, [sign * limit for limit in limits], [0, 0.5, 1]))
+
+
+def _figures(result: Reconstruction) -> Iterator[_Figure]:
+    """Yield the figures that the run determines."""
+    scene, silhouettes, relighting = result.scene, result.silhouettes, result.relighting
+    names, reference = scene.views.names, scene.views.names[result.coarse.reference]
+    given = len(names) + len(scene.unregistered)
+    yield _Figure(
+        "registered",
+        len(names) / given,
+        next(iter(scene.unregistered), reference),
+        f"{len(names)} of {given} photographs were registered",
+        "Take photographs between those that were registered and the others.",
+    )
+    if silhouettes.source != "everything":
+        yield from _of_silhouettes(
+            silhouettes, coverage_by(result.mesh, silhouettes, result.cameras), names
+        )
+    buckets = result.patches.photometric.buckets
+    patches = max(1, sum(len(bucket.determined) for bucket in buckets))
+    determined = sum(int(bucket.determined.sum()) for bucket in buckets) / patches
+    yield _Figure(
+        "determined",
+        determined,
+        reference,
+        f"light determines the normals of only {determined:.0%} of the facets",
+        "Photograph the object under more, and more different, lights.",
+    )
+    if relighting is not None:
+        errors = relighting.errors
+        mean, worst = errors.psnr_db.nanmean(), errors.psnr_db.nan_to_num(torch.inf).argmin()
+        yield _Figure(
+            "predicted_db",
+            float(mean),
+            errors.names[int(worst)],
+            f"the surface predicts the photographs only with a PSNR of {mean:.0f} dB",
+            "Compare it with its prediction in report.html.",
+        )
+
+
+def _of_silhouettes(
+    silhouettes: Silhouettes, found: SilhouetteCoverage, names: tuple[str, ...]
+) -> Iterator[_Figure]:
+    """Yield the figures of silhouettes, and of the surface against them."""
+
+    def worst(values: Tensor, views: Tensor) -> str:
+        return names[int(views[values.argmax()])] if len(values) else names[0]
+
+    reliable, overlap = silhouettes.reliable, silhouettes.expected_overlap
+    count, every = int(reliable.sum()), torch.arange(len(reliable))
+    trusted = reliable.nonzero()[:, 0]
+    yield _Figure(
+        "reliable",
+        count / len(reliable),
+        worst((~reliable).int(), every),
+        f"{len(reliable) - count} of {len(reliable)} silhouettes contradict the others",
+        _MASKS,
+    )
+    if overlap is not None:
+        yield _Figure(
+            "expected_overlap",
+            float(overlap.mean()),
+            worst(-overlap, every),
+            f"the silhouettes are expected to overlap the object by only {overlap.mean():.0%}",
+            _MASKS,
+        )
+    lacking, exceeding = (values.mean() for values in (found.uncovered, found.outside))
+    yield _Figure(
+        "covered",
+        1 - float(lacking),
+        worst(found.uncovered, trusted),
+        f"the surface lacks {lacking:.0%} of the silhouettes",
+        "Photograph what is missing from more places, or check masks/.",
+    )
+    yield _Figure(
+        "sticking_out",
+        float(exceeding),
+        worst(found.outside, trusted),
+        f"the surface sticks out of the silhouettes by {exceeding:.0%} of their area",
+        _MASKS,
+    )
