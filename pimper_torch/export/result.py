@@ -18,7 +18,6 @@ from pimper_torch.io.estimates import mask_path, read_lights, read_reference
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photograph_files import image_name, list_images
 from pimper_torch.io.photographs import load_views, read_mask
-from pimper_torch.io.thumbnails import compare_thumbnails
 from pimper_torch.radiometry import Encoding
 from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene, Views
 from pimper_torch.records.sparse_model import SparseModel
@@ -101,8 +100,7 @@ def read_result(folder: Path | str, photographs: Path | str | None = None) -> Re
     """Read a result folder, and its photographs with the settings of the run.
 
     Photographs that were converted since are matched by their names without suffixes, with a
-    :class:`~pimper_torch.runtime.errors.PimperWarning`. A second warning names photographs that
-    differ from their thumbnails in ``summary.json``.
+    :class:`~pimper_torch.runtime.errors.PimperWarning`.
 
     Args:
         folder: As for :func:`read_written`.
@@ -113,17 +111,12 @@ def read_result(folder: Path | str, photographs: Path | str | None = None) -> Re
         On the CPU.
 
     Raises:
-        InputError: A file of the result is missing or damaged, photographs are missing, or their
-            names were exchanged.
+        InputError: A file of the result is missing or damaged, or photographs are missing.
     """
     folder = Path(folder)
     written, model = _read(folder)
-    path = photographs or written.summary.get("photographs")
-    views = _photographs(folder, path, model)
+    views = _photographs(folder, photographs or written.summary.get("photographs"), model)
     scene = assemble_scene(views, model)
-    thumbnails = written.summary.get("thumbnails")
-    if isinstance(thumbnails, Mapping):  # not in older results
-        compare_thumbnails(scene.views, thumbnails, f"{path}: photographs of {folder}")
     return Result(
         **{each.name: getattr(written, each.name) for each in fields(written)},
         scene=scene,

@@ -21,7 +21,6 @@ from pimper_torch.io.assets.usd import write_usdz
 from pimper_torch.io.assets.write import write_asset, write_asset_obj
 from pimper_torch.io.estimates import mask_path, read_lights
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
-from pimper_torch.io.thumbnails import thumbnails
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import FinishedMesh, Reconstruction, Relighting, TexturedMesh
@@ -162,7 +161,6 @@ def _summary(result: Reconstruction, about: Mapping[str, Any]) -> dict[str, Any]
         "asset": asset.summary,
         "relighting": reports.relighting_report(relighting),
         "verdict": None if result.verdict is None else asdict(result.verdict),
-        "thumbnails": thumbnails(result.scene.views),
     }
 
 

@@ -17,9 +17,9 @@ LIMITS = {
     "registered": (0.4, 0.8, 1.0),
     "reliable": (0.2, 0.7, 1.0),
     "expected_overlap": (0.6, 0.855, 1.0),
-    "covered": (0.7, 0.95, 1.0),
-    "sticking_out": (0.3, 0.04, 0.0),
-    "predicted_db": (12.0, 22.0, 40.0),
+    "covered": (0.7, 0.96, 1.0),
+    "sticking_out": (0.3, 0.045, 0.0),
+    "predicted_db": (12.0, 24.0, 40.0),
     "determined": (0.0, 0.4, 1.0),
 }
 
