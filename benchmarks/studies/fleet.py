@@ -59,7 +59,7 @@ ANNOUNCING = (
 MOST_LOST = 0.2  # of the photographs may be excluded or fail without announcement
 COLUMNS = (
     *("IoU", "worst", "expected", "lost %", "extra %", "reliable", "CPU s"),
-    *("normals °", "met %", "accuracy %", "completeness %", "good", "announced", "error"),
+    *("normals °", "met %", "accuracy %", "completeness %", "score", "good", "announced", "error"),
 )
 
 
@@ -101,7 +101,9 @@ def compared(found: torch.Tensor, known: torch.Tensor) -> Row:
 
 
 def announced(told: Mapping[str, Any]) -> bool:
-    """Return whether ``summary.json`` says that the result is bad."""
+    """Return whether ``summary.json`` says that the result is bad: its verdict, or a warning."""
+    if (told.get("verdict") or {}).get("score", 1.0) < 0.5:
+        return True
     failures = [each["names"] for each in told.get("failures", ()) if each["what"] == "view"]
     missing = max(len({*chain.from_iterable(failures)}), told["views"] - told["registered"])
     counted = any(part in text for text in told["warnings"] for part in ANNOUNCING)
@@ -121,7 +123,7 @@ def reconstructed(place: Path, result: Path, preset: str) -> Row:
     shutil.rmtree(result / STAGES, ignore_errors=True)  # of use only to an interrupted run
     told = json.loads((result / "summary.json").read_text(encoding="utf-8"))
     entries = ("views", "registered", "diagnosis", "failures", "warnings")
-    row = {name: told[name] for name in entries}
+    row = {name: told[name] for name in entries} | {"score": told["verdict"]["score"]}
     return row | {"announced": announced(told), "CPU s": sum(after[2:4]) - sum(before[2:4])}
 
 

@@ -74,6 +74,8 @@ def test_figures_of_known_masks():
         ({}, False),
         ({"warnings": ["photos: 3 of 10 are partly saturated"]}, False),
         ({"warnings": ["Everything in the photographs is treated as the object: no"]}, True),
+        ({"verdict": {"score": 0.49}}, True),
+        ({"verdict": {"score": 0.5}}, False),
         ({"diagnosis": "The cameras are unreliable"}, True),
         ({"registered": 8}, False),
         ({"registered": 7}, True),

@@ -126,10 +126,6 @@ BAD = {
         lambda result: with_reliable(result, True, False, False),
         r"b\.png: 2 of 3 silhouettes contradict the others\. ",
     ),
-    "registered": (
-        lambda result: result.replace(scene=result.scene.replace(unregistered=("d", "e"))),
-        r"d: 3 of 5 photographs were registered\. ",
-    ),
 }
 
 
@@ -150,4 +146,6 @@ def test_an_unusable_figure_has_no_photograph(result):
 def test_figures_that_are_unknown_have_no_score(result):
     everything = Silhouettes.everything(result.scene.views)
     found = judge(result.replace(relighting=None, silhouettes=everything))
-    assert found.scores.keys() == {"registered", "determined"}
+    assert found.scores.keys() == {"determined"}
+    blank = judge(predicting(with_reliable(result, False, False, False), torch.nan))
+    assert blank.scores.keys() == {"determined"}

@@ -14,7 +14,6 @@ from pimper_torch.stages.stage import Stage
 # Values of each figure that score 0, a half and 1: unusable, the last of good results, and best.
 # Fitted to half of a fleet of rendered captures: docs/decisions.md, "The verdict".
 LIMITS = {
-    "registered": (0.4, 0.8, 1.0),
     "reliable": (0.2, 0.7, 1.0),
     "expected_overlap": (0.6, 0.855, 1.0),
     "covered": (0.7, 0.96, 1.0),
@@ -83,15 +82,7 @@ def _figures(result: Reconstruction) -> Iterator[_Figure]:
     """Yield the figures that the run determines."""
     scene, silhouettes, relighting = result.scene, result.silhouettes, result.relighting
     names, reference = scene.views.names, scene.views.names[result.coarse.reference]
-    given = len(names) + len(scene.unregistered)
-    yield _Figure(
-        "registered",
-        len(names) / given,
-        next(iter(scene.unregistered), reference),
-        f"{len(names)} of {given} photographs were registered",
-        "Take photographs between those that were registered and the others.",
-    )
-    if silhouettes.source != "everything":
+    if silhouettes.source != "everything" and bool(silhouettes.reliable.any()):
         yield from _of_silhouettes(
             silhouettes, coverage_by(result.mesh, silhouettes, result.cameras), names
         )
@@ -105,7 +96,7 @@ def _figures(result: Reconstruction) -> Iterator[_Figure]:
         f"light determines the normals of only {determined:.0%} of the facets",
         "Photograph the object under more, and more different, lights.",
     )
-    if relighting is not None:
+    if relighting is not None and bool(relighting.errors.psnr_db.isfinite().any()):
         errors = relighting.errors
         mean, worst = errors.psnr_db.nanmean(), errors.psnr_db.nan_to_num(torch.inf).argmin()
         yield _Figure(
@@ -123,7 +114,7 @@ def _of_silhouettes(
     """Yield the figures of silhouettes, and of the surface against them."""
 
     def worst(values: Tensor, views: Tensor) -> str:
-        return names[int(views[values.argmax()])] if len(values) else names[0]
+        return names[int(views[values.argmax()])]
 
     reliable, overlap = silhouettes.reliable, silhouettes.expected_overlap
     count, every = int(reliable.sum()), torch.arange(len(reliable))
