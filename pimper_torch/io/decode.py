@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import tifffile
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Integer
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
@@ -33,6 +33,7 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two for published d
 # not.
 MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
+_DCT_FACTORS = (2, 4, 8)  # by which libjpeg shrinks while it decodes
 
 LABELS = 32
 """A mask or map with only integers below this contains labels. A choice."""
@@ -43,19 +44,24 @@ class Decoded(Record):
     """Upright samples of a file.
 
     Attributes:
-        samples: In [0, 1] as the file encodes them; one or three channels.
+        levels: Integers from 0 to ``full`` as in the file; one or three channels.
         alpha: Opacity in [0, 1]; ``None`` if the file has none.
         lossy: True for JPEG and HEIC, which ring around edges.
         full: Full-scale level of the file, a sample of 1: 255, 65535, or as the file states.
         colour: Colour metadata of the file.
     """
 
-    samples: Float[Tensor, "channel height width"]
+    levels: Integer[Tensor, "channel height width"]
     alpha: Map | None
     lossy: bool
     full: int
     full_scale_given: bool = False
     colour: Colour = SILENT
+
+    @property
+    def samples(self) -> Float[Tensor, "channel height width"]:
+        """Levels as fractions of full scale."""
+        return self.levels.float() / self.full
 
     @property
     def bits(self) -> int:
@@ -169,33 +175,41 @@ def _guarded(path: Path, read: Callable[[], Result]) -> Result:
         raise _damaged(path) from error
 
 
-def decode(path: Path | str) -> Decoded:
+def decode(path: Path | str, least_px: tuple[int, int] | None = None) -> Decoded:
     """Return the samples of an image file at full bit depth, with EXIF's orientation applied.
 
     Profiles are returned as ``colour``, but not applied.
+
+    Args:
+        least_px: Width and height that suffice. JPEG is decoded at the smallest of a half, a
+            quarter and an eighth of its size that is not below; both sides must be divisible, as
+            a partial last block would shift the content.
 
     Raises:
         InputError: As :func:`read_header`, and for samples that do not have 8 or 16 bits.
     """
     path = Path(path)
     header = read_header(path)
-    array = _guarded(path, lambda: _upright(path, header))
+    sides, least = (header.width, header.height), least_px or (header.width, header.height)
+    shrink = max(
+        factor
+        for factor in (1, *(_DCT_FACTORS if format_of(path) == "JPEG" else ()))
+        if all(a % factor == 0 and a // factor >= b for a, b in zip(sides, least, strict=True))
+    )
+    array = _guarded(path, lambda: _upright(path, header, shrink))
     if array.dtype not in (np.uint8, np.uint16):
         raise tiff.unfit(path, str(array.dtype))
     array = array[..., None] if array.ndim == 2 else array
-    if array.shape[:2] != (header.height, header.width):
+    if array.shape[:2] != (header.height // shrink, header.width // shrink):
         raise _damaged(path)
     # As the file states, unless its samples exceed this.
     sixteen = array.dtype == np.uint16
     full = header.full if sixteen and int(array.max()) <= header.full else np.iinfo(array.dtype).max
-    # Plane by plane, so that no memory is used beyond the returned planes.
-    planes = torch.empty(array.shape[2], *array.shape[:2])
-    for plane, channel in zip(planes, np.moveaxis(array, -1, 0), strict=True):
-        np.divide(channel, np.float32(full), out=plane.numpy())
+    planes = torch.from_numpy(np.moveaxis(array, -1, 0).copy())
     has_alpha = len(planes) in (2, 4)
     return Decoded(
-        samples=planes[:-1] if has_alpha else planes,
-        alpha=planes[-1] if has_alpha else None,
+        levels=planes[:-1] if has_alpha else planes,
+        alpha=planes[-1].float() / int(full) if has_alpha else None,
         lossy=format_of(path) in ("JPEG", "HEIC"),
         full=int(full),
         full_scale_given=header.full_scale_given,
@@ -203,7 +217,7 @@ def decode(path: Path | str) -> Decoded:
     )
 
 
-def _upright(path: Path, header: Header) -> np.ndarray:
+def _upright(path: Path, header: Header, shrink: int) -> np.ndarray:
     """Return upright samples, ``height width`` or ``height width channel`` with opacity last."""
     extra, layout = extra_of(path), header.layout
     if extra == "heic":
@@ -214,6 +228,7 @@ def _upright(path: Path, header: Header) -> np.ndarray:
         return _read_deep(path, header)
     # From memory: Pillow 13 misreads an uncompressed, rotated TIFF if it maps the file.
     with Image.open(io.BytesIO(path.read_bytes()), formats=_FORMATS) as image:
+        image.draft(None, (image.width // shrink, image.height // shrink))
         upright = ImageOps.exif_transpose(image)
         if upright.mode.startswith("I;16"):
             array = np.asarray(upright).astype(np.uint16)

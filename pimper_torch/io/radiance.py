@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -114,9 +114,11 @@ def resized_radiance(radiance: Planes, width: int, height: int) -> Shrunk:
     """
     if tuple(radiance.shape[-2:]) == (height, width):
         return radiance
+    saturated, shrunk = radiance >= SATURATED, resized(radiance, width, height)
+    if not bool(saturated.any()):
+        return shrunk
     # Smaller contributions are rounding errors of the filter's weights.
-    saturated = resized((radiance >= SATURATED).to(radiance), width, height) > 1e-3
-    return torch.where(saturated, 1.0, resized(radiance, width, height))
+    return torch.where(resized(saturated.to(radiance), width, height) > 1e-3, 1.0, shrunk)
 
 
 def resized_mask(
@@ -135,9 +137,10 @@ def _fill(
     given = None if encoding.response == "auto" else response_of(encoding)
 
     def read(index: int) -> tuple[Mask | None, _Kind, _Tally | None]:
-        decoded, (wide, high) = decode(paths[index]), sizes_px[index]
+        wide, high = sizes_px[index]
+        decoded = decode(paths[index], (wide, high))
         response = decoded.colour.response if given is None else given
-        per_colour = isinstance(response, Curve) and len(response.radiance) > len(decoded.samples)
+        per_colour = isinstance(response, Curve) and len(response.radiance) > len(decoded.levels)
         if response is None or (given is None and per_colour):
             response = Srgb()
         kind = _Kind(decoded.full, decoded.full_scale_given, response)
@@ -146,7 +149,9 @@ def _fill(
         # Black becomes 0, and saturation 1.
         dark = linear(black.expand(len(white), 1, 1))
         span = linear(white[:, None, None]) - dark
-        radiance = ((linear(decoded.samples) - dark) / span).clamp(0, 1)
+        encoded = (torch.arange(decoded.full + 1.0) / decoded.full).expand(len(white), 1, -1)
+        table = ((linear(encoded) - dark) / span).clamp(0, 1)[:, 0]
+        radiance, counts = _looked_up(table, decoded.levels)
         if decoded.colour.srgb_from_file is not None and len(radiance) == 3:
             radiance = in_srgb_primaries(radiance, decoded.colour.srgb_from_file)
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
@@ -154,8 +159,6 @@ def _fill(
         mask = resized_mask(decoded.alpha, wide, high) if transparent else None
         if encoding.saturation != "auto" or whites:
             return mask, kind, None
-        levels = (decoded.full * decoded.samples).round().to(torch.int32).flatten(1)
-        counts = torch.stack([channel.bincount(minlength=decoded.full + 1) for channel in levels])
         return mask, kind, torch.stack([counts, (counts >= PIXELS).long()])
 
     opaque: list[Tensor | None] = []
@@ -174,6 +177,18 @@ def _fill(
             if tally is not None:
                 tallies[kind] = tally.expand(-1, images.shape[1], -1) + tallies.get(kind, 0)
     return tuple(opaque), tallies
+
+
+def _looked_up(
+    table: Float[Tensor, "channel level"], levels: Integer[Tensor, "channel height width"]
+) -> tuple[Planes, Int[Tensor, "channel level"]]:
+    """Return the entries of a table at each pixel, and the number of pixels of each level."""
+    planes, counts = torch.empty(levels.shape), []
+    for row, channel, plane in zip(table, levels, planes, strict=True):
+        index = channel.flatten().int()
+        torch.index_select(row, 0, index, out=plane.view(-1))
+        counts.append(index.bincount(minlength=len(row)))
+    return planes, torch.stack(counts)
 
 
 def _saturation(tallies: Mapping[_Kind, _Tally]) -> dict[_Kind, Tensor]:
@@ -215,7 +230,7 @@ def _levels(
     encoding: Encoding, decoded: Decoded, path: Path, detected: Levels | None
 ) -> tuple[Scalar, Levels]:
     """Return the black and saturation levels of a file as fractions of its full scale."""
-    full, channels = decoded.full, decoded.samples.shape[0]
+    full, channels = decoded.full, len(decoded.levels)
     saturation, black = encoding.saturation, encoding.black
     given: tuple[float | int, ...] = ()
     if saturation == "auto":
@@ -255,7 +270,7 @@ def _scaled_response(response: Response, decoded: Decoded, path: Path) -> Respon
             f"at level {last:g}, for files of {response.bits} bits; needed: a curve for the levels "
             "of these files, or for fractions of full scale from 0 to 1."
         )
-    if len(response.radiance) not in (1, decoded.samples.shape[0]):
+    if len(response.radiance) not in (1, len(decoded.levels)):
         raise InputError(
             f"{path}: is gray, but the response curve is for red, green and blue; needed: a single "
             "curve."

@@ -6,6 +6,7 @@ import pytest
 import tifffile
 import torch
 from PIL import Image
+from torch.nn.functional import avg_pool2d
 from torch.testing import assert_close
 
 from pimper_torch.io.decode import decode, read_header, rotated
@@ -116,6 +117,41 @@ def test_one_bit_images_are_gray_and_a_jpeg_gives_its_first_image(tmp_path, pixe
     )
     Image.fromarray(pixels).save(tmp_path / "b.jpg", quality=95)
     assert torch.equal(decode(tmp_path / "a.jpg").samples, decode(tmp_path / "b.jpg").samples)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(
+    ("size", "least", "wanted"),
+    [
+        ((96, 64), (13, 8), (24, 16)),  # an eighth is too narrow
+        ((96, 64), (12, 8), (12, 8)),
+        ((96, 64), (49, 30), (96, 64)),
+        ((97, 64), (12, 8), (97, 64)),  # the last column would be partial
+        ((100, 64), (12, 8), (25, 16)),
+    ],
+)
+def test_jpeg_is_decoded_at_the_smallest_sufficient_size(
+    tmp_path, orientation, size, least, wanted
+):
+    exif, (wide, high) = Image.Exif(), size
+    exif[274] = orientation
+    v, u = np.mgrid[:high, :wide] + 0.5
+    ramps = np.stack([20 + 2 * u, 30 + 3 * v, 200 - u - v], axis=-1).round().astype(np.uint8)
+    stored = rotated(rotated(rotated(ramps, orientation), orientation), orientation)
+    Image.fromarray(stored).save(tmp_path / "a.jpg", exif=exif, quality=98, subsampling=0)
+    upright = decode(tmp_path / "a.jpg").samples
+    assert upright.shape[:0:-1] == size
+    found = decode(tmp_path / "a.jpg", least).samples
+    assert found.shape[:0:-1] == wanted
+    mean = avg_pool2d(upright, size[0] // wanted[0])
+    assert_close(found, mean, rtol=0, atol=3 / 255)  # JPEG rounds
+    Image.fromarray(ramps[..., 0]).save(tmp_path / "grey.jpg")
+    assert decode(tmp_path / "grey.jpg", least).levels.shape == (1, *wanted[::-1])
+
+
+def test_only_jpeg_is_shrunk_while_it_is_decoded(tmp_path, pixels):
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert torch.equal(decode(tmp_path / "a.png", (3, 2)).levels, decode(tmp_path / "a.png").levels)
 
 
 # 30 mm on a 22.5 mm wide sensor with 4500 pixels: 200 pixels a millimetre.
