@@ -256,7 +256,7 @@ def measured(job: Job, imports: Cost, colmap: bool) -> dict[str, Any]:
             masks=job.inputs.masks,
             mask_object=job.inputs.mask_object,
             encoding=job.config.photographs,
-            max_size_px=job.common.max_size_px,
+            max_size_px=job.common.max_size_px or 0,
         ).to(job.common.device)
         meter.ended("read")
         chain = make_chain(job.config, meter, job.common.cache or job.out / STAGES)

@@ -60,7 +60,8 @@ class CommonOptions:
         preset: Settings to start from: default, fast, paper, or your own YAML file.
         reference: Photograph for sample spacing and rendered views; by default automatic.
         device: Device of the stages after structure from motion; cuda has not been tested on a GPU.
-        max_size_px: Longer side to which larger photographs are scaled down; 0 keeps all sizes.
+        max_size_px: Longer side to which larger photographs are scaled down, 0 for none; by
+            default 1600, or less if memory is short.
         overwrite: Replace the result in OUT.
         faces: Maximum number of faces of the mesh, or all; by default as few as the shape needs.
         watertight: Close the mesh; caps are marked as not measured.
@@ -79,7 +80,7 @@ class CommonOptions:
     preset: str = "default"
     reference: str = ""
     device: Literal["cpu", "cuda"] = "cpu"
-    max_size_px: int = 0
+    max_size_px: int | None = None
     overwrite: Flag = False
     faces: Annotated[int | Literal["all"] | None, tyro.conf.arg(metavar="N")] = None
     watertight: Flag = False
@@ -98,8 +99,8 @@ class CommonOptions:
         bytes_of(self.max_kept, "max_kept")
         _ = self.files  # refused before anything is read
         # The smallest photographs for which depth maps are computed.
-        valid = self.max_size_px == 0 or self.max_size_px >= 32
-        require(valid, "max_size_px", self.max_size_px, "0, or at least 32 pixels")
+        size = self.max_size_px or 0
+        require(size == 0 or size >= 32, "max_size_px", size, "0, or at least 32 pixels")
 
     @property
     def files(self) -> MeshFiles:

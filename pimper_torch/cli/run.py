@@ -11,7 +11,7 @@ import torch
 
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.doctor.checks import examine_views
-from pimper_torch.cli.doctor.cost import planned
+from pimper_torch.cli.doctor.cost import planned, working_size
 from pimper_torch.cli.options import Job
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.view import print_address
@@ -22,7 +22,7 @@ from pimper_torch.export.results import RESULT_NAMES, write_result
 from pimper_torch.io.decode import read_header
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photograph_files import image_name, list_images
-from pimper_torch.io.photographs import load_views
+from pimper_torch.io.photographs import load_views, photograph_sizes
 from pimper_torch.presets.load_chain import make_chain
 from pimper_torch.priors.prior_files.read_maps import read_depth, read_normals
 from pimper_torch.priors.prior_files.read_silhouettes import object_at, read_silhouettes
@@ -67,6 +67,7 @@ def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
     warned = collected(Caution, passed_on=True)
     with lock, output.observer() as (observer, table), warned as cautions:
         with stage("read") as figures:
+            job = _at_working_size(job, output)
             views = _read(job, store)
             figures["photographs"] = views.num_views
             _examine(job, views)
@@ -96,6 +97,17 @@ def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
         output.emit(f"The viewer stays at {viewer.address} until Ctrl-C.")
         with suppress(KeyboardInterrupt):
             viewer.wait()
+
+
+def _at_working_size(job: Job, output: Output) -> Job:
+    """Return the run with its working size as a number, and print the size if it shrinks."""
+    sizes_px = [*photograph_sizes(job.photos).values()]
+    limit = job.config.max_memory if isinstance(job.config, CoarseToFineConfig) else ""
+    limit_gb = bytes_of(limit) / 1e9 if limit else 0.0
+    longest, shrunk = working_size(sizes_px, job.common.max_size_px, limit_gb)
+    if shrunk:
+        output.remark(f"{shrunk.capitalize()}.")
+    return replace(job, common=replace(job.common, max_size_px=longest))
 
 
 def _plan(job: Job, views: Views) -> list[tuple[str, float]]:
@@ -128,7 +140,7 @@ def _read(job: Job, store: Store) -> Views:
         masks=inputs.masks,
         mask_object=inputs.mask_object,
         encoding=job.config.photographs,
-        max_size_px=job.common.max_size_px,
+        max_size_px=job.common.max_size_px or 0,
     )
     priors: list[Prior] = []
     if inputs.silhouettes is not None:

@@ -1,6 +1,7 @@
 """Decoding of image files to upright samples at full bit depth."""
 
 import io
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two for published d
 # not.
 MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
-_DCT_FACTORS = (2, 4, 8)  # by which libjpeg shrinks while it decodes
+_DCT_FACTORS = (8, 4, 2)  # by which libjpeg shrinks while it decodes
 
 LABELS = 32
 """A mask or map with only integers below this contains labels. A choice."""
@@ -182,20 +183,16 @@ def decode(path: Path | str, least_px: tuple[int, int] | None = None) -> Decoded
 
     Args:
         least_px: Width and height that suffice. JPEG is decoded at the smallest of a half, a
-            quarter and an eighth of its size that is not below; both sides must be divisible, as
-            a partial last block would shift the content.
+            quarter and an eighth of its size that is not below and has no partial blocks.
 
     Raises:
         InputError: As :func:`read_header`, and for samples that do not have 8 or 16 bits.
     """
     path = Path(path)
     header = read_header(path)
-    sides, least = (header.width, header.height), least_px or (header.width, header.height)
-    shrink = max(
-        factor
-        for factor in (1, *(_DCT_FACTORS if format_of(path) == "JPEG" else ()))
-        if all(a % factor == 0 and a // factor >= b for a, b in zip(sides, least, strict=True))
-    )
+    wide, high = least_px if least_px and format_of(path) == "JPEG" else (math.inf, math.inf)
+    fits = (by for by in _DCT_FACTORS if header.width >= by * wide and header.height >= by * high)
+    shrink = next((by for by in fits if header.width % by == header.height % by == 0), 1)
     array = _guarded(path, lambda: _upright(path, header, shrink))
     if array.dtype not in (np.uint8, np.uint16):
         raise tiff.unfit(path, str(array.dtype))

@@ -17,20 +17,10 @@ from pimper_torch.runtime.errors import InputError, caution, some
 
 MIN_PHOTOGRAPHS = 3  # fewer do not separate shape, light and viewpoint
 # Files that users may expect to be read, though not in SUFFIXES: images and camera raw; video.
-_OTHERS = [
-    ".gif",
-    ".avif",
-    ".webp",
-    ".bmp",
-    ".jp2",
-    ".jxl",
-    ".psd",
-    ".exr",
-    ".hdr",
-    ".ppm",
-    ".pgm",
-    ".raw",
-]
+_OTHERS = (
+    *(".gif", ".avif", ".webp", ".bmp", ".jp2", ".jxl"),
+    *(".psd", ".exr", ".hdr", ".ppm", ".pgm", ".raw"),
+)
 _PICTURES = (*HEIC_SUFFIXES, *RAW_SUFFIXES, *_OTHERS)
 _VIDEO = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts")
 # Folders next to those of poses, with masks and maps of photographs.

@@ -68,7 +68,7 @@ def load_views(
         encoding: Response, saturation and black level of the files.
         max_size_px: Shrink photographs with a longer side above this, in linear light and
             without aliasing; 0 shrinks nothing. A pixel to which a saturated pixel contributes
-            is saturated.
+            is saturated. JPEG is first shrunk by up to 2, 4 or 8 while it is decoded.
 
     Returns:
         On the CPU, float32.
@@ -90,6 +90,12 @@ def load_views(
     has_masks = _fill_masks(inside, files, matched, alphas, mask_object, masks)
     lit = _check_exposure(files, images, inside, masks)
     return _as_views(files, images, inside if has_masks else None).take(lit)
+
+
+def photograph_sizes(folder: Path | str) -> dict[str, tuple[int, int]]:
+    """Return width and height of each photograph by name, from the headers of the files."""
+    headers = {image_name(path, folder): read_header(path) for path in list_images(folder)}
+    return {name: (header.width, header.height) for name, header in headers.items()}
 
 
 class _Files(NamedTuple):

@@ -26,8 +26,8 @@ from pimper_torch.runtime.parallel import side_by_side
 OPAQUE = 0.5
 # Bit depths of sensors, which 16-bit files can contain.
 _SENSOR_BITS = (10, 12, 14)
-# Choices: all photographs share one raster size. A file that makes the rasters 8 times as large as
-# the photographs is not one of them, for rasters of 400 MB or more.
+# Choices: all photographs share one raster size. A file that makes rasters 8 times as large as the
+# photograph of median size is not one of them, for rasters of 400 MB or more.
 _MAX_PADDING, _MUCH_PADDING = 8, 10**8
 
 
@@ -71,14 +71,7 @@ def read_pictures(
     width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
     channels = max(header.channels for header in headers)
     files = [Path(path) for path in paths]
-    raster, pixels = len(files) * width * height, sum(map(prod, sizes_px))
-    if raster * channels >= _MUCH_PADDING and raster >= _MAX_PADDING * pixels:
-        file, (wide, high) = max(zip(files, sizes_px, strict=True), key=lambda item: prod(item[1]))
-        raise InputError(
-            f"{file}: has {wide} x {high} pixels, all have {pixels} together; needed: photographs "
-            "of similar sizes, as each needs the memory of the largest. Remove it from the folder, "
-            "or shrink all to the same longer side with `--max-size-px`."
-        )
+    refuse_outlier(files, sizes_px, channels)
     images = zeros((len(files), channels, height, width))
     opaque, tallies = _fill(images, files, sizes_px, encoding, {})
     whites = _saturation(tallies)
@@ -96,6 +89,20 @@ def read_pictures(
     if whites:
         opaque, _ = _fill(images, files, sizes_px, encoding, whites)
     return images, opaque
+
+
+def refuse_outlier(files: Sequence[Path], sizes_px: Sizes, channels: int = 3) -> None:
+    """Raise an error if one file makes all rasters much larger than the other photographs."""
+    width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
+    usual = sorted(sizes_px, key=prod)[len(files) // 2]
+    large = len(files) * width * height * channels >= _MUCH_PADDING
+    if large and width * height >= _MAX_PADDING * prod(usual):
+        file, (wide, high) = max(zip(files, sizes_px, strict=True), key=lambda item: prod(item[1]))
+        raise InputError(
+            f"{file}: has {wide} x {high} pixels, the median is {usual[0]} x {usual[1]}; needed: "
+            "photographs of similar sizes, as each needs the memory of the largest. Remove it from "
+            f"the folder, or shrink it to the others' size with `--max-size-px {max(usual)}`."
+        )
 
 
 def resized(planes: Planes, width: int, height: int) -> Shrunk:

@@ -129,4 +129,8 @@ def test_settings_of_a_row_override_those_of_the_batch(world, scans):
     table = world.folder / "list.csv"
     table.write_text("photos,faces\nscans/cup,500\n")
     (task,) = planned_batch(read_objects(table), world.out, ("--faces", "9", "--stl"))
-    assert task.arguments[4:] == ("--faces", "9", "--stl", "--faces", "500", "--json")
+    given = ("--faces", "9", "--stl", "--faces", "500")
+    # The working size is planned: it must not depend on the memory of runs next to it.
+    assert task.arguments[4:] == (*given, "--max-size-px", "1600", "--json")
+    (task,) = planned_batch(read_objects([scans / "cup"]), world.out, ("--max-size-px", "50"))
+    assert task.arguments[4:] == ("--max-size-px", "50", "--json")

@@ -54,6 +54,22 @@ def test_a_run_writes_the_result_and_prints_its_path(reconstruct, chain, tmp_pat
     assert "samples 1,200" in printed.err
 
 
+@pytest.mark.parametrize(
+    ("given", "largest", "number"),
+    [((), 1600, 1600), (("--max-size-px", "0"), 1700, 0), (("--max-size-px", "40"), 40, 40)],
+)
+def test_the_working_size_is_chosen_printed_and_written(
+    photos, chain, tmp_path, capsys, given, largest, number
+):
+    with Image.open(photos / "1.png") as image:
+        image.resize((1700, 400)).save(photos / "1.png")
+    assert run("reconstruct", photos, "-o", tmp_path / "out", *given) == 0
+    assert max(chain.given[1].images.shape[-2:]) == largest
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["max_size_px"] == number
+    line = f"Photographs of up to 1700x400 are shrunk to {number} px (`--max-size-px`)."
+    assert (line in capsys.readouterr().out) == (number > 0)
+
+
 def test_a_run_ends_with_the_removals_of_guards(
     reconstruct, chain, reconstruction, tmp_path, capsys
 ):

@@ -1,6 +1,8 @@
 """Each check finds the introduced defects, and reports none in good photographs."""
 
+import json
 import math
+import re
 
 import pytest
 import torch
@@ -8,6 +10,7 @@ from PIL import Image
 from scenes import write_ball
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
+from pimper_torch.cli.doctor import cost as module
 from pimper_torch.cli.doctor.checks import (
     blur,
     examine_views,
@@ -15,7 +18,13 @@ from pimper_torch.cli.doctor.checks import (
     number,
     saturation,
 )
-from pimper_torch.cli.doctor.cost import cost, estimate
+from pimper_torch.cli.doctor.cost import (
+    DETAIL_PX,
+    cost,
+    estimate,
+    megapixels_at,
+    working_size,
+)
 from pimper_torch.cli.doctor.findings import available_gb, machine, total_gb
 from pimper_torch.cli.doctor.pairs import match_copies, overlap
 from pimper_torch.cli.doctor.photograph import Photograph, edge_blur_px, summarize, summarize_views
@@ -126,6 +135,48 @@ def test_memory_depends_on_the_surface_and_on_many_photographs():
     assert "10.1 GB with `default`, an estimate; 8.0 GB are free" in cost(large, 8.0).found
 
 
+PHONE, CAMERA = (4032, 3024), (6000, 4000)
+
+
+@pytest.mark.parametrize("free_gb", [1.0, 2.2, 2.8, 3.5, 100.0, None])
+@pytest.mark.parametrize("sizes_px", [[CAMERA] * 12, [PHONE] * 3 + [(4000, 6000)] * 30])
+def test_the_working_size_is_the_largest_that_fits(sizes_px, free_gb, monkeypatch):
+    monkeypatch.setattr(module, "available_gb", lambda: free_gb)
+    chosen, _ = working_size(sizes_px, None)
+    assert 600 <= chosen <= DETAIL_PX
+
+    def fits(longest):
+        needed = estimate(megapixels_at(sizes_px, longest), len(sizes_px))[1]
+        return free_gb is None or needed <= 0.6 * free_gb
+
+    assert fits(chosen) or chosen == 600
+    assert chosen == DETAIL_PX or not fits(chosen + 100)
+
+
+def test_a_given_working_size_or_limit_counts(monkeypatch):
+    monkeypatch.setattr(module, "available_gb", lambda: 3.0)
+    sizes_px = [CAMERA] * 12
+
+    def size(*given):
+        return working_size(sizes_px, *given)[0]
+
+    assert [size(given) for given in (0, 77, 4000)] == [0, 77, 4000]
+    assert size(None, 1.5) < size(None) < DETAIL_PX == size(None, 4.0)
+    assert working_size([(900, 600)] * 9, None) == (DETAIL_PX, "")  # they fit, and none is shrunk
+
+
+def test_memory_that_no_size_lowers_does_not_shrink(monkeypatch):
+    monkeypatch.setattr(module, "available_gb", lambda: 2.0)
+    assert working_size([CAMERA] * 500, None)[0] == DETAIL_PX  # depth maps of 500 views: 4.8 GB
+
+
+def test_the_working_size_is_reported_if_it_shrinks():
+    text = "photographs of up to 6000x4000 are shrunk to 1600 px (`--max-size-px`)"
+    assert working_size([PHONE, CAMERA], 1600) == (1600, text)
+    assert working_size([PHONE, CAMERA], 0)[1] == working_size([PHONE], 4032)[1] == ""
+    assert text in cost([photograph()], None, text).found
+
+
 def test_the_machine_is_described():
     found = {one.check: one for one in machine()}
     assert torch.__version__ in found["installed"].found
@@ -150,6 +201,33 @@ def test_every_check_of_a_folder_reports_once(photos):
     checks = ["number", "blur", "saturation", "exposure", "overlap", "cost"]
     assert list(found) == checks
     assert [one.check for one in examine_views(load_views(photos))] == [*checks[:4], "cost"]
+
+
+def test_large_photographs_are_examined_small_for_their_size_in_the_run(tmp_path, capsys):
+    image = 255 * gaussian_filter(squares(2000, 160).numpy(), 6.0)
+    for index in range(3):
+        shifted = image[40 * index : 40 * index + 1500].round().astype("uint8")
+        Image.fromarray(shifted).save(tmp_path / f"{index}.jpg", quality=95)
+    assert main(["doctor", str(tmp_path), "--max-size-px", "0", "--json"]) == 0
+    whole = found_in(capsys)
+    assert main(["doctor", str(tmp_path), "--json"]) == 0
+    shrunk = found_in(capsys)
+    assert "3 of 2000x1500" in whole["number"]
+    assert "3 of 1600x1200" in shrunk["number"]
+    assert "of up to 2000x1500 are shrunk to 1600 px" in shrunk["cost"]
+    assert "shrunk" not in whole["cost"]
+    # Shrinking adds little to a blur of six pixels.
+    assert number_in(whole["blur"]) == pytest.approx(6.0, rel=0.15)
+    assert number_in(shrunk["blur"]) == pytest.approx(0.8 * number_in(whole["blur"]), abs=0.1)
+
+
+def found_in(capsys):
+    lines = map(json.loads, capsys.readouterr().out.splitlines())
+    return {line["check"]: line["found"] for line in lines if line["event"] == "finding"}
+
+
+def number_in(text):
+    return float(re.search(r"[\d.]+(?= px)", text)[0])
 
 
 def test_matches_are_of_the_same_points(photos):

@@ -207,6 +207,16 @@ def test_a_huge_image_among_small_ones_is_refused_before_decoding(photos, mode):
     tracemalloc.stop()
 
 
+def test_one_photograph_much_larger_than_the_others_is_refused_or_shrunk(tmp_path):
+    for index in range(7):
+        save(tmp_path / f"{index}.jpg", np.full((300, 400, 3), 99, dtype=np.uint8))
+    save(tmp_path / "7.jpg", np.full((2400, 3200, 3), 99, dtype=np.uint8))
+    wanted = r"7\.jpg: has 3200 x 2400 .*median is 400 x 300; .*`--max-size-px 400`"
+    with pytest.raises(InputError, match=wanted):
+        load_views(tmp_path)
+    assert load_views(tmp_path, max_size_px=400).sizes_px.tolist() == [[400, 300]] * 8
+
+
 def test_padding_does_not_make_a_photograph_black(photos):
     dim = np.zeros((8, 12, 3), dtype=np.uint8)
     dim[:2, :2] = 200

@@ -9,11 +9,9 @@ from functools import cache
 from itertools import accumulate
 from pathlib import Path
 
-from PIL import Image
-
 from pimper_torch.cli.batches.objects import Object
 from pimper_torch.cli.batches.task import Outcome, Task, is_whole
-from pimper_torch.cli.doctor.cost import estimate
+from pimper_torch.cli.doctor.cost import estimate, megapixels_at, working_size
 from pimper_torch.cli.doctor.findings import available_gb
 from pimper_torch.cli.options import check, inputs_of, parse
 from pimper_torch.runtime.cores import usable_cores
@@ -43,6 +41,8 @@ def planned_batch(
     Returns:
         A task for each object; or its outcome, if it is already complete or refused.
     """
+    from pimper_torch.io.photographs import photograph_sizes  # slow to import
+
     out = out.absolute()
     read = cache(lambda words: parse("reconstruct", ["PHOTOS", "-o", "OUT", *words]))
 
@@ -53,7 +53,11 @@ def planned_batch(
         photos, target = Path(item.photos).absolute(), out / item.name
         try:
             job = replace(read(words), photos=photos, out=target)
-            seconds, gigabytes = estimate(*_pixels(photos, job.common.max_size_px))
+            sizes_px = [*photograph_sizes(photos).values()]
+            longest, _ = working_size(sizes_px, job.common.max_size_px, mem_gb)
+            seconds, gigabytes = estimate(megapixels_at(sizes_px, longest), len(sizes_px))
+            if job.common.max_size_px is None:  # memory of other runs must not change it
+                words = (*words, "--max-size-px", str(longest))
             task = Task(
                 name=item.name,
                 arguments=("reconstruct", str(photos), "-o", str(target), *words, "--json"),
@@ -83,20 +87,6 @@ def runs_at_once(gigabytes: Sequence[float]) -> int:
     sums = accumulate(sorted(gigabytes, reverse=True)[: usable_cores()])
     # A fifth is left to other programs.
     return max(1, sum(free is None or total <= 0.8 * free for total in sums))
-
-
-def _pixels(photos: Path, max_size_px: int) -> tuple[float, int]:
-    """Return the megapixels of all photographs, each as large as the first, and their number."""
-    files = [path for path in sorted(photos.rglob("*")) if path.is_file()]
-    for path in files:
-        try:
-            with Image.open(path) as image:
-                width, height = image.size
-        except (OSError, Image.DecompressionBombError):
-            continue
-        shrunk = min(1.0, max_size_px / max(width, height)) if max_size_px else 1.0
-        return len(files) * width * height * shrunk**2 / 1e6, len(files)
-    return 24.0 * len(files), len(files)  # Pillow cannot read any of them, such as camera raw
 
 
 def _made_from(words: Sequence[str], inputs: Mapping[str, Path | None]) -> str:

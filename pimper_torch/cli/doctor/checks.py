@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import median
 
 from pimper_torch.cli.doctor.cost import cost
@@ -16,19 +16,27 @@ from pimper_torch.runtime.errors import some
 _BLUR_PX, _BLUR_RATIO = 1.5, 1.6  # absolute, and relative to the median of the folder
 
 
-def examine_views(views: Views, *, together: bool = False) -> list[Finding]:
+def examine_views(
+    views: Views,
+    sizes_px: Mapping[str, tuple[int, int]] | None = None,
+    *,
+    together: bool = False,
+    shrunk: str = "",
+) -> list[Finding]:
     """Check photographs, in seconds: number, blur, saturation, exposure and cost.
 
     Args:
+        sizes_px: Width and height in the run by name; by default those of the views.
         together: Also check their overlap.
+        shrunk: Clause on the working size, for the cost.
     """
-    photographs = summarize_views(views)
+    photographs = summarize_views(views, sizes_px)
     alone = (check(photographs) for check in (number, blur, saturation, exposure))
     findings = [finding for finding in alone if finding is not None]
     if together:
         matches = match_copies([photo.small for photo in photographs])
         findings.append(overlap(views.names, matches))
-    return [*findings, cost(photographs, available_gb())]
+    return [*findings, cost(photographs, available_gb(), shrunk)]
 
 
 def number(photographs: Sequence[Photograph]) -> Finding:

@@ -1,12 +1,22 @@
 """Estimates of the time and memory of a run."""
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from pimper_torch.cli.doctor.findings import Finding
+from pimper_torch.cli.doctor.findings import Finding, available_gb
 
 if TYPE_CHECKING:
     from pimper_torch.cli.doctor.photograph import Photograph
+
+DETAIL_PX = 1600
+"""Longer side to which a run shrinks larger photographs: the largest size with measured results.
+
+Files of cameras have twice as many pixels as their lenses and colour filters resolve.
+"""
+# Choices: sizes if memory is short, in steps, so that a little more of it changes nothing; and the
+# share of the free memory, as estimates are within a factor of 1.5.
+_SIZES_PX, _SHARE_OF_FREE = range(DETAIL_PX, 500, -100), 0.6
 
 # Fitted by hand to runs of `default` on 2 cores with 10 to 30 photographs of 0.3 to 1.9 megapixels,
 # each within a factor of 1.5 (benchmarks/README.md, "How cost grows"). Memory grows with the
@@ -69,14 +79,47 @@ def planned(
     ]
 
 
-def cost(photographs: Sequence["Photograph"], available_gb: float | None) -> Finding:
-    """Report the estimates, and whether the memory is available."""
+def megapixels_at(sizes_px: Sequence[tuple[int, int]], longest: int) -> float:
+    """Return the megapixels of all photographs after shrinking to a longer side; 0 is their own."""
+    factors = (min(1.0, longest / max(size)) if longest else 1.0 for size in sizes_px)
+    return sum(w * h * by**2 for (w, h), by in zip(sizes_px, factors, strict=True)) / 1e6
+
+
+def working_size(
+    sizes_px: Sequence[tuple[int, int]], given: int | None, limit_gb: float = 0.0
+) -> tuple[int, str]:
+    """Return the longer side to which a run shrinks photographs, 0 for none, and a clause on it.
+
+    Args:
+        sizes_px: Width and height of the photographs' files.
+        given: The user's choice, which counts. ``None`` chooses the largest size of at most
+            :data:`DETAIL_PX` whose estimated memory is within the limit.
+        limit_gb: Memory of the run; by default 60 % of the free memory.
+
+    Returns:
+        The clause is empty if no photograph is larger.
+    """
+    longest = given
+    if longest is None:
+        limit = limit_gb or _SHARE_OF_FREE * (available_gb() or math.inf)
+        limit = max(limit, estimate(0.0, len(sizes_px))[1])  # which no size lowers
+        needed = ((each, megapixels_at(sizes_px, each)) for each in _SIZES_PX)
+        fits = (each for each, pixels in needed if estimate(pixels, len(sizes_px))[1] <= limit)
+        longest = next(fits, _SIZES_PX[-1])
+    width, height = max(sizes_px, key=max)
+    clause = f"photographs of up to {width}x{height} are shrunk to {longest} px (`--max-size-px`)"
+    return longest, clause if 0 < longest < max(width, height) else ""
+
+
+def cost(photographs: Sequence["Photograph"], free_gb: float | None, shrunk: str = "") -> Finding:
+    """Report the estimates, whether the memory is free, and a clause on the working size."""
     megapixels = sum(photo.width * photo.height for photo in photographs) / 1e6
     seconds, needed = estimate(megapixels, len(photographs))
     found = f"about {minutes(seconds)} on 2 cores and {needed:.1f} GB with `default`, an estimate"
-    if available_gb is None or needed <= available_gb:
+    found += f"; {shrunk}" if shrunk else ""
+    if free_gb is None or needed <= free_gb:
         return Finding("cost", "ok", found)
-    found += f"; {available_gb:.1f} GB are free"
+    found += f"; {free_gb:.1f} GB are free"
     advice = "Shrink the photographs (`--max-size-px`), use fewer, or free memory."
     return Finding("cost", "warning", found, "memory for the run", advice)
 

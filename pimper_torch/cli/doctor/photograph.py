@@ -1,6 +1,7 @@
 """Measurements of a photograph: blur, saturation, exposure, and a small copy."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,8 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from pimper_torch.io.radiance import resized_radiance
+from pimper_torch.io.photographs import shrunk_size
+from pimper_torch.io.radiance import resized, resized_mask, resized_radiance
 from pimper_torch.radiometry import SATURATED
 from pimper_torch.records import Record, Views
 from pimper_torch.records.shapes import Map, Mask
@@ -29,8 +31,6 @@ def edge_blur_px(grey: Map) -> float:
 
     Source: Zhuo & Sim, Defocus map estimation from a single image, Pattern Recognition 44, 2011.
     """
-    top, left = (max(0, (side - 1024) // 2) for side in grey.shape)
-    grey = grey[top : top + 1024, left : left + 1024].float()  # the centre, where the object is
     fine, wide = _gradient(grey, _FINE), _gradient(grey, _WIDE)
     strength = torch.hypot(*fine)
     peaks = max_pool2d(strength[None, None], 3, 1, 1)[0, 0] == strength
@@ -60,7 +60,9 @@ def _gradient(grey: Map, sigma: float) -> Float[Tensor, "2 height_in width_in"]:
     return torch.stack([across, down])
 
 
-SMALL_PX = 640  # longer side of the small copy: features of 24 photographs take seconds
+# Longer side at which photographs are examined, where a blur of a pixel at 2000 is still measured.
+EXAMINED_PX = 1024
+_SMALL_PX = 480  # longer side of the small copy, which connects the demo's photographs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -68,9 +70,9 @@ class Photograph(Record):
     """Measurements of one photograph.
 
     Attributes:
-        width: Width in pixels after ``--max-size-px``.
+        width: Width in pixels in the run.
         bright: Radiance that 1 % of the pixels exceed; 1 is saturation.
-        blur_px: Standard deviation of the blur at the strongest edges; NaN without edges.
+        blur_px: Standard deviation of the blur at the strongest edges in the run; NaN without any.
         small: Small copy, mean of the colour channels.
     """
 
@@ -84,35 +86,46 @@ class Photograph(Record):
 
 
 def summarize(
-    name: str, radiance: Float[Tensor, "channel height width"], mask: Mask | None = None
+    name: str,
+    radiance: Float[Tensor, "channel height width"],
+    mask: Mask | None = None,
+    size_px: tuple[int, int] | None = None,
 ) -> Photograph:
-    """Return the measurements of linear radiance; saturation only counts inside the mask."""
+    """Return the measurements of linear radiance; saturation only counts inside the mask.
+
+    The size is that of the run, by default that of the radiance.
+    """
     height, width = radiance.shape[-2:]
-    shrink = min(1.0, SMALL_PX / max(height, width))
-    sides = (max(1, round(side * shrink)) for side in (width, height))
-    small = resized_radiance(radiance, *sides)
-    highest = small.amax(dim=0)
+    size_px = size_px or (width, height)
+    sides = shrunk_size(width, height, EXAMINED_PX)
+    radiance = resized_radiance(radiance, *sides)
     saturated = radiance.amax(dim=0) >= SATURATED
-    counted = saturated if mask is None else saturated[mask]
+    if mask is not None:
+        saturated = saturated[resized_mask(mask.float(), *sides)]
+    small = resized(radiance, *shrunk_size(*sides, _SMALL_PX))
+    highest = small.amax(dim=0)
     return Photograph(
         name=name,
-        width=width,
-        height=height,
-        saturated=float(counted.sum()) / max(1, counted.numel()),
+        width=size_px[0],
+        height=size_px[1],
+        saturated=float(saturated.sum()) / max(1, saturated.numel()),
         bright=float(highest.flatten().kthvalue(math.ceil(0.99 * highest.numel())).values),
-        blur_px=edge_blur_px(radiance.mean(dim=0)),
+        blur_px=edge_blur_px(radiance.mean(dim=0)) * max(size_px) / max(sides),
         small=small.mean(dim=0),
     )
 
 
-def summarize_views(views: Views) -> list[Photograph]:
-    """Return the measurements of loaded photographs."""
+def summarize_views(
+    views: Views, sizes_px: Mapping[str, tuple[int, int]] | None = None
+) -> list[Photograph]:
+    """Return the measurements of loaded photographs, with their sizes in the run by name."""
 
     def measure(index: int) -> Photograph:
         width, height = views.sizes_px[index].tolist()
         image = views.images[index, :, :height, :width].detach().cpu().float()
         mask = None if views.masks is None else views.masks[index, :height, :width].cpu()
-        return summarize(views.names[index], image, mask)
+        name = views.names[index]
+        return summarize(name, image, mask, sizes_px[name] if sizes_px else None)
 
     with torch.no_grad():
         return list(side_by_side(measure, range(views.num_views), tracked=False))
