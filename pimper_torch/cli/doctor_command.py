@@ -25,8 +25,7 @@ class _Job:
 
     Attributes:
         photos: Folder of JPEG, PNG or TIFF files; without it, only the machine is checked.
-        max_size_px: Longer side to which larger photographs are scaled down, 0 for none; by
-            default as in a run.
+        max_size_px: Longer side of shrunk photographs, 0 for none; by default as in a run.
         photographs: Encoding of the photographs.
     """
 

@@ -60,8 +60,7 @@ class CommonOptions:
         preset: Settings to start from: default, fast, paper, or your own YAML file.
         reference: Photograph for sample spacing and rendered views; by default automatic.
         device: Device of the stages after structure from motion; cuda has not been tested on a GPU.
-        max_size_px: Longer side to which larger photographs are scaled down, 0 for none; by
-            default 1600, or less if memory is short.
+        max_size_px: Longer side of shrunk photographs, 0 for none; 1600, or less for short memory.
         overwrite: Replace the result in OUT.
         faces: Maximum number of faces of the mesh, or all; by default as few as the shape needs.
         watertight: Close the mesh; caps are marked as not measured.

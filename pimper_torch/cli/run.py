@@ -100,7 +100,7 @@ def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
 
 
 def _at_working_size(job: Job, output: Output) -> Job:
-    """Return the run with its working size as a number, and print the size if it shrinks."""
+    """Return the run with its working size, and print the size if it shrinks."""
     sizes_px = [*photograph_sizes(job.photos).values()]
     limit = job.config.max_memory if isinstance(job.config, CoarseToFineConfig) else ""
     limit_gb = bytes_of(limit) / 1e9 if limit else 0.0

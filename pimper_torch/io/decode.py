@@ -34,7 +34,6 @@ _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM")  # the last two for published d
 # not.
 MAX_PIXELS, _MAX_BYTES = 160_000_000, 2**31
 _MANY_PIXELS, _MAX_SAMPLES_PER_BYTE = 32_000_000, 200
-_DCT_FACTORS = (8, 4, 2)  # by which libjpeg shrinks while it decodes
 
 LABELS = 32
 """A mask or map with only integers below this contains labels. A choice."""
@@ -191,7 +190,7 @@ def decode(path: Path | str, least_px: tuple[int, int] | None = None) -> Decoded
     path = Path(path)
     header = read_header(path)
     wide, high = least_px if least_px and format_of(path) == "JPEG" else (math.inf, math.inf)
-    fits = (by for by in _DCT_FACTORS if header.width >= by * wide and header.height >= by * high)
+    fits = (by for by in (8, 4, 2) if header.width >= by * wide and header.height >= by * high)
     shrink = next((by for by in fits if header.width % by == header.height % by == 0), 1)
     array = _guarded(path, lambda: _upright(path, header, shrink))
     if array.dtype not in (np.uint8, np.uint16):

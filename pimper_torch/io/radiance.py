@@ -26,8 +26,7 @@ from pimper_torch.runtime.parallel import side_by_side
 OPAQUE = 0.5
 # Bit depths of sensors, which 16-bit files can contain.
 _SENSOR_BITS = (10, 12, 14)
-# Choices: all photographs share one raster size. A file that makes rasters 8 times as large as the
-# photograph of median size is not one of them, for rasters of 400 MB or more.
+# Choices: a file is refused if it makes rasters of 400 MB or more 8 times as large as the median.
 _MAX_PADDING, _MUCH_PADDING = 8, 10**8
 
 

@@ -88,16 +88,13 @@ def megapixels_at(sizes_px: Sequence[tuple[int, int]], longest: int) -> float:
 def working_size(
     sizes_px: Sequence[tuple[int, int]], given: int | None, limit_gb: float = 0.0
 ) -> tuple[int, str]:
-    """Return the longer side to which a run shrinks photographs, 0 for none, and a clause on it.
+    """Return the longer side to which a run shrinks photographs, and a clause if it shrinks any.
 
     Args:
         sizes_px: Width and height of the photographs' files.
-        given: The user's choice, which counts. ``None`` chooses the largest size of at most
-            :data:`DETAIL_PX` whose estimated memory is within the limit.
+        given: The user's choice, which counts; 0 keeps all sizes. ``None`` chooses the largest
+            size of at most :data:`DETAIL_PX` whose estimated memory is within the limit.
         limit_gb: Memory of the run; by default 60 % of the free memory.
-
-    Returns:
-        The clause is empty if no photograph is larger.
     """
     longest = given
     if longest is None:

@@ -64,9 +64,8 @@ def available_gb() -> float | None:
         group = Path("/sys/fs/cgroup")
         limit = float((group / "memory.max").read_text(encoding="ascii"))
         used = float((group / "memory.current").read_text(encoding="ascii"))
-        # The system drops pages of files when memory is needed.
         pages = (group / "memory.stat").read_text(encoding="ascii").split("inactive_file ")[1]
-        used -= float(pages.split()[0])
+        used -= float(pages.split()[0])  # of files, which the system drops
         free = min(free or limit, limit - used)
     return None if free is None else free / 1e9
 

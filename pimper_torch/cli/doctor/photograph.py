@@ -60,8 +60,7 @@ def _gradient(grey: Map, sigma: float) -> Float[Tensor, "2 height_in width_in"]:
     return torch.stack([across, down])
 
 
-# Longer side at which photographs are examined, where a blur of a pixel at 2000 is still measured.
-EXAMINED_PX = 1024
+EXAMINED_PX = 1024  # longer side, at which a blur of a pixel at 2000 is still measured
 _SMALL_PX = 480  # longer side of the small copy, which connects the demo's photographs
 
 
