@@ -30,7 +30,7 @@ from pimper_torch.io.cameras import read_cameras
 from pimper_torch.lighting.light_field import harmonics
 from pimper_torch.presets import load_chain as presets
 from pimper_torch.presets.load_config import load_config
-from pimper_torch.records import Silhouettes, SparseScene, Views
+from pimper_torch.records import Silhouettes, SparseScene, Verdict, Views
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.stages.photometry import factorize
 from pimper_torch.stages.sfm.reconstruct import Reconstruct
@@ -219,7 +219,7 @@ def camera_formats(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
 
 def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
     scene, _ = ball.photographed((0.0, 0.3, 1.0), views=3)
-    chain = pimper_torch.load_chain("default", judge=pimper_torch.stages.Given(None))
+    chain = pimper_torch.load_chain("default", judge=pimper_torch.stages.Given(GOOD))
     result = Found(
         mesh=ball.ball_mesh(),
         scene=scene,
@@ -229,8 +229,12 @@ def a_result(_: pytest.MonkeyPatch) -> dict[str, object]:
         report=(),
         failures=(),
         left_out=(),
+        verdict=None,
     )
     return {"result": result, "chain": chain}
+
+
+GOOD = Verdict(score=1.0, text="Good.", scores={})
 
 
 class Found(SimpleNamespace):

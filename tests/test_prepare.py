@@ -35,7 +35,6 @@ def test_steps_from_what_was_prepared_are_those_from_photographs(sphere, preset)
         assert [each.name for each in own.reports] == [each.name for each in plain.reports]
     assert prepared.decisions["cameras"] == "given"
     assert prepared.coarse is sphere[1]
-    assert prepared.per_pose == sphere[0].views.names
 
 
 def test_a_loop_prepares_once_and_steps_from_other_photographs(sphere):

@@ -44,6 +44,7 @@ from pimper_torch.runtime.errors import InputError, PimperWarning, Reconstructio
 from pimper_torch.stages.sfm.reconstruct import placed_scene, structure_from_motion
 from pimper_torch.stages.silhouettes.find import FindSilhouettes
 from pimper_torch.stages.silhouettes.network import SilhouetteNetwork, load_network
+from pimper_torch.stages.verdict.judge import score_of
 from pimper_torch.store import Store, kept
 
 Row = dict[str, Any]
@@ -51,8 +52,7 @@ Row = dict[str, Any]
 MOST_DEG, LEAST_MET = 6.0, 96.0  # of a good result: normals, per cent of pixels met
 # Parts of warnings that call the result bad; others are notes.
 ANNOUNCING = (
-    *("is treated as the object", "have no point in common", "of the silhouette's area"),
-    "The silhouettes are uncertain",
+    *("is treated as the object", "have no point in common"),
     *("cameras are unreliable", "may be misplaced", "Give masks of the object"),
     *("Features hardly match", "No points", "keep the normals of the coarse mesh"),
 )
@@ -85,6 +85,7 @@ def outlines(place: Path, preset: str, network: SilhouetteNetwork | None) -> Row
     figures = compared(found.masks, torch.stack(known))
     if found.expected_overlap is not None:
         figures["expected"] = float(found.expected_overlap.mean())
+        told["verdict"] = {"score": score_of("expected_overlap", figures["expected"])}
     reliable = f"{int(found.reliable.sum())} of {views.num_views}"
     return told | figures | {"reliable": reliable, "announced": announced(told), "CPU s": seconds}
 

@@ -36,7 +36,7 @@ from pimper_torch.records import (
     Views,
 )
 from pimper_torch.runtime.config import nearest
-from pimper_torch.runtime.errors import ConfigError, InputError, OnFailure
+from pimper_torch.runtime.errors import ConfigError, InputError, OnFailure, caution
 from pimper_torch.runtime.events import Event
 from pimper_torch.runtime.failures import failures_of, skipping, warn_of
 from pimper_torch.runtime.file_names import view_named
@@ -280,14 +280,19 @@ class Chain(Stage):
             reports += step.reports
         with skipping(self.on_failure) as entries, observed(self.observer) as table:
             extracted = self.running()(self.extract, step.surface)
+            result = Reconstruction(
+                mesh=extracted,
+                scene=step.scene,
+                held_out=step.held_out,
+                silhouettes=step.silhouettes,
+                coarse=step.coarse,
+                patches=step.heights,
+                report=(),
+            )
+            verdict = self._judged(result)
             warn_of(entries)
-        return Reconstruction(
-            mesh=extracted,
-            scene=step.scene,
-            held_out=step.held_out,
-            silhouettes=step.silhouettes,
-            coarse=step.coarse,
-            patches=step.heights,
+        return result.replace(
+            verdict=verdict,
             report=table_of([*reports, *table.reports]),
             failures=(*step.failures, *failures_of(entries)),
             left_out=(*step.left_out, *left_out_of(entries)),
@@ -310,7 +315,7 @@ class Chain(Stage):
             references = (scene, silhouettes) if held_out is None else (held_out, None)
             relighting = run(self.judge_textures, relighting, asset, *references)
             result = result.replace(finished=finished, relighting=relighting, asset=asset)
-            verdict = run(self.judge, result)
+            verdict = self._judged(result)
             warn_of(entries)
         return result.replace(
             verdict=verdict,
@@ -321,6 +326,13 @@ class Chain(Stage):
 
     if TYPE_CHECKING:  # code completion does not resolve the type of a stage's call
         __call__ = forward
+
+    def _judged(self, result: Reconstruction) -> Verdict:
+        """Return the verdict; warn if the result is not good, and was not judged so before."""
+        verdict = self.running()(self.judge, result)
+        if not verdict.good and (result.verdict is None or result.verdict.good):
+            caution(verdict.text, stacklevel=3)
+        return verdict
 
     def _swap(self, stages: Mapping[str, nn.Module]) -> None:
         for name, module in stages.items():

@@ -116,7 +116,7 @@ class CoarseToFine(Chain):
                 del sources  # takes as much memory as the photographs
             surface = run(self.fuse, heights, contours, last, *by_blocks)
             surface = run(self.repair, surface)
-            run(self.explain, surface, contours, prepared.per_pose if prepared.mesh is None else ())
+            run(self.explain, surface, contours)
             yield Step(scale=scale, last=last, prepared=prepared, heights=heights, surface=surface)
             if not last:
                 coarse = run(self.remesh, heights, surface, contours)

@@ -47,7 +47,6 @@ class Prepared(Record):
             resolved conventions, and the point cloud.
         silhouettes: In the photographs of ``scene``.
         contours: In one photograph per pose; in all of ``scene`` if it has no poses.
-        per_pose: Names of these photographs.
         coarse: The coarse surface.
         mesh: The given mesh in the scene's frame; ``None`` if none was given.
         held_out: Photographs used only to estimate cameras; ``None`` without any.
@@ -61,7 +60,6 @@ class Prepared(Record):
     scene: SparseScene
     silhouettes: Silhouettes
     contours: Contours
-    per_pose: tuple[str, ...]
     coarse: CoarseMesh
     mesh: Mesh | None = None
     held_out: SparseScene | None = None
@@ -130,7 +128,6 @@ def prepare(
         scene=scene,
         silhouettes=silhouettes,
         contours=contours,
-        per_pose=per_pose.views.names,
         coarse=coarse,
         mesh=mesh,
         held_out=held_out,

@@ -202,9 +202,8 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
         rows.append(f"{line.name:<16}{seconds:>9}{line.peak_memory_mb:10.0f}")
     rows.append(headline(result))
     output.remark("\n".join(rows))
-    if result.verdict is not None:
-        say = output.remark if result.verdict.good else output.warning
-        say(result.verdict.text)
+    if result.verdict is not None and result.verdict.good:
+        output.remark(result.verdict.text)
     if left_out := closing_line(result.left_out):
         output.remark(left_out)
     page = job.out / ("overview.png" if job.common.no_report else "report.html")

@@ -26,8 +26,9 @@ class Reconstruction(Record):
         failures: Items that failed and were skipped.
         left_out: Items that guards removed or reported, in order.
         held_out: Photographs for evaluation, used only to estimate cameras; ``None`` without any.
-        finished: The surface as written. ``finished``, ``relighting``, ``asset`` and ``verdict``
-            are ``None`` until :meth:`~pimper_torch.chains.chain.Chain.finish` has made them.
+        finished: The surface as written. ``finished``, ``relighting`` and ``asset`` are ``None``
+            until :meth:`~pimper_torch.chains.chain.Chain.finish` has made them.
+        verdict: Whether it is good; with the prediction of photographs after ``finish``.
     """
 
     mesh: Mesh

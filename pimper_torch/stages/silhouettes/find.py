@@ -12,7 +12,7 @@ from pimper_torch.geometry.visual_hull import bounding_cube, margins, visual_hul
 from pimper_torch.kernels.compile import COARSE
 from pimper_torch.records import Failure, Silhouettes, SparseScene
 from pimper_torch.records.scene import ViewPerPose, with_views
-from pimper_torch.records.shapes import PerView, ViewMask
+from pimper_torch.records.shapes import ViewMask
 from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.ledger import leave_out
@@ -34,9 +34,6 @@ from pimper_torch.stages.stage import Stage
 # Median intersection over union of silhouettes and hull projections, below which silhouettes are
 # not reliable.
 _MIN_OVERLAP = 0.8
-# Least mean of their expected overlaps without a warning. Of 25 captures, 13 of them of the fleet,
-# those with a true one of at least 0.93 expect 0.858 and more, those below 0.9 expect 0.85 or less.
-_MIN_EXPECTED = 0.855
 _USED = 0.25  # probability above which a pixel belongs to the mask of the object
 _UNLIKE = "its soft mask lacks most of the common hull of the others"
 _BY_HULL = "The hull of the other masks replaces them, and they do not constrain the surface"
@@ -148,7 +145,6 @@ class FindSilhouettes(Stage):
                 "the object. Choose another one by `--object-at`, or give masks that contain it."
             )
         _warn(cuts.rejected, scene.views.names, _UNLIKE, "It is cut without the soft mask")
-        _warn_uncertain(cuts.expected, scene.views.names)
         return _without_empty(silhouettes_of(cuts, scene.views), scene.views.names)
 
 
@@ -249,18 +245,6 @@ def _without_empty(silhouettes: Silhouettes, names: tuple[str, ...]) -> Silhouet
         return silhouettes
     _warn(empty, names, "its silhouette is empty", "These silhouettes do not constrain the surface")
     return silhouettes.replace(reliable=silhouettes.reliable & ~empty)
-
-
-def _warn_uncertain(overlaps: PerView | None, names: tuple[str, ...]) -> None:
-    """Warn if the expected overlap of the silhouettes with the object is low."""
-    if overlaps is not None and float(overlaps.mean()) < _MIN_EXPECTED:
-        worst = int(overlaps.argmin())
-        caution(
-            f"The silhouettes are uncertain: expected is an overlap of {overlaps.mean():.0%} with "
-            f"the object in the mean, and of {overlaps[worst]:.0%} in {names[worst]}; needed: "
-            f"{_MIN_EXPECTED:.0%}. Check them in overview.png; give masks if they are wrong.",
-            stacklevel=3,
-        )
 
 
 def _warn(views: ViewMask, names: tuple[str, ...], reason: str, done: str) -> None:
