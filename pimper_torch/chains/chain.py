@@ -289,7 +289,7 @@ class Chain(Stage):
                 patches=step.heights,
                 report=(),
             )
-            verdict = self._judged(result)
+            verdict = self._judged(result, True)
             warn_of(entries)
         return result.replace(
             verdict=verdict,
@@ -315,7 +315,8 @@ class Chain(Stage):
             references = (scene, silhouettes) if held_out is None else (held_out, None)
             relighting = run(self.judge_textures, relighting, asset, *references)
             result = result.replace(finished=finished, relighting=relighting, asset=asset)
-            verdict = self._judged(result)
+            known_good = result.verdict is not None and result.verdict.good
+            verdict = self._judged(result, known_good)
             warn_of(entries)
         return result.replace(
             verdict=verdict,
@@ -327,10 +328,10 @@ class Chain(Stage):
     if TYPE_CHECKING:  # code completion does not resolve the type of a stage's call
         __call__ = forward
 
-    def _judged(self, result: Reconstruction) -> Verdict:
-        """Return the verdict; warn if the result is not good, and was not judged so before."""
+    def _judged(self, result: Reconstruction, warn: bool) -> Verdict:
+        """Return the verdict, with a warning if the result is not good."""
         verdict = self.running()(self.judge, result)
-        if not verdict.good and (result.verdict is None or result.verdict.good):
+        if warn and not verdict.good:
             caution(verdict.text, stacklevel=3)
         return verdict
 
