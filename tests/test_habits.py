@@ -13,7 +13,8 @@ import pimper_torch as pt
 from pimper_torch.records import Silhouettes
 from pimper_torch.stages.stage import Given
 
-LIT = pytest.mark.filterwarnings("ignore:Factorization")  # few patches have enough lit views
+# Few patches have enough lit views.
+LIT = pytest.mark.filterwarnings("ignore:Factorization", "ignore:Not usable. light determines")
 
 
 class Scaled(pt.Stage):

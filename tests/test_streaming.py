@@ -87,7 +87,12 @@ def test_steps_have_the_records_of_every_pass_and_end_with_the_result():
     names = [report.name for step in steps for report in step.reports]
     assert names.count("between stages") == len(steps)
     stages = [name for name in names if name != "between stages"]
-    assert [report.name for report in result.report] == [*stages, "extract", "between stages"]
+    assert [report.name for report in result.report] == [
+        *stages,
+        "extract",
+        "judge",
+        "between stages",
+    ]
     assert torch.equal(chain.extract(steps[-1].surface).vertices_world, result.mesh.vertices_world)
     # The second pass uses facets remeshed on the surface of the first.
     assert steps[0].coarse is chain.coarse_surface.record

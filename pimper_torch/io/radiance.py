@@ -90,7 +90,7 @@ def read_pictures(
     return images, opaque
 
 
-def refuse_outlier(files: Sequence[Path], sizes_px: Sizes, channels: int = 3) -> None:
+def refuse_outlier(files: Sequence[Path | str], sizes_px: Sizes, channels: int = 3) -> None:
     """Raise an error if one file makes all rasters much larger than the other photographs."""
     width, height = (max(sides) for sides in zip(*sizes_px, strict=True))
     usual = sorted(sizes_px, key=prod)[len(files) // 2]

@@ -59,7 +59,7 @@ def test_only_selected_photographs_are_decoded(folder, monkeypatch):
     monkeypatch.setattr(
         radiance,
         "decode",
-        lambda path, real=radiance.decode: decoded.append(path.name) or real(path),
+        lambda path, *size, real=radiance.decode: decoded.append(path.name) or real(path, *size),
     )
     capture = read_dtu_points(folder, 4, light_seed=5, lights=(1, 2))
     assert capture.position.tolist() == [1, 2, 3]
