@@ -3,7 +3,7 @@
 ``CoarseToFine`` (presets ``default`` and ``fast``) runs ``Reconstruct``, ``FindSilhouettes``,
 ``TraceContours``, ``CoarseSurface`` and ``DepthFromLight``; for each scale ``Decompose``, ``Warp``,
 ``FitLight``, ``Factorize``, ``Sweep``, ``FixGauge``, ``Fuse``, ``Repair`` and ``Remesh``; then
-``Extract``.
+``Extract`` and ``Judge``.
 ``Chain.finish`` runs ``Simplify``, ``Relight``, ``Texture``, ``JudgeTextures`` and ``Judge``.
 """
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scenes import trusted
 
+from pimper_torch.geometry.coverage import coverage_by
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import RayCaster
@@ -112,8 +113,14 @@ def with_reliable(result, *reliable):
 
 
 BAD = {
-    "covered": (without_one_side, r"a\.png: the surface lacks 1\d% of the silhouettes\. Phot"),
-    "sticking_out": (wider, r"b\.png: the surface sticks out of the silhouettes by 1\d% of"),
+    "covered": (
+        without_one_side,
+        r"a\.png: the surface lacks 1\d% of the silhouette, and 1\d% in the mean\. Phot",
+    ),
+    "sticking_out": (
+        wider,
+        r"b\.png: the surface sticks out of the silhouette by 1\d% of its area, and by 1\d% in the",
+    ),
     "predicted_db": (
         lambda result: predicting(result, 20.0, 14.0, 17.0),
         r"b\.png: the surface predicts the photographs only with a PSNR of 17 dB\. ",
@@ -137,6 +144,18 @@ def test_the_least_favourable_figure_is_named_with_a_photograph(result, name):
     assert 0 < found.score < 0.5
     assert not found.good
     assert re.match(f"Look at {text}", found.text), found.text
+
+
+def test_the_sentence_has_the_figures_of_the_view_and_of_the_mean(result):
+    inside = result.silhouettes.inside.clone()
+    inside[1, :4] = 1  # a strip above the surface
+    result = result.replace(silhouettes=result.silhouettes.replace(inside=inside))
+    lacking = coverage_by(result.mesh, result.silhouettes, result.cameras).uncovered
+    assert lacking.max() > 2 * lacking.mean()
+    text = (
+        f"b.png: the surface lacks {lacking.max():.0%} of the silhouette, and {lacking.mean():.0%}"
+    )
+    assert text in judge(result).text
 
 
 def test_an_unusable_figure_has_no_photograph(result):

@@ -36,7 +36,7 @@ class Judge(Stage):
         """Return the verdict, which is that of the least favourable figure.
 
         Args:
-            result: With relighting, see :meth:`~pimper_torch.chains.chain.Chain.finish`.
+            result: With its relighting, if it has one, the prediction of photographs counts.
         """
         figures = {each.name: each for each in _figures(result)}
         scores = {name: score_of(name, each.value) for name, each in figures.items()}
@@ -137,21 +137,19 @@ def _of_silhouettes(
             f"the silhouettes are expected to overlap the object by only {overlap.mean():.0%}",
             _MASKS,
         )
-    lacking, exceeding = (
-        torch.maximum(values.mean(), _WORST * values.max())
-        for values in (found.uncovered, found.outside)
-    )
+    lacking, exceeding = ((x.mean(), x.max()) for x in (found.uncovered, found.outside))
     yield _Figure(
         "covered",
-        1 - float(lacking),
+        1 - float(torch.maximum(lacking[0], _WORST * lacking[1])),
         worst(found.uncovered, trusted),
-        f"the surface lacks {lacking:.0%} of the silhouettes",
+        f"the surface lacks {lacking[1]:.0%} of the silhouette, and {lacking[0]:.0%} in the mean",
         "Photograph what is missing from more places, or check masks/.",
     )
     yield _Figure(
         "sticking_out",
-        float(exceeding),
+        float(torch.maximum(exceeding[0], _WORST * exceeding[1])),
         worst(found.outside, trusted),
-        f"the surface sticks out of the silhouettes by {exceeding:.0%} of their area",
+        f"the surface sticks out of the silhouette by {exceeding[1]:.0%} of its area, and by "
+        f"{exceeding[0]:.0%} in the mean",
         _MASKS,
     )
