@@ -37,8 +37,9 @@ def test_a_public_name_is_in_the_package_or_a_listed_subpackage():
         ("pt.stages.", {"Warp", "Factorize", "Stage"}),
     ],
 )
-def test_completion_offers_existing_names(code, offered):
-    """Completion does not execute code."""
+def test_completion_offers_existing_names(code, offered, tmp_path, monkeypatch):
+    """Completion does not execute code; workers that share jedi's cache read half-written files."""
+    monkeypatch.setattr(jedi.settings, "cache_directory", tmp_path)
     in_a_file = jedi.Script(f"import pimper_torch as pt\n{code}").complete()
     assert offered <= {one.name for one in in_a_file}
     in_a_cell = jedi.Interpreter(code, [{"pt": pt}]).complete()
