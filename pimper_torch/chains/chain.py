@@ -308,7 +308,7 @@ class Chain(Stage):
         scene, held_out, silhouettes = result.scene, result.held_out, result.silhouettes
         run = self.running()
         with skipping(self.on_failure) as entries, observed(self.observer) as table:
-            finished = run(self.simplify, result.mesh, files or MeshFiles())
+            finished = run(self.simplify, result.mesh, (files or MeshFiles()).shape())
             relighting = run(self.relight, finished.few, scene, silhouettes, held_out)
             asset = run(self.texture, result.mesh, finished.few, relighting)
             # Against the same photographs as the mesh.

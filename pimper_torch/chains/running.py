@@ -16,7 +16,7 @@ from pimper_torch.runtime.errors import held
 from pimper_torch.runtime.reporting import HASH, aside
 from pimper_torch.runtime.reporting import stage as reported_stage
 from pimper_torch.stages.stage import Stage
-from pimper_torch.store import Store, digest, kept
+from pimper_torch.store import Store, actual, digest, kept
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -51,7 +51,11 @@ class ChainRun:
         if kernels and not all_compiled():
             with reported_stage("compile"):
                 load(kernels)
-        make: Callable[[], Any] = partial(called, name, partial(stage, *inputs, **named))
+
+        def make() -> Any:  # noqa: ANN401 - the record of any stage
+            values, others = actual((inputs, named))
+            return called(name, partial(stage, *values, **others))
+
         with nullcontext() if self.last else held():
             if self.store is None or not isinstance(stage, Stage) or stage.kept_as is None:
                 return make()

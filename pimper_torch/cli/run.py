@@ -2,19 +2,22 @@
 
 import json
 import time
-from contextlib import nullcontext, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
 from pimper_torch.chains.chain_config import CoarseToFineConfig
-from pimper_torch.cli.doctor.checks import examine_views
 from pimper_torch.cli.doctor.cost import planned, working_size
+from pimper_torch.cli.earlier import reconstructed
 from pimper_torch.cli.options import Job
 from pimper_torch.cli.output import Output
 from pimper_torch.cli.view import print_address
+from pimper_torch.export.pictures import Pictures, drawn
 from pimper_torch.export.result_folder.folders import held_output
 from pimper_torch.export.result_folder.marker import STAGES
 from pimper_torch.export.result_folder.stages import PREVIEW
@@ -37,12 +40,14 @@ from pimper_torch.runtime.reporting import stage, stage_report
 from pimper_torch.runtime.stream import collected
 from pimper_torch.scale import given
 from pimper_torch.scale.find_scale import find_scale
+from pimper_torch.scale.marker_scale import Marker
 from pimper_torch.scale.scale import Scale
 from pimper_torch.scale.scaled import scaled
 from pimper_torch.store import Store
-from pimper_torch.viewer.show import COARSE, RESULT, add_found
-from pimper_torch.viewer.viewer import Viewer
 from pimper_torch.viz.overview import draw_preview, headline
+
+if TYPE_CHECKING:
+    from pimper_torch.viewer.viewer import Viewer
 
 
 def carry_out(job: Job, output: Output) -> None:
@@ -52,13 +57,17 @@ def carry_out(job: Job, output: Output) -> None:
             f"--device is cuda, but torch {torch.__version__} finds no CUDA device. Run on the CPU "
             "(--device cpu), or install the CUDA build of torch and check the driver."
         )
-    with Viewer() if job.common.view else nullcontext() as viewer:
-        if viewer is not None:
-            print_address(viewer, output)
+    if not job.common.view:
+        _reconstruct(job, output)
+        return
+    from pimper_torch.viewer.viewer import Viewer
+
+    with Viewer() as viewer:
+        print_address(viewer, output)
         _reconstruct(job, output, viewer)
 
 
-def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
+def _reconstruct(job: Job, output: Output, viewer: "Viewer | None" = None) -> None:
     common = job.common
     imports = stage_report("import", time.perf_counter() - output.began)
     lock = held_output(job.out, "result", overwrite=common.overwrite)
@@ -66,29 +75,38 @@ def _reconstruct(job: Job, output: Output, viewer: Viewer | None) -> None:
     store = Store(folder=folder, max_bytes=limit, fresh=common.fresh)
     warned = collected(Caution, passed_on=True)
     with lock, output.observer() as (observer, table), warned as cautions:
-        with stage("read") as figures:
-            job = _at_working_size(job, output)
-            views = _read(job, store)
-            figures["photographs"] = views.num_views
-            _examine(job, views)
-            bars = bars_in_files(job, views)
-            mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
-        observer.plan = _plan(job, views)
+        job = _at_working_size(job, output)
+        bars = bars_in_files(job)
         chain = make_chain(job.config, observer, store)
         chain.needed = tuple(given.measured_in(job.inputs.scale_bar, job.inputs.camera_distance))
         chain.preview = partial(_preview, output, job.out / STAGES / PREVIEW, viewer)
-        chain.watch = None if viewer is None else partial(add_found, viewer)
-        result = chain(views.to(common.device), job.inputs.sparse, mesh)
+        if viewer is not None:
+            from pimper_torch.viewer.show import RESULT, add_found
+
+            chain.watch = partial(add_found, viewer)
+
+        def run() -> Reconstruction:
+            with stage("read") as figures:
+                views = _read(job, store)
+                figures["photographs"] = views.num_views
+                _examine(job, views)
+                mesh = read_mesh(job.inputs.mesh).to(common.device) if job.inputs.mesh else None
+            observer.plan = _plan(job, views)
+            return chain(views.to(common.device), job.inputs.sparse, mesh)
+
+        # The viewer shows every pass.
+        result = reconstructed(job, store if viewer is None else None, run)
         if viewer is not None:
             viewer.add_pass(RESULT, result.mesh)
-        result = result.replace(report=(imports, *table.so_far()))
+        result = chain.finish(result, common.files)
+        pictures = drawn(result, store)
         with stage("scale") as figures:
-            result, scale = sized(job, bars, result)
+            result, scale = sized(job, bars, result, pictures.markers)
             if scale is not None:
                 figures["scale"] = scale.factor
-        result = chain.finish(result, job.common.files)
+        result = result.replace(report=(imports, *table.so_far()))
         with stage("write"):
-            _write(job, result, scale, cautions)
+            _write(job, result, pictures, scale, cautions)
         result = result.replace(report=(imports, *table.so_far()))
     if scale is not None:
         output.remark(scale_message(scale))
@@ -122,10 +140,12 @@ def _plan(job: Job, views: Views) -> list[tuple[str, float]]:
 
 
 def _preview(
-    output: Output, path: Path, viewer: Viewer | None, scene: SparseScene, coarse: CoarseMesh
+    output: Output, path: Path, viewer: "Viewer | None", scene: SparseScene, coarse: CoarseMesh
 ) -> None:
     """Draw the coarse surface and print its path; errors of the disk are ignored."""
     if viewer is not None:
+        from pimper_torch.viewer.show import COARSE
+
         viewer.add_pass(COARSE, coarse.mesh)
     with suppress(OSError):
         draw_preview(scene, coarse, path)
@@ -148,7 +168,7 @@ def _read(job: Job, store: Store) -> Views:
     if inputs.segmenter:
         priors.append(segment(views, inputs.segmenter, cache=store))
     if inputs.object_at:
-        priors.append(object_at([in_files(job, views, mark) for mark in inputs.object_at], views))
+        priors.append(object_at([in_files(job, mark) for mark in inputs.object_at], views))
     if inputs.normals is not None:
         error_deg = inputs.normals_error_deg
         priors.append(read_normals(inputs.normals, views, inputs.axes, error_deg=error_deg))
@@ -159,6 +179,8 @@ def _read(job: Job, store: Store) -> Views:
 
 def _examine(job: Job, views: Views) -> None:
     """Give the warnings of `pimper doctor`, except those on overlap."""
+    from pimper_torch.cli.doctor.checks import examine_views  # not for kept results
+
     config = job.config
     # Time and memory are estimated for `default`.
     estimated = isinstance(config, CoarseToFineConfig) and config.scales[-1] >= 1
@@ -167,7 +189,13 @@ def _examine(job: Job, views: Views) -> None:
             caution(f"{job.photos}: {finding}", stacklevel=2)
 
 
-def _write(job: Job, result: Reconstruction, scale: Scale | None, cautions: list[Caution]) -> None:
+def _write(
+    job: Job,
+    result: Reconstruction,
+    pictures: Pictures,
+    scale: Scale | None,
+    cautions: list[Caution],
+) -> None:
     names = ("masks", "sparse", "mesh", "silhouettes", "normals", "depth")
     paths: dict[str, Path | None] = {name: getattr(job.inputs, name) for name in names}
     about: dict[str, object] = {
@@ -191,6 +219,7 @@ def _write(job: Job, result: Reconstruction, scale: Scale | None, cautions: list
         about=about,
         files=job.common.files,
         report=not job.common.no_report,
+        pictures=pictures,
     )
 
 
@@ -213,31 +242,32 @@ def _conclude(output: Output, job: Job, result: Reconstruction) -> None:
     output.result({"folder": job.out, **paths}, figures=figures)
 
 
-def in_files(job: Job, views: Views, mark: given.Mark) -> given.Mark:
+def in_files(job: Job, mark: given.Mark) -> given.Mark:
     """Return a mark with the upright image sizes of the files that its pixels refer to.
 
     People click in files, which viewers rotate by EXIF; ``--max-size-px`` scales them afterwards.
     """
-    paths = {image_name(path, job.photos): path for path in list_images(job.photos)}
+    paths = list_images(job.photos)
+    names = [image_name(path, job.photos) for path in paths]
 
     def sized_pointer(pointer: given.PixelMark) -> given.PixelMark:
-        header = read_header(paths[views.names[view_named(pointer.name, views.names)]])
+        header = read_header(paths[view_named(pointer.name, names)])
         given.require_inside(pointer, header.width, header.height)
         return replace(pointer, size_px=(header.width, header.height))
 
     return given.Mark(pointers=tuple(map(sized_pointer, mark.pointers)))
 
 
-def bars_in_files(job: Job, views: Views) -> tuple[given.ScaleBar, ...]:
+def bars_in_files(job: Job) -> tuple[given.ScaleBar, ...]:
     """Return the scale bars with marks as from :func:`in_files`."""
     return tuple(
-        replace(bar, first=in_files(job, views, bar.first), second=in_files(job, views, bar.second))
+        replace(bar, first=in_files(job, bar.first), second=in_files(job, bar.second))
         for bar in job.inputs.scale_bar
     )
 
 
 def sized(
-    job: Job, bars: tuple[given.ScaleBar, ...], result: Reconstruction
+    job: Job, bars: tuple[given.ScaleBar, ...], result: Reconstruction, found: Sequence[Marker]
 ) -> tuple[Reconstruction, Scale | None]:
     """Return the result in real size and the scale; both unchanged, ``None``, if unknown."""
     inputs = job.inputs
@@ -248,6 +278,7 @@ def sized(
         markers=inputs.markers,
         unit=inputs.unit,
         own_frame=inputs.sparse is not None,
+        found=found,
     )
     return (result, None) if scale is None else (scaled(result, scale.factor), scale)
 

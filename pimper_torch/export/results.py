@@ -1,5 +1,6 @@
 """Writing of result folders."""
 
+import json
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -13,6 +14,7 @@ from PIL import Image
 from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.export import reports
 from pimper_torch.export.picture_files import write_mask
+from pimper_torch.export.pictures import Pictures, completed, drawn
 from pimper_torch.export.result_folder.folders import written_whole
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
 from pimper_torch.io.assets.mesh_files import MeshFiles as MeshFiles
@@ -23,7 +25,7 @@ from pimper_torch.io.estimates import mask_path, read_lights
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale
-from pimper_torch.records import FinishedMesh, Reconstruction, Relighting, TexturedMesh
+from pimper_torch.records import FinishedMesh, Reconstruction, TexturedMesh
 from pimper_torch.runtime.config import read_mapping, to_yaml
 from pimper_torch.runtime.mapped import drop_pages
 from pimper_torch.runtime.progress import part
@@ -31,11 +33,9 @@ from pimper_torch.runtime.reporting import stage_report
 from pimper_torch.scale.given import MILLIMETRES
 from pimper_torch.stages.sfm.sparse_scene import write_model
 from pimper_torch.viz.maps import normal_colors, view_maps
-from pimper_torch.viz.overview import draw_overview
 from pimper_torch.viz.report.page import asset_within, write_page
-from pimper_torch.viz.report.predictions import predictions
 from pimper_torch.viz.tiles import array
-from pimper_torch.viz.turn import draw_turn, up_world
+from pimper_torch.viz.turn import up_world
 
 RESULT_NAMES = (
     "mesh.ply",
@@ -61,7 +61,7 @@ RESULT_NAMES = (
     "report.html",
 )
 """All files of a result; a table in the manual describes them."""
-_PARTS = 6  # of the progress bar: meshes, asset, maps, overview, turntable, page
+_PARTS = 4  # of the progress bar: meshes, asset, others, page
 
 
 def write_result(
@@ -73,6 +73,7 @@ def write_result(
     about: Mapping[str, object] | None = None,
     files: MeshFiles | None = None,
     report: bool = True,
+    pictures: Pictures | None = None,
 ) -> None:
     """Write a result to a folder: the files of :data:`RESULT_NAMES`.
 
@@ -96,6 +97,7 @@ def write_result(
         folder: New or empty; its parents are created.
         files: Number of faces and formats of the mesh, for a result without ``finished``; see
             :meth:`~pimper_torch.chains.chain.Chain.finish`.
+        pictures: Images of the result, if they are drawn already.
 
     Raises:
         OutputError: The folder contains other files, or cannot be written.
@@ -105,29 +107,22 @@ def write_result(
     if result.finished is None:
         result = CoarseToFine().finish(result, files)
     with written_whole(folder, "result", overwrite=overwrite) as staging:
-        ready, asset, _ = _completed(result)
-        written = result.replace(mesh=ready.mesh)
+        ready, asset, _ = completed(result)
+        written, shown = result.replace(mesh=ready.mesh), pictures or drawn(result)
         with part(0, _PARTS):
             _write_meshes(ready, files, written.scene.offset_world, staging)
         with part(1, _PARTS):
             placement = _placement(written, asset, files, folder.absolute().name, about or {})
             _write_assets(asset, files, placement, staging)
-        _write_all(written, config, staging)
+        with part(2, _PARTS):
+            _write_all(written, shown, config, staging)
         writing = stage_report("write", time.perf_counter() - began)
         timed = result.replace(report=(*result.report, writing))
-        summary = _summary(timed, about or {})
+        summary = _summary(timed, about or {}) | {"thumbnails": shown.thumbnails}
         reports.write_json(summary, staging / "summary.json")
-        with part(5, _PARTS):
+        with part(3, _PARTS):
             if report:
-                _write_page(written, placement, summary, staging)
-
-
-def _completed(result: Reconstruction) -> tuple[FinishedMesh, TexturedMesh, Relighting]:
-    ready, asset, relighting = result.finished, result.asset, result.relighting
-    assert ready is not None
-    assert asset is not None
-    assert relighting is not None
-    return ready, asset, relighting
+                _write_page(written, shown, placement, summary, staging)
 
 
 def _write_meshes(ready: FinishedMesh, files: MeshFiles, offset: Offset, folder: Path) -> None:
@@ -153,7 +148,7 @@ def _write_assets(
 
 
 def _summary(result: Reconstruction, about: Mapping[str, Any]) -> dict[str, Any]:
-    ready, asset, relighting = _completed(result)
+    ready, asset, relighting = completed(result)
     return {
         **reports.summary_report(result, about),
         **({ready.how: ready.counts} if ready.how else {}),
@@ -165,19 +160,22 @@ def _summary(result: Reconstruction, about: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _write_page(
-    result: Reconstruction, placement: Placement, summary: Mapping[str, Any], folder: Path
+    result: Reconstruction,
+    pictures: Pictures,
+    placement: Placement,
+    summary: Mapping[str, Any],
+    folder: Path,
 ) -> None:
-    ready, asset, relighting = _completed(result)
     write_page(
         folder / "report.html",
         title=placement.name,
         mesh=result.mesh,
-        asset=asset_within(asset, folder / "asset.glb", placement),
-        surface=asset.mesh,
+        asset=asset_within(completed(result)[1], folder / "asset.glb", placement),
+        openness=pictures.openness,
         scene=result.scene,
         silhouettes=result.silhouettes,
         reference=result.coarse.reference,
-        predictions=predictions(ready.few, result.scene, relighting),
+        images=json.loads(pictures.views),
         summary=summary,
         settings=read_mapping(folder / "config.yaml"),
         lights_world=read_lights(folder / "lights.json", result.scene.views.names),
@@ -204,22 +202,19 @@ def _placement(
     )
 
 
-def _write_all(result: Reconstruction, config: object, folder: Path) -> None:
-    write_model(result.scene, folder / "sparse")
+def _write_all(result: Reconstruction, pictures: Pictures, config: object, folder: Path) -> None:
+    write_model(result.scene, folder / "sparse", pictures.points)
     if result.silhouettes.source != "everything":
         (folder / "masks").mkdir()
         views = result.scene.views.replace(masks=result.silhouettes.shown)
         for index, name in enumerate(views.names):
             write_mask(views, index, mask_path(folder / "masks", name))
             drop_pages()
-    with part(2, _PARTS):
-        _write_maps(result, folder)
+    _write_maps(result, folder)
     reports.write_json(reports.lights_report(result), folder / "lights.json", indent=None)
     (folder / "config.yaml").write_text(to_yaml(config), encoding="utf-8")
-    with part(3, _PARTS):
-        draw_overview(result, folder / "overview.png")
-    with part(4, _PARTS):
-        draw_turn(result.mesh, result.cameras, result.coarse.reference, folder / "turn.webp")
+    (folder / "overview.png").write_bytes(pictures.overview.numpy().tobytes())
+    (folder / "turn.webp").write_bytes(pictures.turn.numpy().tobytes())
 
 
 def _write_maps(result: Reconstruction, folder: Path) -> None:

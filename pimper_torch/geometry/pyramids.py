@@ -7,7 +7,6 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float, Int, UInt8
-from kornia.geometry.transform import pyrdown
 from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, pad
 
@@ -41,6 +40,9 @@ def halve(images: Float[Tensor, "view channels _ _"]) -> Float[Tensor, "view cha
     """
     height, width = images.shape[-2:]
     if height % 2 or width % 2:
+        # Slow to import, and rarely used.
+        from kornia.geometry.transform import pyrdown
+
         return pyrdown(images)
     taps = images.new_tensor([1, 5, 10, 10, 5, 1]) / 32
     planes = pad(images.reshape(-1, 1, height, width), (2, 2, 2, 2), mode="reflect")

@@ -9,9 +9,9 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+import lazy_loader
 import numpy as np
 import torch
-import trimesh
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -27,6 +27,7 @@ from pimper_torch.records.shapes import FaceMask, Vertices
 from pimper_torch.records.value_checks import not_finite, out_of_range
 from pimper_torch.runtime.errors import InputError
 
+trimesh = lazy_loader.load("trimesh")  # takes a second
 # Scalars per vertex, written and read under the names of the record's fields.
 _ERRORS = ("confidence", "expected_error")
 SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")

@@ -9,7 +9,7 @@ from pimper_torch.records import Reconstruction
 from pimper_torch.records.shapes import Vector
 from pimper_torch.runtime.errors import caution
 from pimper_torch.scale.given import CameraDistance, ScaleBar, Unit
-from pimper_torch.scale.marker_scale import scale_of_markers
+from pimper_torch.scale.marker_scale import Marker, scale_of_markers
 from pimper_torch.scale.marks import place_of, view_of
 from pimper_torch.scale.scale import Length, Scale, fit_scale, most_accurate
 
@@ -45,6 +45,7 @@ def find_scale(
     markers: Literal["auto", "off"] | float = "auto",
     unit: Unit = "mm",
     own_frame: bool = False,
+    found: Sequence[Marker] | None = None,
 ) -> Scale | None:
     """Compute the factor from a result's lengths to a known unit.
 
@@ -58,6 +59,7 @@ def find_scale(
             in millimetres, if it differs from the one that their codes encode.
         own_frame: The cameras were given with the photographs. ``markers="auto"`` alone then does
             not change their unit.
+        found: The markers of the scene; by default, they are searched for.
 
     Returns:
         ``None`` if the scale is unknown.
@@ -69,7 +71,7 @@ def find_scale(
         scales.append(scale_of_cameras(result, camera_distances, unit))
     side_mm = None if isinstance(markers, str) else float(markers)
     if markers != "off" and (side_mm is not None or scales or not own_frame):
-        marker_scale = scale_of_markers(result.scene, side_mm, unit)
+        marker_scale = scale_of_markers(result.scene, side_mm, unit, found)
         if marker_scale is not None:
             scales.append(marker_scale)
         elif side_mm is not None:

@@ -1,6 +1,7 @@
 """Scale of a result from printed markers in its photographs."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -41,7 +42,10 @@ class Marker(Record):
 
 
 def scale_of_markers(
-    scene: SparseScene, side_mm: float | None = None, unit: Unit = "mm"
+    scene: SparseScene,
+    side_mm: float | None = None,
+    unit: Unit = "mm",
+    found: Sequence[Marker] | None = None,
 ) -> Scale | None:
     """Compute the scale of a scene from printed markers.
 
@@ -52,6 +56,7 @@ def scale_of_markers(
     Args:
         side_mm: Side of the black squares; by default that of their sheet, see
             :func:`~pimper_torch.scale.sheet.side_of`.
+        found: The markers of the scene; by default, they are searched for.
 
     Returns:
         ``None`` if there is no such marker, or no size that most markers agree on.
@@ -62,7 +67,7 @@ def scale_of_markers(
             true=true_mm / MILLIMETRES[unit],
             label=f"the side of marker {marker.code}",
         )
-        for marker in find_markers(scene)
+        for marker in (find_markers(scene) if found is None else found)
         if (true_mm := side_of(marker.code) if side_mm is None else side_mm) is not None
     ]
     if not lengths:

@@ -94,6 +94,8 @@ def _copy(value: Any, factor: float, copies: dict[int, Any]) -> Any:  # noqa: AN
                 new = value * value.new_tensor([1.0, 1.0, 1.0, factor])
         if new is not value:
             changes[field.name] = new
+    if isinstance(record, records.FinishedMesh) and "spacing" in record.counts:
+        changes["counts"] = record.counts | {"spacing": factor * record.counts["spacing"]}
     if isinstance(record, records.SparseScene):
         changes["offset_world"] = tuple(factor * length for length in record.offset_world)
     return copies.setdefault(id(record), record.replace(**changes) if changes else record)

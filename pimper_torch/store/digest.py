@@ -43,8 +43,8 @@ def is_known(module: str) -> bool:
     return module.startswith((f"{_PACKAGE.name}.", "torch.nn."))
 
 
-# Version and hash of live tensors that were hashed. Stages pass on the same tensors, and writing
-# into a tensor increments its version.
+# Version and hash of live tensors that were hashed or deferred. Stages pass on the same tensors,
+# and writing into a tensor increments its version.
 _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
@@ -79,7 +79,7 @@ def _described(value: object) -> object:
         return value
     kind = _named(type(value))
     if isinstance(value, Tensor):
-        return [kind, _tensor(value)]
+        return [kind, tensor_hash(value)]
     if isinstance(value, float | complex | bytes | Path | Enum):
         return [kind, repr(value)]
     if isinstance(value, types.FunctionType | nn.Module | type):
@@ -111,7 +111,8 @@ def _named(kind: type | types.FunctionType) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
-def _tensor(tensor: Tensor) -> str:
+def tensor_hash(tensor: Tensor) -> str:
+    """Return a hash of a tensor's bits, shape, type and device, computed once while it lives."""
     if tensor.requires_grad or tensor.layout != torch.strided or tensor.is_meta:
         raise _UnknownError
     # An inference tensor has no version; it cannot be written to outside inference mode.
@@ -127,6 +128,10 @@ def _tensor(tensor: Tensor) -> str:
     for chunk in torch.split(flat.view(torch.uint8), LARGE):
         hashed.update(chunk.numpy().data)
         drop_pages()
-    result = hashed.hexdigest()
-    _known[tensor] = (version, result)
-    return result
+    _known[tensor] = (version, hashed.hexdigest())
+    return hashed.hexdigest()
+
+
+def known_hash(tensor: Tensor, hashed: str) -> None:
+    """Set the hash of a tensor that has, or stands for, the bits of a hashed one."""
+    _known[tensor] = (tensor._version, hashed)

@@ -20,7 +20,7 @@ from pimper_torch.runtime.errors import InputError, OutputError, caution
 from pimper_torch.runtime.events import Caution, Event, Failure, Removal, StageReport, StageStarted
 from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.mapped import copied
-from pimper_torch.runtime.reporting import KEEP, aside
+from pimper_torch.runtime.reporting import ASIDE, KEEP, aside
 from pimper_torch.runtime.stream import collected, emit
 from pimper_torch.store.digest import digest
 
@@ -168,5 +168,5 @@ def _repeat(event: Event) -> None:
         skipped(event)
     elif not isinstance(event, StageReport):
         emit(event)
-    elif emit(StageStarted(name=event.name)):
+    elif event.name not in ASIDE and emit(StageStarted(name=event.name)):
         emit(event.replace(kept=True))

@@ -1,6 +1,7 @@
 """The contact sheet of a run: photographs, silhouettes, facets, normals, albedo, height."""
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import torch
@@ -27,7 +28,9 @@ _FACETS = "#ffd24a"
 _THUMBNAILS_ACROSS, _THUMBNAILS_DOWN = 8, 8
 
 
-def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PANEL_PX) -> None:
+def draw_overview(
+    result: Reconstruction, path: Path | str | BytesIO, panel_px: int = _PANEL_PX
+) -> None:
     """Draw the contact sheet of a run as PNG.
 
     The sheet has, in the reference view, cropped to the object: the photograph, the facets over it
@@ -39,7 +42,7 @@ def draw_overview(result: Reconstruction, path: Path | str, panel_px: int = _PAN
     rows = [panels[first : first + _ACROSS] for first in range(0, len(panels), _ACROSS)]
     if result.silhouettes.source != "everything":
         rows.append([_all_views(result, _ACROSS * panel_px)])
-    tiles.sheet(rows, panel_px, headline(result)).save(path, compress_level=3)
+    tiles.sheet(rows, panel_px, headline(result)).save(path, "PNG", compress_level=3)
 
 
 def panels_of(result: Reconstruction, panel_px: int) -> list[tiles.Tile]:
@@ -107,10 +110,11 @@ def headline(result: Reconstruction) -> str:
     registered = result.scene.views.num_views
     given = registered + len(result.scene.unregistered)
     seconds = sum(report.seconds for report in result.report)
+    took = f", {seconds:.0f} s" if result.report else ""
     caveat = " (cameras unreliable)" if result.scene.diagnosis else ""
     return (
         f"{registered} of {given} photographs{caveat}, {len(result.coarse.mesh.faces)} facets, "
-        f"{len(result.mesh.vertices_world):,} vertices, {seconds:.0f} s"
+        f"{len(result.mesh.vertices_world):,} vertices{took}"
     )
 
 

@@ -1,6 +1,7 @@
 """An animated image of a rotating surface, for browsers and file managers."""
 
 import math
+from io import BytesIO
 from pathlib import Path
 
 import torch
@@ -37,7 +38,7 @@ def up_world(cameras: Cameras) -> Vector:
 
 @torch.no_grad()
 def draw_turn(
-    mesh: Mesh, cameras: Cameras, reference: int, path: Path | str, side_px: int = 280
+    mesh: Mesh, cameras: Cameras, reference: int, path: Path | str | BytesIO, side_px: int = 280
 ) -> None:
     """Draw one turn of a surface, its shape on the left and its lit albedo on the right.
 

@@ -49,7 +49,7 @@ def test_marks_in_files_agree_with_marks_in_views(orientation, reconstruction, t
     job = parse("reconstruct", [str(photos), "-o", "out", *more])
     views = pt.load_views(photos, max_size_px=60)
     assert views.sizes_px[0].tolist() == [60, 40]
-    (bar,) = bars_in_files(job, views)
+    (bar,) = bars_in_files(job)
     assert bar.first.pointers[0].size_px == (120, 80)
     assert (str(bar.first), str(bar.second)) == ("a,55,40", "c.png,66,50+b,60,45")
     wanted = place_of(pt.Mark.read("a,27.5,20"), reconstruction)
@@ -64,7 +64,7 @@ def test_a_result_is_written_in_the_unit_of_its_scale_bar(photos, reconstruction
     assert main(line(photos, out, *bar)) == 0
     message = json.loads((out / "summary.json").read_text())["scale"]
     job = parse("reconstruct", line(photos, out, *bar)[1:])
-    (loaded,) = bars_in_files(job, pt.load_views(photos, max_size_px=60))
+    (loaded,) = bars_in_files(job)
     ends = [place_of(mark, reconstruction) for mark in loaded.ends]
     factor = 120 / float((ends[0] - ends[1]).norm())
     assert message == {

@@ -20,8 +20,9 @@ from pimper_torch.records import Materials, Relighting, ViewErrors
 from pimper_torch.stages.relighting.held_out import predict
 from pimper_torch.stages.texturing.bake import textured
 from pimper_torch.viz.maps import view_maps
+from pimper_torch.viz.report.openness import openness
 from pimper_torch.viz.report.page import write_page
-from pimper_torch.viz.report.predictions import predictions
+from pimper_torch.viz.report.predictions import predictions, view_images
 from tests.relighting.ball import SIDE, ball_mesh, photographed
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -102,11 +103,11 @@ def shown(tmp_path_factory):
         "title": "ball",
         "mesh": mesh,
         "asset": (folder / "asset.glb").read_bytes(),
-        "surface": asset.mesh,
+        "openness": openness(asset.mesh),
         "scene": scene,
-        "silhouettes": trusted(inside, "found"),
+        "silhouettes": (silhouettes := trusted(inside, "found")),
         "reference": 0,
-        "predictions": predictions(mesh, scene, relighting),
+        "images": view_images(scene, silhouettes, predictions(mesh, scene, relighting)),
         "summary": SUMMARY,
         "settings": {"zeta": 0.5, "fuse": {"terms": ["normals"]}},
     }

@@ -24,6 +24,7 @@ from pimper_torch.viz.report.predictions import (
     predictions,
     shrunk_to,
     view_entries,
+    view_images,
 )
 from pimper_torch.viz.report.vertex_layers import (
     VertexLayer,
@@ -44,16 +45,20 @@ SUMMARY = {
 }
 
 
+def images_of(result, predicted):
+    return view_images(result.scene, result.silhouettes, predicted)
+
+
 def written(result, path, **changed):
     parts = {
         "title": "cup",
         "mesh": result.mesh,
         "asset": b"glTF and so on",
-        "surface": result.mesh,
+        "openness": openness(result.mesh),
         "scene": result.scene,
         "silhouettes": result.silhouettes,
         "reference": 1,
-        "predictions": [None] * result.scene.views.num_views,
+        "images": images_of(result, [None] * 3),
         "summary": SUMMARY,
         "settings": {"zeta": 0.5, "fuse": {"terms": ["normals", "points"], "max_hole": math.inf}},
     }
@@ -106,7 +111,8 @@ def test_file_names_are_escaped(reconstruction, tmp_path, name):
 
 def test_pinholes_equal_those_of_the_run(reconstruction):
     scene = reconstruction.scene
-    entries = view_entries(scene, reconstruction.silhouettes, [None] * 3)
+    images = images_of(reconstruction, [None] * 3)
+    entries = view_entries(scene, reconstruction.silhouettes, images)
     point = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
     for view, entry in enumerate(entries):
         pose = torch.tensor(entry["pose"], dtype=torch.float64).reshape(4, 4)
@@ -131,7 +137,7 @@ def test_a_prediction_has_its_light(reconstruction):
     first, second, third = view_entries(
         reconstruction.scene,
         reconstruction.silhouettes,
-        [None, predicted, predicted.replace(psnr_db=math.nan)],
+        images_of(reconstruction, [None, predicted, predicted.replace(psnr_db=math.nan)]),
         lights_world,
     )
     assert not {"prediction", "psnr_db", "environment"} & set(first)

@@ -14,7 +14,7 @@ from pimper_torch.stages.silhouettes.silhouette_config import SilhouetteConfig
 
 
 def test_writing_a_model_and_reading_it_gives_the_same_scene(scene, views, tmp_path):
-    write_model(scene, tmp_path / "new" / "sparse")
+    write_model(scene, tmp_path / "new" / "sparse", point_colors(scene))
     again = Reconstruct()(views, tmp_path / "new" / "sparse")
     assert again.lenses == scene.lenses
     assert again.views.names == scene.views.names
@@ -97,7 +97,8 @@ def test_a_model_far_from_the_origin_gives_the_same_scene(views, model, offset, 
 @pytest.mark.parametrize("offset", FAR)
 def test_a_scene_far_from_the_origin_is_written_in_the_model_frame(views, model, offset, tmp_path):
     far = moved(model, offset)
-    write_model(assemble_scene(views.to(torch.float32), far), tmp_path)
+    scene = assemble_scene(views.to(torch.float32), far)
+    write_model(scene, tmp_path, point_colors(scene))
     read = read_model(tmp_path)
     # The scene is in single precision, its model in the user's frame is not.
     assert_close(read.points_world, far.points_world, rtol=0, atol=1e-6)

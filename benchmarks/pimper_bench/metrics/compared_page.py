@@ -20,8 +20,9 @@ from pimper_torch.runtime.config import read_mapping
 from pimper_torch.stages.meshing.finish import Simplify
 from pimper_torch.stages.relighting.held_out import Relight
 from pimper_torch.stages.texturing.bake import Texture
+from pimper_torch.viz.report.openness import openness
 from pimper_torch.viz.report.page import write_page
-from pimper_torch.viz.report.predictions import predictions
+from pimper_torch.viz.report.predictions import predictions, view_images
 from pimper_torch.viz.report.vertex_layers import LengthUnit, length_layer
 
 _DISTANCE, _ANGLE = "_DISTANCE_TO_TRUTH", "_NORMAL_ERROR_DEG"
@@ -63,11 +64,11 @@ def write_compared_page(
             title=f"{folder.absolute().name}, compared with the truth",
             mesh=result.mesh,
             asset=glb.read_bytes(),
-            surface=asset.mesh,
+            openness=openness(asset.mesh),
             scene=scene,
             silhouettes=result.silhouettes,
             reference=scene.views.names.index(result.reference),
-            predictions=predictions(few, scene, relighting),
+            images=view_images(scene, result.silhouettes, predictions(few, scene, relighting)),
             summary=result.summary,
             settings=read_mapping(folder / "config.yaml"),
             lights_world=result.lights_world,

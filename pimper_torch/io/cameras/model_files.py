@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
 from pimper_torch.geometry.colmap_library import loaded
 from pimper_torch.geometry.quarter_turns import count_focals
@@ -102,6 +101,9 @@ def read_model(folder: Path) -> SparseModel:
             f"The COLMAP model in {folder} is broken: {some(faults, 4)}. Export it again, or omit "
             "it to run structure from motion."
         )
+    # Slow to import.
+    from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
     poses = torch.tensor([image.pose for image in images], dtype=torch.float64).reshape(-1, 7)
     model = SparseModel(
         names=tuple(names),

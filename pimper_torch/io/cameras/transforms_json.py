@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 
+import lazy_loader
 import numpy as np
 import torch
-import trimesh
 
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.cameras.layout import DataSetPath
@@ -21,6 +21,7 @@ from pimper_torch.records import CameraModel
 from pimper_torch.records.shapes import Points
 from pimper_torch.runtime.errors import InputError, caution
 
+trimesh = lazy_loader.load("trimesh")  # takes a second
 KIND = "a transforms.json set"
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 """Converts OpenGL's camera axes, with y up and the view along -z."""

@@ -2,14 +2,9 @@
 
 from collections.abc import Sequence
 
+import lazy_loader
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.epipolar import (
-    essential_from_Rt,
-    fundamental_from_essential,
-    normalize_points,
-    sampson_epipolar_distance,
-)
 from torch import Tensor
 
 from pimper_torch.geometry.lens_models import pinhole_of, pinholes_of, undistort_pixels
@@ -25,6 +20,7 @@ from pimper_torch.stages.sfm.matching import (
     match_ends,
 )
 
+kornia = lazy_loader.load("kornia")  # takes a second
 Matched = Float[Tensor, "match 2"]
 Ends = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ 2"]]  # of matches, in two photographs
 
@@ -32,7 +28,7 @@ Ends = tuple[Float[Tensor, "_ 2"], Float[Tensor, "_ 2"]]  # of matches, in two p
 def sampson_errors(geometry: Matrix3, first: Matched, second: Matched) -> Float[Tensor, " match"]:
     """Return the first-order distance of matches to an epipolar geometry, in pixels."""
     ends = first.double(), second.double()
-    return sampson_epipolar_distance(*ends, geometry, squared=False)
+    return kornia.geometry.sampson_epipolar_distance(*ends, geometry, squared=False)
 
 
 def fundamental_matrix(first: Matched, second: Matched, weight: Float[Tensor, " match"]) -> Matrix3:
@@ -44,8 +40,8 @@ def fundamental_matrix(first: Matched, second: Matched, weight: Float[Tensor, " 
 
     Source: Hartley, In Defense of the Eight-Point Algorithm, PAMI 19(6), 1997.
     """
-    x, from_first = (batch[0] for batch in normalize_points(first.double()[None]))
-    y, from_second = (batch[0] for batch in normalize_points(second.double()[None]))
+    x, from_first = (rows[0] for rows in kornia.geometry.normalize_points(first.double()[None]))
+    y, from_second = (rows[0] for rows in kornia.geometry.normalize_points(second.double()[None]))
     rows = (homogeneous(y)[:, :, None] * homogeneous(x)[:, None, :]).flatten(1)
     least = torch.linalg.eigh(rows.mT @ (weight[:, None] * rows)).eigenvectors[:, 0]
     u, s, v = torch.linalg.svd(least.reshape(3, 3))
@@ -90,7 +86,8 @@ def epipolar_geometry(cameras: Cameras, views: PhotographPair) -> Matrix3:
     poses = (cameras.cam_from_world[view] for view in views)
     motion = (block for pose in poses for block in (pose[:3, :3], pose[:3, 3:]))
     intrinsics = (cameras.intrinsics[view] for view in views)
-    return fundamental_from_essential(essential_from_Rt(*motion), *intrinsics)
+    essential = kornia.geometry.essential_from_Rt(*motion)
+    return kornia.geometry.fundamental_from_essential(essential, *intrinsics)
 
 
 def undistorted_pixels(model: SparseModel, view: int, pixels: Matched) -> Matched:

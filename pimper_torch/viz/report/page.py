@@ -9,17 +9,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.io.assets.placement import Placement
 from pimper_torch.io.assets.write import write_asset
 from pimper_torch.records import Mesh, Removal, Silhouettes, SparseScene, TexturedMesh
+from pimper_torch.records.shapes import PerVertex
 from pimper_torch.runtime.ledger import closing_line
 from pimper_torch.stages.texturing.bake import halved
-from pimper_torch.viz.report.openness import openness
-from pimper_torch.viz.report.predictions import Prediction, view_entries
+from pimper_torch.viz.report.predictions import Json, view_entries
 from pimper_torch.viz.report.vertex_layers import VertexLayer, length_unit, surface_layers
 from pimper_torch.viz.turn import up_world
 
@@ -43,11 +42,11 @@ def write_page(
     title: str,
     mesh: Mesh,
     asset: bytes,
-    surface: Mesh,
+    openness: PerVertex,
     scene: SparseScene,
     silhouettes: Silhouettes,
     reference: int,
-    predictions: Sequence[Prediction | None],
+    images: Sequence[Json],
     summary: Mapping[str, Any],
     settings: Mapping[str, object],
     lights_world: Float[Tensor, "view 4"] | None = None,
@@ -60,19 +59,20 @@ def write_page(
         asset: The surface as a binary glTF, whose ``extras`` contain its placement in ``scene``;
             without these, it is in that frame.
         summary: Contents of ``summary.json``; ``settings`` likewise of ``config.yaml``.
-        surface: The asset's mesh, with its vertices in the order of the file.
+        openness: Of the asset's vertices, by :mod:`~pimper_torch.viz.report.openness`.
+        images: Of every view, by :func:`~pimper_torch.viz.report.predictions.view_images`.
         lights_world: First-order light of every view, up to a scale; NaN where unknown.
         layers: In addition to those of ``mesh``; the page skips those that the asset lacks.
     """
     unit = length_unit(mesh, (summary.get("scale") or {}).get("unit"))
-    shade = (255 * openness(surface)).round().to(torch.uint8).numpy().tobytes()
+    shade = (255 * openness).round().byte().numpy().tobytes()
     data = {
         "title": title,
         "reference": reference,
         "up": up_world(scene.cameras).tolist(),
         "unit": asdict(unit),
         "openness": base64.b64encode(shade).decode("ascii"),
-        "views": view_entries(scene, silhouettes, predictions, lights_world),
+        "views": view_entries(scene, silhouettes, images, lights_world),
         "layers": [asdict(layer) for layer in (*surface_layers(mesh, unit), *layers)],
         "summary": {name: summary.get(name) for name in _SHOWN},
         "left_out": left_out_by_pass(summary["left_out"]),

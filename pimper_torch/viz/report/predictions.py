@@ -109,33 +109,21 @@ def predictions(mesh: Mesh, scene: SparseScene, relighting: Relighting) -> list[
 Json = dict[str, object]
 
 
-def view_entries(
-    scene: SparseScene,
-    silhouettes: Silhouettes,
-    predictions: Sequence[Prediction | None],
-    lights_world: Float[Tensor, "view 4"] | None = None,
+def view_images(
+    scene: SparseScene, silhouettes: Silhouettes, predictions: Sequence[Prediction | None]
 ) -> list[Json]:
-    """Return the photographs with their pinholes, images, silhouettes and lights, as JSON.
+    """Return the images of every view, its silhouette and the light of its prediction, as JSON.
+
+    They do not depend on the unit of length.
 
     Args:
         predictions: One per view, ``None`` without a prediction.
-        lights_world: First-order light of every view, up to a scale; NaN where unknown.
     """
-    longest = longest_px(scene.views.num_views)
-    cameras, entries = scene.cameras.to("cpu"), []
-    for view, (name, predicted) in enumerate(zip(scene.views.names, predictions, strict=True)):
-        width, height = cameras.sizes_px[view].tolist()
-        intrinsics = cameras.intrinsics[view]
-        entry: Json = {
-            "name": name,
-            "width": width,
-            "height": height,
-            "focal": [float(intrinsics[0, 0]), float(intrinsics[1, 1])],
-            "centre": [float(intrinsics[0, 2]), float(intrinsics[1, 2])],
-            "pose": cameras.cam_from_world[view].double().flatten().tolist(),
-            "reliable": bool(silhouettes.reliable[view]),
-            "photo": jpeg(shrunk_to(scene.views.images[view, :, :height, :width], longest)),
-        }
+    longest, entries = longest_px(scene.views.num_views), list[Json]()
+    for view, predicted in enumerate(predictions):
+        width, height = scene.views.sizes_px[view].tolist()
+        image = scene.views.images[view, :, :height, :width]
+        entry: Json = {"photo": jpeg(shrunk_to(image, longest))}
         if silhouettes.source != "everything":
             small = shrunk_to(silhouettes.inside[view, :height, :width][None], longest)[0]
             entry["outline"] = outline(small, width / small.shape[1])
@@ -150,8 +138,38 @@ def view_entries(
             if not math.isnan(predicted.psnr_db):
                 entry["psnr_db"] = predicted.psnr_db
             entry["prediction"] = jpeg(shrunk_to(predicted.radiance, longest))
+        entries.append(entry)
+        drop_pages()
+    return entries
+
+
+def view_entries(
+    scene: SparseScene,
+    silhouettes: Silhouettes,
+    images: Sequence[Json],
+    lights_world: Float[Tensor, "view 4"] | None = None,
+) -> list[Json]:
+    """Return the views with their pinholes and lights, as JSON.
+
+    Args:
+        images: By :func:`view_images`.
+        lights_world: First-order light of every view, up to a scale; NaN where unknown.
+    """
+    cameras, entries = scene.cameras.to("cpu"), list[Json]()
+    for view, (name, shown) in enumerate(zip(scene.views.names, images, strict=True)):
+        width, height = cameras.sizes_px[view].tolist()
+        intrinsics = cameras.intrinsics[view]
+        entry: Json = {
+            "name": name,
+            "width": width,
+            "height": height,
+            "focal": [float(intrinsics[0, 0]), float(intrinsics[1, 1])],
+            "centre": [float(intrinsics[0, 2]), float(intrinsics[1, 2])],
+            "pose": cameras.cam_from_world[view].double().flatten().tolist(),
+            "reliable": bool(silhouettes.reliable[view]),
+            **shown,
+        }
         if lights_world is not None and bool(lights_world[view].isfinite().all()):
             entry["environment"] = lights_world[view].tolist()
         entries.append(entry)
-        drop_pages()
     return entries

@@ -1,0 +1,91 @@
+"""Images of a finished result, which depend neither on formats nor on the unit of length."""
+
+import json
+from dataclasses import dataclass
+from io import BytesIO
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from pimper_torch.chains.running import ChainRun
+from pimper_torch.io.thumbnails import thumbnails
+from pimper_torch.records import FinishedMesh, Reconstruction, Record, Relighting, TexturedMesh
+from pimper_torch.records.shapes import PerVertex
+from pimper_torch.runtime.progress import part
+from pimper_torch.scale.marker_scale import Marker, find_markers
+from pimper_torch.stages.sfm.sparse_scene import point_colors
+from pimper_torch.stages.stage import Stage
+from pimper_torch.store import Store
+from pimper_torch.viz.overview import draw_overview
+from pimper_torch.viz.report.openness import openness
+from pimper_torch.viz.report.predictions import predictions, view_images
+from pimper_torch.viz.turn import draw_turn
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Pictures(Record):
+    """Images of a surface and its photographs.
+
+    Attributes:
+        overview: Bytes of ``overview.png``.
+        turn: Bytes of ``turn.webp``.
+        openness: Of the asset's vertices.
+        views: JSON of :func:`~pimper_torch.viz.report.predictions.view_images`.
+        thumbnails: Of every photograph, by name.
+        points: Colours of the sparse cloud.
+        markers: Printed ones in the photographs.
+    """
+
+    overview: UInt8[Tensor, " overview"]
+    turn: UInt8[Tensor, " turn"]
+    openness: PerVertex
+    views: str
+    thumbnails: dict[str, str]
+    points: UInt8[Tensor, "point 3"]
+    markers: tuple[Marker, ...]
+
+
+class Draw(Stage):
+    """Draw the images of a finished result."""
+
+    kept_as = Pictures
+
+    def forward(self, result: Reconstruction) -> Pictures:
+        """Draw the surface, the photographs and their predictions."""
+        ready, asset, relighting = completed(result)
+        files = BytesIO(), BytesIO()
+        with part(0, 3):
+            draw_overview(result, files[0])
+        with part(1, 3):
+            draw_turn(result.mesh, result.cameras, result.coarse.reference, files[1])
+        overview, turn = (torch.frombuffer(file.getbuffer(), dtype=torch.uint8) for file in files)
+        with part(2, 3):
+            predicted = predictions(ready.few, result.scene, relighting)
+            return Pictures(
+                overview=overview,
+                turn=turn,
+                openness=openness(asset.mesh),
+                views=json.dumps(view_images(result.scene, result.silhouettes, predicted)),
+                thumbnails=thumbnails(result.scene.views),
+                points=point_colors(result.scene),
+                markers=tuple(find_markers(result.scene)),
+            )
+
+
+def drawn(result: Reconstruction, store: Store | None = None) -> Pictures:
+    """Draw the images of a finished result, or read those that a store keeps."""
+    ready, draw = completed(result)[0], Draw()
+    # Without what they do not show: the full mesh, caps and times.
+    shown = result.replace(mesh=ready.mesh, report=(), failures=(), left_out=())
+    shown = shown.replace(finished=ready.replace(closed=None, caps={}))
+    return ChainRun(names={draw: "draw"}, store=store)(draw, shown)
+
+
+def completed(result: Reconstruction) -> tuple[FinishedMesh, TexturedMesh, Relighting]:
+    """Return what :meth:`~pimper_torch.chains.chain.Chain.finish` added to a result."""
+    ready, asset, relighting = result.finished, result.asset, result.relighting
+    assert ready is not None
+    assert asset is not None
+    assert relighting is not None
+    return ready, asset, relighting
