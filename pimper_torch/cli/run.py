@@ -280,7 +280,14 @@ def sized(
         own_frame=inputs.sparse is not None,
         found=found,
     )
-    return (result, None) if scale is None else (scaled(result, scale.factor), scale)
+    if scale is not None:
+        return scaled(result, scale.factor), scale
+    if job.common.stl:
+        caution(
+            "The size of the object is unknown, so its longest side in mesh.stl is 100 mm. Give a "
+            "length (`--scale-bar`), or photograph printed markers (`pimper markers`)."
+        )
+    return result, None
 
 
 def scale_message(scale: Scale) -> str:

@@ -16,7 +16,7 @@ from pimper_torch.export import reports
 from pimper_torch.export.picture_files import write_mask
 from pimper_torch.export.pictures import Pictures, completed, drawn
 from pimper_torch.export.result_folder.folders import written_whole
-from pimper_torch.geometry.local_frame import NO_OFFSET, Offset, from_local
+from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.io.assets.mesh_files import MeshFiles as MeshFiles
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.usd import write_usdz
@@ -80,7 +80,8 @@ def write_result(
     All files are in the frame of the given cameras; ``summary.json`` has the ``offset_world`` that
     was added to the frame of the run, zero unless the cameras are far from their origin. If it is
     not zero, the PLY has doubles, and the mesh's GLB has the offset as translation of its node.
-    Only the asset is upright on the origin; its ``extras`` have the inverse transform.
+    Only the asset is upright on the origin, with the inverse transform in its ``extras``, and the
+    STL is on the bed of a printer, see :func:`~pimper_torch.io.meshes.write_stl`.
 
     The mesh is simplified: every vertex of ``result.mesh`` is within a twentieth of a sample's
     spacing of it, its normal within 1.5 degrees, and its colour, confidence and expected error
@@ -109,10 +110,10 @@ def write_result(
     with written_whole(folder, "result", overwrite=overwrite) as staging:
         ready, asset, _ = completed(result)
         written, shown = result.replace(mesh=ready.mesh), pictures or drawn(result)
+        placement = _placement(written, asset, files, folder.absolute().name, about or {})
         with part(0, _PARTS):
-            _write_meshes(ready, files, written.scene.offset_world, staging)
+            _write_meshes(ready, files, placement, staging)
         with part(1, _PARTS):
-            placement = _placement(written, asset, files, folder.absolute().name, about or {})
             _write_assets(asset, files, placement, staging)
         with part(2, _PARTS):
             _write_all(written, shown, config, staging)
@@ -125,14 +126,16 @@ def write_result(
                 _write_page(written, shown, placement, summary, staging)
 
 
-def _write_meshes(ready: FinishedMesh, files: MeshFiles, offset: Offset, folder: Path) -> None:
-    mesh, measured = ready.mesh, None
+def _write_meshes(
+    ready: FinishedMesh, files: MeshFiles, placement: Placement, folder: Path
+) -> None:
+    mesh, measured, offset = ready.mesh, None, placement.offset_world
     if ready.closed is not None:
         mesh, measured = ready.closed.mesh, ready.closed.measured
     write_ply(mesh, folder / "mesh.ply", offset, measured)
     write_glb(mesh, folder / "mesh.glb", offset, measured)
     if "stl" in files.formats:
-        write_stl(mesh, folder / "mesh.stl", offset)
+        write_stl(mesh, folder / "mesh.stl", placement)
     if "obj" in files.formats:
         write_obj(mesh, folder / "mesh.obj", offset, measured)
 

@@ -17,9 +17,10 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.local_frame import NO_OFFSET, Offset
 from pimper_torch.geometry.rigid import rotate, transform
-from pimper_torch.geometry.surfaces import carried_normals
+from pimper_torch.geometry.surfaces import carried_normals, unit_face_normals
 from pimper_torch.geometry.topology import corners_of
 from pimper_torch.io.assets.gltf import MATTE, glb, gltf_of
+from pimper_torch.io.assets.placement import Placement
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear, to_bytes
 from pimper_torch.radiometry.base_color import base_color
 from pimper_torch.records import Mesh
@@ -174,20 +175,21 @@ def write_glb(
     Path(path).write_bytes(data)
 
 
-def write_stl(mesh: Mesh, path: Path | str, offset_world: Offset = NO_OFFSET) -> None:
-    """Write a binary STL: only triangles, without shared vertices.
+def write_stl(mesh: Mesh, path: Path | str, placement: Placement) -> None:
+    """Write a binary STL for printing: z up, standing on the middle of the bed, in millimetres.
 
-    STL has no doubles, so vertices stay near the origin.
-
-    Args:
-        offset_world: Written to the header, not added; see ``SparseScene.offset_world``.
+    The front is towards -y. Without a known unit, the longest side of the asset is 100 mm.
     """
-    vertices, faces = mesh.vertices_world.detach().cpu().numpy(), mesh.faces.cpu().numpy()
-    data = trimesh.exchange.stl.export_stl(trimesh.Trimesh(vertices, faces, process=False))
-    header = b"pimper_torch"
-    if offset_world != NO_OFFSET:
-        header = "offset {} {} {}".format(*offset_world).encode("ascii")
-    Path(path).write_bytes(header.ljust(80)[:80] + data[80:])
+    x, up, front = placement.placed(mesh.vertices_world, mesh.vertices_world)[0].unbind(dim=1)
+    points = (1000 if placement.metric else 100) * torch.stack([x, -front, up], dim=1)
+    low, high = points.aminmax(dim=0)
+    middle = torch.cat([(low + high)[:2] / 2, low[2:]])
+    fields = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+    rows = np.zeros(len(mesh.faces), fields)
+    rows["corners"] = (points - middle)[mesh.faces].numpy()
+    rows["normal"] = unit_face_normals(points, mesh.faces).numpy()
+    header = b"pimper_torch, millimetres".ljust(80)
+    Path(path).write_bytes(header + struct.pack("<I", len(rows)) + rows.tobytes())
 
 
 def write_obj(

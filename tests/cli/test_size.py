@@ -91,8 +91,10 @@ def test_a_result_is_written_in_the_unit_of_its_scale_bar(photos, reconstruction
 
 @pytest.mark.usefixtures("chain")
 def test_without_a_reference_length_the_size_is_unknown(photos, tmp_path):
-    assert main(line(photos, tmp_path / "out")) == 0
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["scale"] is None
+    assert main(line(photos, tmp_path / "out", "--stl")) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["scale"] is None
+    assert any("its longest side in mesh.stl is 100 mm" in text for text in summary["warnings"])
 
 
 @pytest.mark.usefixtures("chain")
