@@ -16,7 +16,7 @@ class ClosedMesh(Record):
     """A mesh with capped borders.
 
     Attributes:
-        mesh: The faces before capping first, in the same order.
+        mesh: The faces before capping first, in the same order, without those trimmed at borders.
         measured: True for these faces; the others are caps.
         borders: Number of capped borders.
     """
@@ -36,7 +36,8 @@ class FinishedMesh(Record):
         closed: With caps, if requested.
         how: ``"simplified"``, ``"reduced"`` to a number of faces, or empty if unchanged.
         counts: Numbers of vertices and faces, and how far simplification moved the surface.
-        caps: Number of capped borders, faces of the caps and their fraction of the area.
+        caps: Numbers of capped borders, of faces of the caps and of faces trimmed for them, and the
+            caps' fraction of the area.
     """
 
     mesh: Mesh

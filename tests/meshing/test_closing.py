@@ -4,10 +4,10 @@ import trimesh
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
-from pimper_torch.geometry.topology import face_components
-from pimper_torch.records import Mesh
+from pimper_torch.geometry.topology import face_components, face_edges
+from pimper_torch.records import ClosedMesh, Mesh
 from pimper_torch.runtime.errors import InputError
-from pimper_torch.stages.meshing.closing import border_cycles, closed
+from pimper_torch.stages.meshing.closing import border_cycles, capped, closed
 
 
 def ball(*, above: float, level: int = 4) -> Mesh:
@@ -116,3 +116,65 @@ def test_caps_propagate_gradients_to_their_border():
     assert set(vertices.grad.abs().sum(dim=1).nonzero()[:, 0].tolist()) == set(borders.tolist())
     fresh = len(found.mesh.vertices_world) - len(vertices)
     assert_close(vertices.grad.sum(dim=0), torch.full((3,), float(fresh)).double())
+
+
+def intersections(found: ClosedMesh) -> int:
+    """Count edges through faces without a common vertex, one of them of a cap, by brute force."""
+    vertices, caps = found.mesh.vertices_world.double(), found.mesh.faces[~found.measured]
+    surface = found.mesh.faces[found.measured]
+    return sum(passing(vertices, *pair) for pair in ((caps, found.mesh.faces), (surface, caps)))
+
+
+def passing(vertices, first, second) -> int:
+    edges, _ = face_edges(first)
+    origin, one, two = (vertices[second[:, corner]] for corner in range(3))
+    one, two = one - origin, two - origin
+    count = 0
+    for chunk in edges.split(200):  # Moeller and Trumbore, 1997
+        start = vertices[chunk[:, 0]]
+        along = (vertices[chunk[:, 1]] - start)[:, None].expand(-1, len(second), -1)
+        offset, across = start[:, None] - origin, torch.linalg.cross(along, two[None])
+        turned, scale = torch.linalg.cross(offset, one[None]), (one * across).sum(dim=-1)
+        products = ((offset * across), (along * turned), (two * turned))
+        u, v, t = (product.sum(dim=-1) / scale for product in products)
+        through = (u > 0) & (v > 0) & (u + v < 1) & (t > 0) & (t < 1)
+        apart = (second[None, :, :, None] != chunk[:, None, None, :]).flatten(2).all(dim=2)
+        count += int((through & apart).sum())
+    return count
+
+
+def bowl(*, cone: float) -> Mesh:
+    """Return a half ball, open above, with a cone from its bottom to a height above the rim."""
+    whole = ball(above=2.0).replace(normals_world=None)
+    lower = (whole.vertices_world[whole.faces][..., 2] < 0.05).all(dim=1)
+    used, faces = torch.unique(whole.faces[lower], return_inverse=True)
+    x, y, z = whole.vertices_world[used].unbind(dim=1)
+    raised = z + (1 + cone) * (1 - torch.hypot(x, y) / 0.4).clamp_min(0)
+    vertices = torch.stack([x, y, raised], dim=1)
+    return whole.take(used).replace(faces=faces, vertices_world=vertices)
+
+
+def test_a_cap_does_not_cut_through_the_surface():
+    low, high = bowl(cone=-0.3), bowl(cone=0.5)
+    assert intersections(capped(low)) == 0
+    assert len(closed(low).mesh.faces) == len(capped(low).mesh.faces)
+    assert intersections(capped(high)) > 10
+    found = closed(high)
+    assert intersections(found) == 0
+    assert solid(found.mesh).is_volume
+    # Only the cone above the rim is trimmed, and its stump is capped.
+    left = found.mesh.faces[found.measured]
+    assert found.borders == 2
+    assert 0.9 * len(high.faces) < len(left) < len(high.faces)
+    heights = found.mesh.vertices_world[left][..., 2]
+    assert float(heights.max()) < 0.1
+    assert bool((found.mesh.expected_error[len(torch.unique(left)) :] > 1).all())
+
+
+def test_a_surface_of_which_much_would_be_trimmed_is_capped_as_it_is():
+    many = bowl(cone=0.5)
+    shifts = torch.tensor([[0.0, 0, 0], [0.3, 0, 0.1], [0.0, 0.3, -0.1], [0.2, 0.2, 0.05]]).double()
+    vertices = torch.cat([many.vertices_world + shift for shift in shifts])
+    faces = torch.cat([many.faces + index * len(many.vertices_world) for index in range(4)])
+    crossing = Mesh(vertices_world=vertices, faces=faces)
+    assert len(closed(crossing).mesh.faces) == len(capped(crossing).mesh.faces)

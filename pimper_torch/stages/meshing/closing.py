@@ -3,18 +3,81 @@
 import math
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pimper_torch.geometry import topology
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.topology import face_counts, face_edges, half_edges, vertex_fans
+from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.linalg.continuation import continued
 from pimper_torch.records import ClosedMesh, Mesh
-from pimper_torch.records.shapes import Faces, VertexValues
+from pimper_torch.records.shapes import FaceMask, Faces, VertexValues, Vertices
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.stages.meshing.extract import large_components
 from pimper_torch.stages.meshing.faults import bounding_diagonal
+
+# The demo's skull takes 6 trims, 1 % of its faces.
+_TRIMS, _LEAST_LEFT = 20, 0.9
+# Rings trimmed around crossed faces; least area of a piece that stays, over the largest.
+_RINGS, _PIECE = 2, 0.01
+# Ends of edges, over their length, that are not tested: caps and surface touch at borders.
+_ENDS = 1e-3
 
 
 def closed(mesh: Mesh) -> ClosedMesh:
+    """Close every border of a mesh with a cap that does not cut through the surface.
+
+    Borders are trimmed where their cap (see :func:`capped`) would intersect the surface or itself,
+    until none does, or a tenth of the faces would be lost: then caps may still intersect it.
+    Otherwise the given surface is unchanged.
+
+    Raises:
+        InputError: Neighbouring faces have opposite orientation.
+    """
+    result = capped(mesh)
+    for _ in range(_TRIMS):
+        crossed = _crossed(result)
+        if not bool(crossed.any()):
+            break
+        faces = result.mesh.faces[result.measured]
+        keep = ~topology.dilated(faces, crossed, _RINGS, len(result.mesh.vertices_world))
+        faces = faces[keep]
+        if len(faces) < _LEAST_LEFT * len(mesh.faces):
+            break
+        vertices = result.mesh.vertices_world
+        pieces = large_components(vertices.detach(), faces, _PIECE, face_edges(faces))
+        used, faces = torch.unique(faces[pieces], return_inverse=True)
+        result = capped(result.mesh.take(used).replace(faces=faces))
+    return result
+
+
+def _crossed(mesh: ClosedMesh) -> FaceMask:
+    """Return measured faces that intersect caps, or are nearest to caps that intersect caps."""
+    vertices = mesh.mesh.vertices_world.detach().cpu()
+    surface, caps = (mesh.mesh.faces[which].cpu() for which in (mesh.measured, ~mesh.measured))
+    crossed = _crossings(vertices, surface, caps)[0] | _crossings(vertices, caps, surface)[1]
+    twisted = torch.unique(caps[_crossings(vertices, caps, caps)[0]])
+    border = torch.unique(caps[caps <= surface.max()])
+    nearest = cKDTree(vertices[border]).query(vertices[twisted])[1] if len(border) else []
+    return crossed | torch.isin(surface, border[nearest]).any(dim=1)
+
+
+def _crossings(vertices: Vertices, first: Faces, second: Faces) -> tuple[FaceMask, FaceMask]:
+    """Return the first faces with edges through second faces, and these; not those that touch."""
+    through = torch.zeros(len(second), dtype=torch.bool)
+    ends = half_edges(first)
+    if len(first) == 0 or len(second) == 0:
+        return torch.zeros(len(first), dtype=torch.bool), through
+    start, along = vertices[ends[:, 0]], vertices[ends[:, 1]] - vertices[ends[:, 0]]
+    reach = along.new_full((len(along),), 1 - 2 * _ENDS)
+    met = RayCaster(vertices, second).cast(start + _ENDS * along, along, reach).face
+    apart = (second[met][:, :, None] != ends[:, None, :]).flatten(1).all(dim=1) & (met >= 0)
+    through[met[apart]] = True
+    return apart.reshape(-1, 3).any(dim=1), through
+
+
+def capped(mesh: Mesh) -> ClosedMesh:
     """Close every border of a mesh with a membrane, like a soap film.
 
     The given surface is unchanged, except that the mesh is made a manifold first: if fans of faces

@@ -49,6 +49,7 @@ class Simplify(Stage):
             fraction = float(area[~capped.measured].sum() / area.sum())
             count = int((~capped.measured).sum())
             caps = {"borders": capped.borders, "faces": count, "area_fraction": fraction}
+            caps["trimmed_faces"] = len(few.faces) - int(capped.measured.sum())
         return FinishedMesh(
             mesh=few,
             few=reduced(few, _FACES),
