@@ -77,11 +77,11 @@ def lit_before(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def small_pictures(monkeypatch: pytest.MonkeyPatch, lit_before: None) -> None:
     """Write results with small images: large ones take most of the time."""
-    from pimper_torch.export import results
+    from pimper_torch.export import pictures
 
-    draw, turn = results.draw_overview, results.draw_turn
-    monkeypatch.setattr(results, "draw_overview", lambda result, path: draw(result, path, 40))
-    monkeypatch.setattr(results, "draw_turn", lambda *arguments: turn(*arguments, side_px=8))
+    draw, turn = pictures.draw_overview, pictures.draw_turn
+    monkeypatch.setattr(pictures, "draw_overview", lambda result, path: draw(result, path, 40))
+    monkeypatch.setattr(pictures, "draw_turn", lambda *arguments: turn(*arguments, side_px=8))
 
 
 @pytest.fixture

@@ -306,9 +306,10 @@ class Chain(Stage):
         """
         result = result.to("cpu")
         scene, held_out, silhouettes = result.scene, result.held_out, result.silhouettes
-        run = self.running()
+        run, files = self.running(), files or MeshFiles()
+        shape = MeshFiles(faces=files.faces, watertight=files.watertight)  # others keep the mesh
         with skipping(self.on_failure) as entries, observed(self.observer) as table:
-            finished = run(self.simplify, result.mesh, (files or MeshFiles()).shape())
+            finished = run(self.simplify, result.mesh, shape)
             relighting = run(self.relight, finished.few, scene, silhouettes, held_out)
             asset = run(self.texture, result.mesh, finished.few, relighting)
             # Against the same photographs as the mesh.

@@ -50,20 +50,17 @@ def reconstructed(
     def without_images() -> KeptResult:
         result = run().to("cpu")
         made.append(result.scene.views.images)
-        hashed, channels = tensor_hash(made[0]), made[0].shape[1]
-        return KeptResult(
-            result=_with_images(result, made[0][:, :0]), channels=channels, hashed=hashed
-        )
+        bare, channels = _with_images(result, made[0][:, :0]), made[0].shape[1]
+        return KeptResult(result=bare, channels=channels, hashed=tensor_hash(made[0]))
 
     with aside(HASH):
         request = _request(job) if store else None
     key = f"result-{request}" if request else None
     record, _ = kept(store, key, KeptResult, without_images)
-    scene = record.result.scene
     if not made:
-        count, _, height, width = scene.views.images.shape
-        shape, read = (count, record.channels, height, width), partial(_photographs, job, record)
-        made.append(deferred(shape, record.hashed, cache(read)))
+        count, _, *size = record.result.scene.views.images.shape
+        read = cache(partial(_photographs, job, record))
+        made.append(deferred((count, record.channels, *size), record.hashed, read))
     return _with_images(record.result, made[0])
 
 
@@ -75,8 +72,8 @@ def _with_images(result: Reconstruction, images: Tensor) -> Reconstruction:
 def _photographs(job: Job, record: KeptResult) -> Tensor:
     """Read and undistort the photographs of a kept result, without repeating warnings."""
     encoding, size = job.config.photographs, job.common.max_size_px
-    scene = record.result.scene
     with stage("photographs"), collected(Caution):
+        scene = record.result.scene
         views = load_views(job.photos, encoding=encoding, max_size_px=size)
         views = views.take([views.names.index(name) for name in scene.views.names])
         images = undistort(views.to(job.common.device), scene.lenses)[0].images.cpu()

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from pimper_torch.store.digest import known_hash
+from pimper_torch.store.digest import known_hashes
 
 Value = TypeVar("Value")
 
@@ -23,8 +23,7 @@ def deferred(shape: Sequence[int], hashed: str, read: Callable[[], Tensor]) -> T
         read: Returns the tensor itself, for :func:`actual`.
     """
     tensor = torch.full((1,) * len(shape), torch.nan).expand(*shape)
-    known_hash(tensor, hashed)
-    _readers[tensor] = read
+    known_hashes[tensor], _readers[tensor] = (tensor._version, hashed), read
     return tensor
 
 
@@ -34,9 +33,6 @@ def actual(value: Value) -> Value:
     def is_deferred(leaf: object) -> bool:
         return isinstance(leaf, Tensor) and leaf in _readers
 
-    if not any(map(is_deferred, pytree.tree_leaves(value))):
-        return value
-    read: Value = pytree.tree_map(
-        lambda leaf: _readers[leaf]() if is_deferred(leaf) else leaf, value
-    )
-    return read
+    if any(map(is_deferred, pytree.tree_leaves(value))):
+        value = pytree.tree_map(lambda leaf: _readers[leaf]() if is_deferred(leaf) else leaf, value)
+    return value

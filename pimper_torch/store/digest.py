@@ -45,7 +45,7 @@ def is_known(module: str) -> bool:
 
 # Version and hash of live tensors that were hashed or deferred. Stages pass on the same tensors,
 # and writing into a tensor increments its version.
-_known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+known_hashes: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def digest(*values: object) -> str | None:
@@ -117,7 +117,7 @@ def tensor_hash(tensor: Tensor) -> str:
         raise _UnknownError
     # An inference tensor has no version; it cannot be written to outside inference mode.
     version = -1 if tensor.is_inference() else tensor._version
-    cached: tuple[int, str] | None = _known.get(tensor)  # type: ignore[no-untyped-call]
+    cached: tuple[int, str] | None = known_hashes.get(tensor)  # type: ignore[no-untyped-call]
     if cached is not None and cached[0] == version:
         return cached[1]
     about = f"{tensor.dtype} {tuple(tensor.shape)} {tensor.device.type}"
@@ -128,10 +128,5 @@ def tensor_hash(tensor: Tensor) -> str:
     for chunk in torch.split(flat.view(torch.uint8), LARGE):
         hashed.update(chunk.numpy().data)
         drop_pages()
-    _known[tensor] = (version, hashed.hexdigest())
+    known_hashes[tensor] = (version, hashed.hexdigest())
     return hashed.hexdigest()
-
-
-def known_hash(tensor: Tensor, hashed: str) -> None:
-    """Set the hash of a tensor that has, or stands for, the bits of a hashed one."""
-    _known[tensor] = (tensor._version, hashed)

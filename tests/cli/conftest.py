@@ -51,7 +51,7 @@ def chain(reconstruction, monkeypatch, lit_before):
             return reconstruction
 
         def finish(self, result, files):
-            return CoarseToFine().finish(result, files)
+            return CoarseToFine(cache=Chain.cache).finish(result, files)
 
         def work(self):
             """Do nothing; tests replace it by events in the middle of a run."""

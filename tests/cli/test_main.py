@@ -41,7 +41,7 @@ def reconstruct(photos, chain, tmp_path):
 
 def test_a_run_writes_the_result_and_prints_its_path(reconstruct, chain, tmp_path, capsys):
     assert reconstruct() == 0
-    assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
+    assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER, ".stages"} - ASKED_FOR)
     config, views, sparse = chain.given
     assert config == pt.CoarseToFineConfig() == pt.load_config("default")
     assert views.names == ("0.png", "1.png", "2.png", "3.png")
@@ -122,7 +122,7 @@ def test_masks_of_a_result_can_be_given_and_are_trusted(reconstruction, chain, t
 def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run("demo", "--max-size-px", "60") == 0
-    assert held(tmp_path / "pimper_demo") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
+    assert held(tmp_path / "pimper_demo") == sorted({*RESULT_NAMES, MARKER, ".stages"} - ASKED_FOR)
     assert chain.given[1].num_views == 24
     assert "37.jpg" in chain.given[1].names
 
@@ -169,7 +169,7 @@ def test_an_occupied_out_is_refused_before_photographs_are_read(reconstruct, tmp
     assert run("reconstruct", tmp_path / "nowhere", "-o", tmp_path / "out") == 2
     assert "out: already contains albedo.png" in capsys.readouterr().err
     assert reconstruct("--overwrite") == 0
-    assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER} - ASKED_FOR)
+    assert held(tmp_path / "out") == sorted({*RESULT_NAMES, MARKER, ".stages"} - ASKED_FOR)
 
 
 def test_a_missing_gpu_is_reported_before_the_run(reconstruct, chain, capsys, monkeypatch):
@@ -408,12 +408,16 @@ def test_without_a_viewer_a_run_is_refused(reconstruct, tmp_path, capsys, monkey
     assert not (tmp_path / "out").exists()
 
 
+def times(out):
+    return {path: path.stat().st_mtime_ns for path in out.iterdir() if path.name != ".stages"}
+
+
 def test_the_coarse_surface_is_a_preview_until_the_run_ends(
     reconstruct, chain, reconstruction, tmp_path, capsys
 ):
     out = tmp_path / "out"
     assert reconstruct() == 0
-    former = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    former = times(out)
     capsys.readouterr()
 
     def show(self):
@@ -423,18 +427,18 @@ def test_the_coarse_surface_is_a_preview_until_the_run_ends(
 
     def show_and_fail(self):
         show(self)
-        assert {path: path.stat().st_mtime_ns for path in former} == former
+        assert times(out) == former
         raise pt.ReconstructionError("no surface.")
 
     chain.work = show_and_fail
-    assert reconstruct("--json", "--overwrite") == 2
+    assert reconstruct("--json", "--overwrite", "--fresh") == 2
     (printed,) = [one for one in events(capsys) if one["event"] == "preview"]
     assert printed["path"] == str(out / ".stages" / "preview.png")
-    assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == former
+    assert times(out) == former
     chain.work = show
-    assert reconstruct("--overwrite") == 0
+    assert reconstruct("--overwrite", "--fresh") == 0
     assert f"{printed['path']} shows the coarse surface" in capsys.readouterr().out
-    assert {path.name for path in out.iterdir()} == {path.name for path in former}
+    assert times(out).keys() == former.keys()
 
 
 def test_values_without_json_form_become_null_or_text(capsys):

@@ -30,10 +30,6 @@ class MeshFiles:
     texture: TextureFormat = "png"
     cameras: bool = False
 
-    def shape(self) -> "MeshFiles":
-        """Return only the options that change the mesh."""
-        return MeshFiles(faces=self.faces, watertight=self.watertight)
-
     def __post_init__(self) -> None:
         too_few = self.faces is not None and self.faces != "all" and self.faces < 4
         require(not too_few, "faces", self.faces, "all, or at least 4, a tetrahedron's")
