@@ -48,7 +48,7 @@ CameraDistances = Annotated[
 ]
 Markers = Annotated[Literal["auto", "off"] | float, tyro.conf.arg(metavar="auto|off|MM")]
 
-# The demo keeps 0.5 GB. Chosen for a few runs with photographs of twice the size.
+# The demo keeps 0.8 GB. Chosen for a few runs with photographs of twice the size.
 MAX_KEPT = "8GB"
 
 

@@ -34,7 +34,7 @@ def lights_report(result: Reconstruction) -> Report:
     """
     facets, lights_world, determined = world_lights(result)
     lit = (lights_world != 0).any(dim=-1)
-    common, counts = common_lights(result)
+    common, counts = (values.tolist() for values in common_lights(result))
     views = result.scene.views.names
     return {
         "reference": views[result.coarse.reference],
@@ -43,21 +43,22 @@ def lights_report(result: Reconstruction) -> Report:
             {
                 "name": name,
                 "light": _rounded(common[index]) if counts[index] > 0 else None,
-                "patches": int(counts[index]),
+                "patches": counts[index],
             }
             for index, name in enumerate(views)
         ],
         "patches": [
             {
-                "facet": int(facet),
-                "determined": bool(is_determined),
+                "facet": facet,
+                "determined": is_determined,
                 "lights": [
-                    _rounded(light) if bool(is_lit) else None
+                    _rounded(light) if is_lit else None
                     for light, is_lit in zip(lights, lit_views, strict=True)
                 ],
             }
             for facet, is_determined, lights, lit_views in zip(
-                facets, determined, lights_world, lit, strict=True
+                *(values.tolist() for values in (facets, determined, lights_world, lit)),
+                strict=True,
             )
         ],
     }
@@ -191,9 +192,9 @@ def _finite(value: float | int) -> float | int | None:
     return value if math.isfinite(value) else None
 
 
-def _rounded(light: Float[Tensor, " 4"]) -> list[float | None]:
+def _rounded(light: Sequence[float]) -> list[float | None]:
     """Round to six digits, more than photographs determine."""
-    return [_finite(float(f"{value:.6g}")) for value in light.tolist()]
+    return [_finite(float(f"{value:.6g}")) for value in light]
 
 
 def relighting_report(fit: Relighting) -> dict[str, object]:

@@ -61,7 +61,7 @@ RESULT_NAMES = (
     "report.html",
 )
 """All files of a result; a table in the manual describes them."""
-_PARTS = 4  # of the progress bar: meshes, asset, others, page
+_PARTS = 5  # of the progress bar: images, meshes, asset, others, page
 
 
 def write_result(
@@ -98,30 +98,30 @@ def write_result(
         folder: New or empty; its parents are created.
         files: Number of faces and formats of the mesh, for a result without ``finished``; see
             :meth:`~pimper_torch.chains.chain.Chain.finish`.
-        pictures: Images of the result, if they are drawn already.
+        pictures: Of the result, if they are drawn.
 
     Raises:
         OutputError: The folder contains other files, or cannot be written.
     """
-    folder, began = Path(folder), time.perf_counter()
-    files = files or MeshFiles()
+    folder, files, began = Path(folder), files or MeshFiles(), time.perf_counter()
     if result.finished is None:
         result = CoarseToFine().finish(result, files)
     with written_whole(folder, "result", overwrite=overwrite) as staging:
-        ready, asset, _ = completed(result)
-        written, shown = result.replace(mesh=ready.mesh), pictures or drawn(result)
-        placement = _placement(written, asset, files, folder.absolute().name, about or {})
         with part(0, _PARTS):
-            _write_meshes(ready, files, placement, staging)
+            (ready, asset, _), shown = completed(result), pictures or drawn(result)
+        written = result.replace(mesh=ready.mesh)
+        placement = _placement(written, asset, files, folder.absolute().name, about or {})
         with part(1, _PARTS):
-            _write_assets(asset, files, placement, staging)
+            _write_meshes(ready, files, placement, staging)
         with part(2, _PARTS):
+            _write_assets(asset, files, placement, staging)
+        with part(3, _PARTS):
             _write_all(written, shown, config, staging)
         writing = stage_report("write", time.perf_counter() - began)
         timed = result.replace(report=(*result.report, writing))
         summary = _summary(timed, about or {}) | {"thumbnails": shown.thumbnails}
         reports.write_json(summary, staging / "summary.json")
-        with part(3, _PARTS):
+        with part(4, _PARTS):
             if report:
                 _write_page(written, shown, placement, summary, staging)
 

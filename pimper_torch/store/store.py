@@ -22,7 +22,7 @@ from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.mapped import copied
 from pimper_torch.runtime.reporting import ASIDE, KEEP, aside
 from pimper_torch.runtime.stream import collected, emit
-from pimper_torch.store.digest import digest
+from pimper_torch.store.digest import digest, known_hashes
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
@@ -123,7 +123,12 @@ def realigned(record: AnyRecord) -> AnyRecord:
             return value
         if value.is_contiguous() and value.data_ptr() % 64 == 0:
             return value
-        return copies.setdefault(id(value), copied(value))
+        copy = copies.setdefault(id(value), copied(value))
+        known = known_hashes.get(value)  # type: ignore[no-untyped-call]
+        versions = known and not (value.is_inference() or copy.is_inference())
+        if versions and known[0] == value._version:
+            known_hashes[copy] = (copy._version, known[1])
+        return copy
 
     return pytree.tree_map(align, record)
 

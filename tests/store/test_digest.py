@@ -9,10 +9,11 @@ import pytest
 import torch
 from torch import nn
 
+from pimper_torch.records import Mesh
 from pimper_torch.stages.fusion.fuse import Fuse
 from pimper_torch.stages.fusion.fuse_config import FuseConfig
 from pimper_torch.stages.meshing.extract import Extract
-from pimper_torch.store import digest, opened
+from pimper_torch.store import digest, opened, realigned
 
 
 class Color(Enum):
@@ -114,3 +115,18 @@ def test_hashes_of_functions_cover_the_packages_code(monkeypatch):
     monkeypatch.setattr(sys.modules[digest.__module__], "code", lambda: "edited")
     changed = [digest(value) for value in (opened, Fuse(), 1)]
     assert [one == other for one, other in zip(before, changed, strict=True)] == [0, 0, 1]
+
+
+def test_a_realigned_copy_has_the_hash_of_its_bits():
+    values = torch.arange(9.0)[1:]  # not aligned
+    record = Mesh(vertices_world=values[:6].reshape(2, 3), faces=torch.zeros(0, 3).long())
+    with torch.inference_mode():
+        assert digest(realigned(record)) == digest(record)
+    before = digest(record)
+    copy = realigned(record)
+    assert copy.vertices_world.data_ptr() != record.vertices_world.data_ptr()
+    assert digest(copy) == before
+    copy.vertices_world[0, 0] = 5
+    assert digest(copy) != before
+    record.vertices_world[0, 0] = 5
+    assert digest(realigned(record)) == digest(copy)

@@ -58,9 +58,11 @@ def _crossed(mesh: ClosedMesh) -> FaceMask:
     surface, caps = (mesh.mesh.faces[which].cpu() for which in (mesh.measured, ~mesh.measured))
     crossed = _crossings(vertices, surface, caps)[0] | _crossings(vertices, caps, surface)[1]
     twisted = torch.unique(caps[_crossings(vertices, caps, caps)[0]])
-    border = torch.unique(caps[caps <= surface.max()])
-    nearest = cKDTree(vertices[border]).query(vertices[twisted])[1] if len(border) else []
-    return crossed | torch.isin(surface, border[nearest]).any(dim=1)
+    if len(twisted):
+        border = torch.unique(caps[caps <= surface.max()])
+        nearest = cKDTree(vertices[border]).query(vertices[twisted])[1]
+        crossed = crossed | torch.isin(surface, border[nearest]).any(dim=1)
+    return crossed
 
 
 def _crossings(vertices: Vertices, first: Faces, second: Faces) -> tuple[FaceMask, FaceMask]:
