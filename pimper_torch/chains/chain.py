@@ -331,7 +331,8 @@ class Chain(Stage):
 
     def _judged(self, result: Reconstruction, warn: bool) -> Verdict:
         """Return the verdict, with a warning if the result is not good."""
-        verdict = self.running()(self.judge, result)
+        judged = result.replace(finished=None, asset=None, report=(), failures=(), left_out=())
+        verdict = self.running()(self.judge, judged)
         if warn and not verdict.good:
             caution(verdict.text, stacklevel=3)
         return verdict

@@ -9,7 +9,6 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from pimper_torch.chains.running import ChainRun
-from pimper_torch.io.thumbnails import thumbnails
 from pimper_torch.records import FinishedMesh, Reconstruction, Record, Relighting, TexturedMesh
 from pimper_torch.records.shapes import PerVertex
 from pimper_torch.runtime.progress import part
@@ -32,7 +31,6 @@ class Pictures(Record):
         turn: Bytes of ``turn.webp``.
         openness: Of the asset's vertices.
         views: JSON of :func:`~pimper_torch.viz.report.predictions.view_images`.
-        thumbnails: Of every photograph, by name.
         points: Colours of the sparse cloud.
         markers: Printed ones in the photographs.
     """
@@ -41,7 +39,6 @@ class Pictures(Record):
     turn: UInt8[Tensor, " turn"]
     openness: PerVertex
     views: str
-    thumbnails: dict[str, str]
     points: UInt8[Tensor, "point 3"]
     markers: tuple[Marker, ...]
 
@@ -67,7 +64,6 @@ class Draw(Stage):
                 turn=turn,
                 openness=openness(asset.mesh),
                 views=json.dumps(view_images(result.scene, result.silhouettes, predicted)),
-                thumbnails=thumbnails(result.scene.views),
                 points=point_colors(result.scene),
                 markers=tuple(find_markers(result.scene)),
             )

@@ -119,7 +119,7 @@ def write_result(
             _write_all(written, shown, config, staging)
         writing = stage_report("write", time.perf_counter() - began)
         timed = result.replace(report=(*result.report, writing))
-        summary = _summary(timed, about or {}) | {"thumbnails": shown.thumbnails}
+        summary = _summary(timed, about or {})
         reports.write_json(summary, staging / "summary.json")
         with part(4, _PARTS):
             if report:

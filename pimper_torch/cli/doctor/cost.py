@@ -75,7 +75,8 @@ def planned(
         ("simplify", 1.7 * one),
         ("relight", 4.0 + 0.5 * one),
         ("texture", 1.5 + 3.7 * one),
-        ("write", 3.0 + 2.5 * one),
+        ("draw", 2.0 + 0.1 * num_views + 1.5 * one),
+        ("write", 1.0 + 1.0 * one),
     ]
 
 

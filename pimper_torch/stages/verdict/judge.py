@@ -31,6 +31,8 @@ _MASKS = "Check masks/, correct them, and give them by `--masks`."
 class Judge(Stage):
     """Compare figures of a run with those of good results. Not differentiable."""
 
+    kept_as = Verdict
+
     @torch.no_grad()
     def forward(self, result: Reconstruction) -> Verdict:
         """Return the verdict, which is that of the least favourable figure.
