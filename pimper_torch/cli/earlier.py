@@ -71,7 +71,7 @@ def _with_images(result: Reconstruction, images: Tensor) -> Reconstruction:
 
 def _photographs(job: Job, record: KeptResult) -> Tensor:
     """Read and undistort the photographs of a kept result, without repeating warnings."""
-    encoding, size = job.config.photographs, job.common.max_size_px
+    encoding, size = job.config.photographs, job.common.max_size_px or 0
     with stage("photographs"), collected(Caution):
         scene = record.result.scene
         views = load_views(job.photos, encoding=encoding, max_size_px=size)

@@ -31,6 +31,7 @@ from pimper_torch.cli.output import Output, split
 from pimper_torch.cli.stopping import SIGNALS, exit_code, stoppable
 from pimper_torch.cli.supervise import SHRINK
 from pimper_torch.export.result_folder.files import require_name
+from pimper_torch.export.result_folder.marker import MARKER
 from pimper_torch.io.version import versions
 from pimper_torch.runtime.config import nearest
 from pimper_torch.runtime.cores import usable_cores
@@ -179,6 +180,10 @@ def commands() -> dict[str, str]:
 
 
 def _no_command(name: str) -> str:
+    if Path(name).is_dir():
+        result = (Path(name) / MARKER).is_file()
+        needed = f"view {name}" if result else f"reconstruct {name} -o OUT"
+        return f"{name} is a folder; needed: a command before it, such as `pimper {needed}`."
     if name in OF_BENCH:
         return (
             f"`pimper {name}` comes with pimper-bench, which is not installed. Run `pip install "

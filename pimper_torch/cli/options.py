@@ -13,6 +13,7 @@ from pimper_torch.cli.arguments import Flag, Option, options_of, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.export.result_folder.files import require_name
 from pimper_torch.export.result_folder.folders import prepare_output, require_apart
+from pimper_torch.export.result_folder.marker import read_marker
 from pimper_torch.io.assets.mesh_files import MeshFiles, MeshFormat, TextureFormat
 from pimper_torch.io.photograph_files import image_name, list_images
 from pimper_torch.paper.paper_config import PublishedConfig
@@ -297,6 +298,7 @@ def check(job: Job) -> Job:
         require_network(job.inputs.segmenter)
     require_apart(job.out, inputs_of(job))
     prepare_output(job.out, "result", job.common.overwrite)
+    refuse_result(job.photos)
     for folder in (job.photos, job.inputs.masks):
         if folder is not None:
             for path in list_images(folder):
@@ -317,6 +319,15 @@ def check(job: Job) -> Job:
     for name in (*filter(None, references), *measured, *marked):
         view_named(name, present)
     return job
+
+
+def refuse_result(folder: Path) -> None:
+    """Raise an error for a folder of results in place of photographs."""
+    marker = read_marker(folder)
+    if marker is not None and marker.kind == "result":
+        raise InputError(
+            f"{folder}: is a result of `pimper reconstruct`; needed: a folder of photographs."
+        )
 
 
 def inputs_of(job: Job) -> dict[str, Path | None]:

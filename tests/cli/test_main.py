@@ -17,7 +17,7 @@ from PIL import Image
 
 import pimper_torch as pt
 from pimper_torch.cli.output import Output
-from pimper_torch.export.result_folder.marker import MARKER
+from pimper_torch.export.result_folder.marker import MARKER, seal
 from pimper_torch.export.results import RESULT_NAMES
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.io.version import installed_version
@@ -238,6 +238,22 @@ def test_help_names_the_commands_and_version_the_version(capsys):
 def test_a_misspelt_command_suggests_the_nearest(capsys):
     assert run("reconstuct") == 2
     assert "Did you mean `reconstruct`?" in capsys.readouterr().err
+
+
+def test_a_folder_in_place_of_a_command_names_the_command(tmp_path, capsys):
+    assert run(str(tmp_path)) == 2
+    assert f"such as `pimper reconstruct {tmp_path} -o OUT`" in capsys.readouterr().err
+    seal(tmp_path, "result")
+    assert run(str(tmp_path)) == 2
+    assert f"such as `pimper view {tmp_path}`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "batch"])
+def test_a_result_in_place_of_photographs_is_refused(command, tmp_path, capsys):
+    (tmp_path / "result").mkdir()
+    seal(tmp_path / "result", "result")
+    assert run(command, str(tmp_path / "result"), "-o", str(tmp_path / "out")) == 2
+    assert "is a result of `pimper reconstruct`" in " ".join(capsys.readouterr().err.split())
 
 
 def test_unexpected_errors_are_reported_and_saved(

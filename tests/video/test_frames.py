@@ -63,8 +63,8 @@ def test_changing_light_does_not_count_as_motion(clip, tmp_path):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda path: None, "cannot be decoded as a video (No such file"),
-        (lambda path: path.mkdir(), "cannot be decoded as a video (Is a directory)"),
+        (lambda path: None, "found nothing; needed: a video."),
+        (lambda path: path.mkdir(), "found a folder; needed: a video."),
         (lambda path: path.write_bytes(b"\x00" * 5000), "cannot be decoded as a video"),
         (lambda path: path.write_text("#EXTM3U\n#EXTINF:1,\n/etc/hostname\n"), "clip.mkv: "),
         (

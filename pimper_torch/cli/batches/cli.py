@@ -90,10 +90,9 @@ def run(given: tuple[_Job, list[str]], output: Output) -> None:
     totals = ", ".join(f"{count} {status}" for status, count in counts.items())
     output.remark(f"{totals}; {job.out / HTML} shows them.")
     if failed := [outcome for outcome in outcomes if outcome.status not in ("ended", "kept")]:
-        first = failed[0]
         raise ReconstructionError(
-            f"{len(failed)} of {len(outcomes)} objects have no result, for example {first.name}: "
-            f"{first.message} {job.out / CSV} lists all with their reasons. {_CONTINUES}"
+            f"{len(failed)} of {len(outcomes)} objects have no result. {job.out / CSV} lists them "
+            f"with their reasons. {_CONTINUES}"
         )
     paths = {"folder": job.out, CSV: job.out / CSV, HTML: job.out / HTML}
     output.result(paths, objects=len(outcomes))

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pimper_torch.cli.options import every_option
+from pimper_torch.cli.options import every_option, refuse_result
 from pimper_torch.export.result_folder.files import require_name
 from pimper_torch.runtime.errors import ConfigError, InputError, some
 
@@ -57,6 +57,7 @@ def read_objects(given: Path | str | Sequence["Object | Path | str"]) -> list[Ob
     if not isinstance(given, Path | str):
         objects = [item if isinstance(item, Object) else _in_folder(Path(item)) for item in given]
     elif Path(given).is_dir():
+        refuse_result(Path(given))
         paths = (path for path in sorted(Path(given).iterdir()) if not path.name.startswith("."))
         objects = [_in_folder(path) for path in paths if path.is_dir()]
     else:
@@ -65,7 +66,7 @@ def read_objects(given: Path | str | Sequence["Object | Path | str"]) -> list[Ob
     if not objects:
         raise InputError(
             f"{where}: no objects; needed: a folder of folders of photographs, or a CSV file with "
-            "a column `photos`."
+            "a column `photos`. For one object, run `pimper reconstruct`."
         )
     counts = Counter(item.name.casefold() for item in objects)  # some disks ignore case
     same = [f"{item.photos} ({item.name})" for item in objects if counts[item.name.casefold()] > 1]

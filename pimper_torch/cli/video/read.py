@@ -62,6 +62,9 @@ def _frames(path: Path) -> Iterator[Any]:
             f"{path}: videos need PyAV, which is not installed. Run pip install "
             '"pimper_torch[video]".'
         ) from error
+    if not path.is_file():
+        found = "a folder" if path.exists() else "nothing"
+        raise InputError(f"{path}: found {found}; needed: a video.")
     try:
         with av.open(str(path), metadata_errors="replace", options=_LOCAL) as container:
             streams = container.streams.video
