@@ -13,7 +13,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.Pim
 
 # Two passes over given facets, in order.
 STAGES = ["silhouettes", "light", "depth_from_light", "photometry", "fuse", "remesh"]
-STAGES += ["light", "photometry", "fuse", "extract"]
+STAGES += ["light", "photometry", "fuse", "extract", "judge"]
 
 
 class Listener(SilentObserver):

@@ -64,7 +64,7 @@ def content(out):
     [
         (["--stl", "--obj", "--asset-cameras", "--texture", "webp", *BAR], set()),
         (["--watertight", "--unit", "cm"], {"simplify"}),
-        (["--faces", "60"], {"simplify", "photographs", "relight", "texture", "draw"}),
+        (["--faces", "60"], {"simplify", "photographs", "relight", "texture", "judge", "draw"}),
     ],
 )
 def test_a_kept_run_writes_the_files_of_a_new_one(line, tmp_path, options, runs):
