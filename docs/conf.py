@@ -49,6 +49,7 @@ html_title = f"pimper_torch {release}"
 html_math_renderer = "mathml"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_js_files = ["filter.js"]
 html_copy_source = False
 html_show_copyright = False
 

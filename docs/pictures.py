@@ -1,10 +1,14 @@
-"""Draw the pictures of the documentation: ``python docs/pictures.py [captures] [stages] [walk]``.
+"""Draw the pictures of the documentation.
+
+``python docs/pictures.py [captures] [stages] [walk] [reports]``
 
 Captures are sheets of photographs that ``pimper render`` makes with the commands in
 ``docs/photographs.md``. Stages are drawn from the bundled skull, and so is the path of the
-photographs through the subpackages.
+photographs through the subpackages. Reports are the pages of the commands in ``docs/gallery.md``,
+with some of the photographs; their mesh files are looked for in the current folder.
 """
 
+import json
 import re
 import subprocess
 import sys
@@ -27,8 +31,15 @@ from pimper_torch.viz.render import crop_to, image_bounds, shade
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
+REPORTS = DOCS / "static" / "reports"
 PACKAGE = Path(pt.__file__).parent
 CAPTURE = re.compile(r"^    pimper render (.+) -o ([\w-]+)$", flags=re.MULTILINE)
+
+RUN = re.compile(r"^    (pimper .*\bcaptures/.*)$", flags=re.MULTILINE)
+
+# Of a report: where the page has its data, and the number of photographs that stay.
+DATA = re.compile(r'(<script type="application/json" id="data">)(.*?)(</script>)', flags=re.DOTALL)
+KEPT = 4
 
 # Of a sheet: photographs per row, and the width of each.
 COLUMNS, WIDTH_PX, GAP_PX = 4, 236, 4
@@ -131,6 +142,34 @@ def draw_walk() -> None:
     axes.grid(visible=True, color="#eeeeee")
     axes.set_axisbelow(True)
     figure.savefig(IMAGES / "walk.png", dpi=90)
+
+
+def write_reports() -> None:
+    """Run the commands of the gallery, and keep a small page of each result."""
+    commands = RUN.findall((DOCS / "gallery.md").read_text(encoding="utf-8"))
+    meshes = {path.name: path for path in Path.cwd().glob("*.obj")}
+    REPORTS.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for command in commands:
+            words = [str(meshes.get(word, word)) for word in command.split()]
+            subprocess.run(words, cwd=folder, check=True)
+            page = Path(folder) / words[words.index("-o") + 1] / "report.html"
+            if page.exists():
+                text = with_fewer_views(page.read_text(encoding="utf-8"))
+                (REPORTS / f"{page.parent.name}.html").write_text(text, encoding="utf-8")
+
+
+def with_fewer_views(page: str) -> str:
+    """Remove photographs from a report, except the reference and some evenly spaced ones."""
+    found = DATA.search(page)
+    assert found, "the page has no data"
+    data = json.loads(found[2])
+    count, reference = len(data["views"]), data["reference"]
+    kept = sorted({(reference + step * count // KEPT) % count for step in range(KEPT)})
+    data["views"] = [data["views"][view] for view in kept]
+    data["reference"] = kept.index(reference)
+    text = json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
+    return f"{page[: found.start(2)]}{text}{page[found.end(2) :]}"
 
 
 class Walk:
@@ -240,10 +279,12 @@ def sheet(images: list[Image.Image], width: int, columns: int = COLUMNS) -> Imag
 
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
-    wanted = sys.argv[1:] or ["captures", "stages", "walk"]
+    wanted = sys.argv[1:] or ["captures", "stages", "walk", "reports"]
     if "captures" in wanted:
         draw_captures()
     if "stages" in wanted:
         draw_stages()
     if "walk" in wanted:
         draw_walk()
+    if "reports" in wanted:
+        write_reports()

@@ -66,6 +66,7 @@ def executed(notebook: NotebookNode) -> NotebookNode:
     for data in (output.get("data", {}) for cell in code_cells(fresh) for output in cell.outputs):
         if "image/png" in data:
             data["image/png"] = quantized(data["image/png"])
+            data.pop("image/jpeg", None)  # Pillow shows an image in both formats
     fresh.metadata = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},
