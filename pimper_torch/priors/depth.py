@@ -86,16 +86,7 @@ def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPri
             _doubt_contradicted(where, stated, gauge, best, medians, scores, trained)
         best = stated
     else:
-        on_axis = _NAMES.index((_NAMES[best][0], "axis"))
-        if not clearly_better(scores[best, -1], scores[on_axis, -1]):
-            best = on_axis
-        gauge = [clearly_better(scores[best, -1], row) for row in scores[best]].index(False)
-        caution(
-            f"{where} is interpreted as {_READINGS[_NAMES[best]]} {_GAUGES[gauges[gauge]]}, which "
-            f"fits the point cloud best: its median error at {errors.shape[-1]} observations is "
-            f"{medians[best, gauge]:.1%}. If this is wrong, state `inverse`, `along` and `gauge`.",
-            stacklevel=4,
-        )
+        best, gauge = _simplest(where, best, medians, scores)
     inverse, along = _NAMES[best]
     if (inverse, along, gauges[gauge]) == _OURS:
         return prior.replace(inverse=inverse, along=along, gauge=gauges[gauge])
@@ -103,6 +94,24 @@ def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPri
     for index in torch.unique(maps).tolist():
         deviation[index] = 1.4826 * errors[best, gauge, maps == index].median()  # of Gaussians
     return _to_scene_depth(prior, scene, along, inverse, lines[best, gauge], deviation)
+
+
+def _simplest(where: str, best: int, medians: Tensor, scores: Tensor) -> tuple[int, int]:
+    """Return reading and gauge: along the axis and the simplest ones unless others fit far better.
+
+    A warning states them.
+    """
+    on_axis, gauges = _NAMES.index((_NAMES[best][0], "axis")), tuple(_GAUGES)
+    if not clearly_better(scores[best, -1], scores[on_axis, -1]):
+        best = on_axis
+    gauge = [clearly_better(scores[best, -1], row) for row in scores[best]].index(False)
+    caution(
+        f"{where} is interpreted as {_READINGS[_NAMES[best]]} {_GAUGES[gauges[gauge]]}, which "
+        f"fits the point cloud best: its median error at {scores.shape[-1]} points is "
+        f"{medians[best, gauge]:.1%}. If this is wrong, state `inverse`, `along` and `gauge`.",
+        stacklevel=5,
+    )
+    return best, gauge
 
 
 def _doubt_contradicted(

@@ -81,8 +81,7 @@ def resolve_normal_conventions(
     """Convert normals to our camera axes, or leave them in the world.
 
     Axes that are not stated are determined, and exchanged channels corrected, with a warning. Maps
-    with stated axes that require gradients are used as stated, with a warning for what is an error
-    otherwise.
+    with stated axes that require gradients are used as stated, with a warning instead of errors.
 
     Args:
         prior: Of undistorted photographs.
@@ -108,12 +107,7 @@ def resolve_normal_conventions(
     if _in_other_world(bare, valid) and means[best] < _LEAST:
         remedy = "Give camera normals, or the cameras of that world with `--sparse`."
         contradicted("are consistent, but in a different world frame", remedy)
-    changes = [(_BGR, _scores(bare, samples, change=lambda normals, _: normals.flip(-1)))]
-    for name, tags in exif_errors(bare, scene):
-        # The network ran on the stored pixels, or only pixels were reoriented and vectors not.
-        changes += [(name, _scores(bare, samples, tags, reoriented_vectors))]
-        changes += [(name, _scores(bare, samples, tags))]
-    if change := better_change(_scores(bare, samples)[best], changes, _LEAST):
+    if change := _better_change(bare, samples, scene, best):
         if change == _BGR and not trained:
             caution(f"{where} have {_BGR}; this is corrected.", stacklevel=4)
             return resolve_normal_conventions(
@@ -141,6 +135,16 @@ def resolve_normal_conventions(
         return prior.replace(frame="world", axes="opencv")
     normals = prior.normals * prior.normals.new_tensor(signs)
     return prior.replace(normals=normals, frame="camera", axes="opencv")
+
+
+def _better_change(prior: NormalPrior, samples: _Samples, scene: SparseScene, best: int) -> str:
+    """Return the change of channels or orientation with which maps fit far better, else ""."""
+    changes = [(_BGR, _scores(prior, samples, change=lambda normals, _: normals.flip(-1)))]
+    for name, tags in exif_errors(prior, scene):
+        # The network ran on the stored pixels, or only pixels were reoriented and vectors not.
+        changes += [(name, _scores(prior, samples, tags, reoriented_vectors))]
+        changes += [(name, _scores(prior, samples, tags))]
+    return better_change(_scores(prior, samples)[best], changes, _LEAST)
 
 
 def _announce(where: str, index: int, scores: Tensor, means: Tensor) -> None:
