@@ -1,6 +1,7 @@
 # Public names, imported on first use (`__init__.py`).
 __all__: list[str]
 from . import export as export
+from . import losses as losses
 from . import priors as priors
 from . import radiometry as radiometry
 from . import records as records

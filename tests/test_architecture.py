@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[1]
 # A folder imports only itself and folders before it; a stage no other stage.
 FOLDERS = [
     *("runtime", "records", "store", "radiometry", "kernels", "geometry", "linalg", "lighting"),
+    "losses",
     *("scale", "io", "priors", "stages", "chains", "paper", "presets", "single_view", "viz"),
     *("export", "viewer", "cli"),
 ]

@@ -117,7 +117,7 @@ def test_overlay_merges_sections_and_leaves_its_inputs_unchanged():
 
 
 def test_a_misspelt_preset_suggests_the_nearest():
-    with pytest.raises(ConfigError, match=r"'papre'.*`paper`.*default, fast, paper"):
+    with pytest.raises(ConfigError, match=r"'papre'.*`paper`.*default, fast, paper, training"):
         find_config("papre")
 
 

@@ -16,8 +16,8 @@ def load_config(
     """Read the settings of a preset or of a YAML file; the file contains only changes to defaults.
 
     Args:
-        name_or_path: ``"default"``, ``"paper"``, ``"fast"``, or a file. Its ``chain`` selects the
-            chain: ``coarse-to-fine``, the default, or ``published``.
+        name_or_path: ``"default"``, ``"fast"``, ``"paper"``, ``"training"``, or a file. Its
+            ``chain`` selects the chain: ``coarse-to-fine``, the default, or ``published``.
         changes: Override the file, nested by stage as in it.
 
     Raises:

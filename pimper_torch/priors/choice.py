@@ -9,11 +9,27 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.runtime.errors import InputError, caution
+
 # Least gain in score for maps that are reoriented or have channels exchanged: a choice. It finds
 # all mirrored, half turned and exchanged normals of rendered scenes (potatoes, jar, balls, mug, 12
 # of 160x120) without noise and with 25 degrees, including maps of the object alone, except those of
 # the jar, which is its own mirror image.
 _MIN_GAIN = 0.05
+
+
+def doubt(message: str, trained: bool) -> None:
+    """Raise an error, or give a warning for stated conventions of a network in training.
+
+    Its maps need not fit the scene yet. The warning has one text, which Python shows once.
+    """
+    if not trained:
+        raise InputError(message)
+    caution(
+        "Maps that require gradients contradict the scene; they are used as stated, as of a "
+        "network in training. Detached maps are refused, with the reason.",
+        stacklevel=5,
+    )
 
 
 def clearly_better(scores: Float[Tensor, " point"], baseline: Float[Tensor, " point"]) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.priors.at_points import AtPoints, at_points, exif_errors, means_by, reoriented
-from pimper_torch.priors.choice import better_change, clearly_better
+from pimper_torch.priors.choice import better_change, clearly_better, doubt
 from pimper_torch.records import DepthPrior, SparseScene
 from pimper_torch.records.shapes import Scalar
 from pimper_torch.runtime.errors import InputError, caution, some
@@ -45,7 +45,9 @@ def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPri
     If they are not stated they are determined, with a warning that states them: whether depth is
     inverse, along the axis unless along the ray fits far better, and the simplest gauge that fits.
     Factors and offsets are fitted to the cloud, map by map; standard errors are at least a map's
-    error there. A map with too few points is excluded.
+    error there. A map with too few points is excluded. Maps with stated conventions that require
+    gradients are used as stated, with a warning for what is an error otherwise, unless there are
+    too few points.
 
     Args:
         prior: Of undistorted photographs. Depth in scene units along the axis is not changed.
@@ -63,13 +65,15 @@ def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPri
     best = int(medians[:-1, -1].argmin())
     if not enough and (prior.inverse, prior.along, prior.gauge) == _OURS:
         return prior
+    trained = prior.depth.requires_grad and prior.inverse is not None
     if change := _better_orientation(prior.detach(), scene, size):
-        raise InputError(f"{where} is {change}, as the cloud shows. Turn it like the photographs.")
+        doubt(f"{where} is {change}, as the cloud shows. Turn it like the photographs.", trained)
     informative = enough and clearly_better(scores[best, -1], scores[-1, -1])
     if medians[-1, -1] > _FLAT and not informative:
-        raise InputError(
+        doubt(
             f"{where} fits the point cloud no better than constant depth, as depth or as inverse "
-            "depth. Photographs and maps may be mixed up, or maps may have a different size."
+            "depth. Photographs and maps may be mixed up, or maps may have a different size.",
+            trained,
         )
     if not enough or (prior.inverse is None and not informative):
         raise InputError(
@@ -79,19 +83,10 @@ def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPri
     if prior.inverse is not None:
         stated, gauge = _NAMES.index((prior.inverse, prior.along)), gauges.index(prior.gauge)
         if informative:
-            _refuse_contradicted(where, stated, gauge, best, medians, scores)
+            _doubt_contradicted(where, stated, gauge, best, medians, scores, trained)
         best = stated
     else:
-        on_axis = _NAMES.index((_NAMES[best][0], "axis"))
-        if not clearly_better(scores[best, -1], scores[on_axis, -1]):
-            best = on_axis
-        gauge = [clearly_better(scores[best, -1], row) for row in scores[best]].index(False)
-        caution(
-            f"{where} is interpreted as {_READINGS[_NAMES[best]]} {_GAUGES[gauges[gauge]]}, which "
-            f"fits the point cloud best: its median error at {errors.shape[-1]} observations is "
-            f"{medians[best, gauge]:.1%}. If this is wrong, state `inverse`, `along` and `gauge`.",
-            stacklevel=4,
-        )
+        best, gauge = _simplest(where, best, medians, scores)
     inverse, along = _NAMES[best]
     if (inverse, along, gauges[gauge]) == _OURS:
         return prior.replace(inverse=inverse, along=along, gauge=gauges[gauge])
@@ -101,22 +96,48 @@ def resolve_depth_conventions(prior: DepthPrior, scene: SparseScene) -> DepthPri
     return _to_scene_depth(prior, scene, along, inverse, lines[best, gauge], deviation)
 
 
-def _refuse_contradicted(
-    where: str, stated: int, gauge: int, best: int, medians: Tensor, scores: Tensor
+def _simplest(where: str, best: int, medians: Tensor, scores: Tensor) -> tuple[int, int]:
+    """Return reading and gauge: along the axis and the simplest ones unless others fit far better.
+
+    A warning states them.
+    """
+    on_axis, gauges = _NAMES.index((_NAMES[best][0], "axis")), tuple(_GAUGES)
+    if not clearly_better(scores[best, -1], scores[on_axis, -1]):
+        best = on_axis
+    gauge = [clearly_better(scores[best, -1], row) for row in scores[best]].index(False)
+    caution(
+        f"{where} is interpreted as {_READINGS[_NAMES[best]]} {_GAUGES[gauges[gauge]]}, which "
+        f"fits the point cloud best: its median error at {scores.shape[-1]} points is "
+        f"{medians[best, gauge]:.1%}. If this is wrong, state `inverse`, `along` and `gauge`.",
+        stacklevel=5,
+    )
+    return best, gauge
+
+
+def _doubt_contradicted(
+    where: str,
+    stated: int,
+    gauge: int,
+    best: int,
+    medians: Tensor,
+    scores: Tensor,
+    trained: bool,
 ) -> None:
-    """Raise an error if a different reading or gauge fits far better than the stated ones."""
+    """Doubt the stated reading and gauge if different ones fit far better."""
     if clearly_better(scores[best, -1], scores[stated, -1]):
-        raise InputError(
+        doubt(
             f"{where} is {_READINGS[_NAMES[best]]}, given as {_READINGS[_NAMES[stated]]} (median "
             f"errors at the cloud: {medians[best, -1]:.1%}, {medians[stated, -1]:.1%}). State the "
-            "first."
+            "first.",
+            trained,
         )
     worse = medians[stated, gauge] > _WORSE * medians[stated, -1]
     if worse and clearly_better(scores[stated, -1], scores[stated, gauge]):
-        raise InputError(
+        doubt(
             f"{where} is not depth {list(_GAUGES.values())[gauge]}: its median error at the cloud "
             f"is {medians[stated, gauge]:.1%}, and {medians[stated, -1]:.1%} {_GAUGES['affine']} "
-            "(`gauge` affine)."
+            "(`gauge` affine).",
+            trained,
         )
 
 

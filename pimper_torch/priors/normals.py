@@ -24,7 +24,7 @@ from pimper_torch.priors.at_points import (
     reoriented,
     reoriented_vectors,
 )
-from pimper_torch.priors.choice import better_change, clearly_better
+from pimper_torch.priors.choice import better_change, clearly_better, doubt
 from pimper_torch.records import NormalPrior, Record, Silhouettes, SparseScene
 from pimper_torch.records.priors import AXES
 from pimper_torch.records.shapes import Points
@@ -80,7 +80,8 @@ def resolve_normal_conventions(
 ) -> NormalPrior:
     """Convert normals to our camera axes, or leave them in the world.
 
-    Axes that are not stated are determined, and exchanged channels corrected, with a warning.
+    Axes that are not stated are determined, and exchanged channels corrected, with a warning. Maps
+    with stated axes that require gradients are used as stated, with a warning instead of errors.
 
     Args:
         prior: Of undistorted photographs.
@@ -98,32 +99,31 @@ def resolve_normal_conventions(
     means = scores.mean(dim=1) if scores.shape[1] else scores.new_zeros(len(_READINGS))
     best = int(means.argmax())
 
-    def contradiction(found: str, remedy: str) -> InputError:
-        return InputError(f"{where} {found}, as cloud, outlines and cameras show. {remedy}")
+    trained = prior.normals.requires_grad and prior.axes is not None
+
+    def contradicted(found: str, remedy: str) -> None:
+        doubt(f"{where} {found}, as cloud, outlines and cameras show. {remedy}", trained)
 
     if _in_other_world(bare, valid) and means[best] < _LEAST:
         remedy = "Give camera normals, or the cameras of that world with `--sparse`."
-        raise contradiction("are consistent, but in a different world frame", remedy)
-    changes = [(_BGR, _scores(bare, samples, change=lambda normals, _: normals.flip(-1)))]
-    for name, tags in exif_errors(bare, scene):
-        # The network ran on the stored pixels, or only pixels were reoriented and vectors not.
-        changes += [(name, _scores(bare, samples, tags, reoriented_vectors))]
-        changes += [(name, _scores(bare, samples, tags))]
-    if change := better_change(_scores(bare, samples)[best], changes, _LEAST):
-        if change != _BGR:
-            raise contradiction(f"are {change}", "Orient maps and vectors like the photographs.")
-        caution(f"{where} have {_BGR}; this is corrected.", stacklevel=4)
-        return resolve_normal_conventions(
-            prior.replace(normals=prior.normals.flip(-1)), scene, silhouettes
-        )
+        contradicted("are consistent, but in a different world frame", remedy)
+    if change := _better_change(bare, samples, scene, best):
+        if change == _BGR and not trained:
+            caution(f"{where} have {_BGR}; this is corrected.", stacklevel=4)
+            return resolve_normal_conventions(
+                prior.replace(normals=prior.normals.flip(-1)), scene, silhouettes
+            )
+        contradicted(f"are {change}", "Orient maps and vectors like the photographs.")
     index = int(means[: _WORLD + 1].argmax())
     if prior.axes:
         index = _WORLD if prior.frame == "world" else list(AXES).index(prior.axes)
     if clearly_better(scores[best], scores[index]):
         given = f"given as {_MEANINGS[index]}" if prior.axes else "as no known network writes them"
-        raise contradiction(f"are {_MEANINGS[best]}, {given}", "State `axes`, or convert them.")
+        contradicted(f"are {_MEANINGS[best]}, {given}", "State `axes`, or convert them.")
     if prior.axes is None:
         _announce(where, index, scores, means)
+    elif trained and scores.shape[1] and float(means[index]) < _LEAST:
+        contradicted("hardly fit", "")
     elif scores.shape[1] and float(means[index]) < _LEAST:
         caution(
             f"{where} hardly fit cloud, outlines and cameras, to {float(means[index]):.2f} of 1. "
@@ -135,6 +135,16 @@ def resolve_normal_conventions(
         return prior.replace(frame="world", axes="opencv")
     normals = prior.normals * prior.normals.new_tensor(signs)
     return prior.replace(normals=normals, frame="camera", axes="opencv")
+
+
+def _better_change(prior: NormalPrior, samples: _Samples, scene: SparseScene, best: int) -> str:
+    """Return the change of channels or orientation with which maps fit far better, else ""."""
+    changes = [(_BGR, _scores(prior, samples, change=lambda normals, _: normals.flip(-1)))]
+    for name, tags in exif_errors(prior, scene):
+        # The network ran on the stored pixels, or only pixels were reoriented and vectors not.
+        changes += [(name, _scores(prior, samples, tags, reoriented_vectors))]
+        changes += [(name, _scores(prior, samples, tags))]
+    return better_change(_scores(prior, samples)[best], changes, _LEAST)
 
 
 def _announce(where: str, index: int, scores: Tensor, means: Tensor) -> None:

@@ -108,3 +108,21 @@ class Cameras(Record):
         """Camera centres."""
         rotation, translation = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
         return -(rotation.mT @ translation[..., None])[..., 0]
+
+    def retract(self, delta: Float[Tensor, "view 6"]) -> "Cameras":
+        """Move the cameras by steps in SE(3): a step of an optimizer keeps rotations exact.
+
+        Args:
+            delta: Of each camera in its own axes: translation of the world in scene units, then its
+                rotation as a vector in radians.
+
+        Returns:
+            Cameras with poses ``exp(delta) cam_from_world``; differentiable, also at zero.
+        """
+        x, y, z = delta[:, 3:].unbind(dim=1)
+        zero = torch.zeros_like(x)
+        skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
+        twist = torch.cat([skew, delta[:, :3, None]], dim=2)
+        twist = torch.cat([twist, torch.zeros_like(twist[:, :1])], dim=1)
+        motion = torch.linalg.matrix_exp(twist).to(self.cam_from_world)
+        return self.replace(cam_from_world=motion @ self.cam_from_world)

@@ -370,6 +370,52 @@ def test_normals_unrelated_to_the_scene_give_a_warning_or_error(rendered):
         settle(rendered.scene, of_normals(rendered.scene, normals, axes=None))
 
 
+@pytest.mark.parametrize("given", ["lub", "world", "mirrored", "exchanged", "random"])
+def test_normals_of_a_network_in_training_are_used_as_stated(rendered, given):
+    scene, camera = rendered.scene, rendered.camera
+    random = torch.randn(camera.shape, generator=torch.Generator().manual_seed(0))
+    written = {
+        "lub": -camera,
+        "world": rendered.world,
+        "mirrored": camera.flip(2),
+        "exchanged": camera.flip(-1),
+        "random": normalize(random, dim=-1),
+    }[given].requires_grad_()
+    with pytest.warns(PimperWarning, match="require gradients contradict the scene") as caught:
+        found = settle(scene, of_normals(scene, written, axes="opengl"))
+    assert len({str(one.message) for one in caught}) == 1
+    known = found.variance.isfinite()
+    assert_close(found.normals[known], (written * torch.tensor([1.0, -1.0, -1.0]))[known])
+
+
+def test_unstated_axes_of_a_network_in_training_are_refused(rendered):
+    random = torch.randn(rendered.camera.shape, generator=torch.Generator().manual_seed(0))
+    normals = normalize(random, dim=-1).requires_grad_()
+    with pytest.raises(InputError, match="State `axes`"):
+        settle(rendered.scene, of_normals(rendered.scene, normals, axes=None))
+
+
+@pytest.mark.parametrize("given", ["inverse", "constant", "mirrored"])
+def test_depth_of_a_network_in_training_is_used_as_stated(rendered, given):
+    scene, depth = rendered.scene, rendered.depth
+    written = (
+        {
+            "inverse": 1 / depth,
+            "constant": torch.full_like(depth, 2.0)
+            + torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)),
+            "mirrored": depth.flip(2),
+        }[given]
+        .nan_to_num(1.0, 1.0, 1.0)
+        .requires_grad_()
+    )
+    with pytest.warns(PimperWarning, match="require gradients contradict the scene"):
+        found = settle(scene, of_depth(scene, written, gauge="affine"))
+    found.depth.sum().backward()
+    assert written.grad.isfinite().all()
+    with pytest.raises(InputError):
+        settle(scene, of_depth(scene, written.detach(), gauge="affine"))
+
+
 def test_gradients_reach_the_given_maps(rendered):
     normals = (-rendered.camera).requires_grad_()
     found = settle(rendered.scene, of_normals(rendered.scene, normals, axes="lub"))
