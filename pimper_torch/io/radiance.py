@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from pimper_torch.io.decode import Decoded, decode
+from pimper_torch.io.extras import format_of
 from pimper_torch.io.header import Header
 from pimper_torch.io.responses import response_of
 from pimper_torch.radiometry import SATURATED, Curve, Encoding, Response, Srgb
@@ -72,7 +73,7 @@ def read_pictures(
     files = [Path(path) for path in paths]
     refuse_outlier(files, sizes_px, channels)
     images = zeros((len(files), channels, height, width))
-    opaque, tallies = _fill(images, files, sizes_px, encoding, {})
+    opaque, tallies = _fill(images, files, headers, sizes_px, encoding, {})
     whites = _saturation(tallies)
     if advice := _low_levels(tallies, whites):
         caution(f"{files[0].parent}: {advice}", stacklevel=3)
@@ -86,7 +87,7 @@ def read_pictures(
             stacklevel=3,
         )
     if whites:
-        opaque, _ = _fill(images, files, sizes_px, encoding, whites)
+        opaque, _ = _fill(images, files, headers, sizes_px, encoding, whites)
     return images, opaque
 
 
@@ -137,10 +138,19 @@ def resized_mask(
 
 
 def _fill(
-    images: Images, paths: Sequence[Path], sizes_px: Sizes, encoding: Encoding, whites: _Whites
+    images: Images,
+    paths: Sequence[Path],
+    headers: Sequence[Header],
+    sizes_px: Sizes,
+    encoding: Encoding,
+    whites: _Whites,
 ) -> tuple[tuple[Mask | None, ...], dict[_Kind, _Tally]]:
     """Write the radiance of each file to ``images``; count its levels unless whites are known."""
     given = None if encoding.response == "auto" else response_of(encoding)
+    sizes = zip(paths, headers, sizes_px, strict=True)
+    shrunk = (path for path, header, size in sizes if size != (header.width, header.height))
+    # Larger files than the run needs are decoded one at a time, except JPEG, see `decode`.
+    in_turn = map if any(format_of(path) != "JPEG" for path in shrunk) else side_by_side
 
     def read(index: int) -> tuple[Mask | None, _Kind, _Tally | None]:
         wide, high = sizes_px[index]
@@ -173,7 +183,7 @@ def _fill(
     with warnings.catch_warnings():
         # Decoders ignore warnings in threads that exchange their filters; this restores them.
         warnings.simplefilter("ignore")
-        for index, (mask, kind, tally) in enumerate(side_by_side(read, range(len(paths)))):
+        for index, (mask, kind, tally) in enumerate(in_turn(read, range(len(paths)))):
             opaque.append(None)
             if mask is not None:
                 if opaque_masks is None:

@@ -1,9 +1,12 @@
+import time
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 from torch.testing import assert_close
 
+from pimper_torch.io import radiance
 from pimper_torch.io.photographs import load_views
 from pimper_torch.io.radiance import resized, resized_radiance
 from pimper_torch.radiometry import LINEAR, SATURATED, Encoding
@@ -183,3 +186,29 @@ def test_files_of_different_depths_have_separate_saturation_levels(raw, pixels):
         images = load_views(folder, encoding=Encoding(response="linear")).images
     assert_close(images[3], torch.from_numpy(shallow / 255).movedim(-1, 0).float())
     assert_close(images[0].double(), (levels[0] / 15000).clamp(max=1), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("suffix", "at_once"), [("png", 1), ("jpg", 2)])
+def test_files_that_are_shrunk_after_decoding_are_in_memory_one_at_a_time(
+    tmp_path, monkeypatch, suffix, at_once
+):
+    pixels = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    for index in range(6):
+        Image.fromarray(pixels).save(tmp_path / f"{index}.{suffix}")
+    together, most = 0, 0
+
+    def decode(*given):
+        nonlocal together, most
+        together += 1
+        most = max(most, together)
+        time.sleep(0.02)
+        found = original(*given)
+        together -= 1
+        return found
+
+    original = radiance.decode
+    monkeypatch.setattr(radiance, "decode", decode)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    load_views(tmp_path, max_size_px=32)
+    assert most <= at_once
+    assert suffix == "png" or most == at_once
