@@ -90,6 +90,14 @@ class Step(Record):
         """Photographs used only to estimate cameras; ``None`` without any."""
         return self.prepared.held_out
 
+    def frozen(self) -> Prepared:
+        """Return what was prepared with the facets of this step, for steps of a training loop.
+
+        They skip the search for facets, which takes most of a step's time and is not
+        differentiable.
+        """
+        return self.prepared.replace(coarse=self.coarse.detach(), frozen=True)
+
     @property
     def photometric(self) -> PhotometricPatches:
         """Normals, albedo and lights of every patch."""

@@ -132,7 +132,8 @@ class CoarseToFine(Chain):
         self, run: ChainRun, prepared: Prepared, light: Illumination
     ) -> OrientedPoints | None:
         """Return points where photographs contradict the coarse surface; None if they do not."""
-        if prepared.mesh is not None or prepared.scene.views.poses is not None:
+        known = prepared.frozen or prepared.mesh is not None
+        if known or prepared.scene.views.poses is not None:
             return None
         contours, mesh = prepared.contours, prepared.coarse.mesh
         points = run(self.depth_from_light, prepared.scene, contours, mesh, light.field)

@@ -49,6 +49,8 @@ class Prepared(Record):
         contours: In one photograph per pose; in all of ``scene`` if it has no poses.
         coarse: The coarse surface.
         mesh: The given mesh in the scene's frame; ``None`` if none was given.
+        frozen: Whether ``coarse`` stays as it is; otherwise the first pass may improve it by depth
+            from light.
         held_out: Photographs used only to estimate cameras; ``None`` without any.
         decisions: What was decided about cameras, points, poses and held-out photographs,
             and why, as texts; without entries where there was nothing to decide.
@@ -62,6 +64,7 @@ class Prepared(Record):
     contours: Contours
     coarse: CoarseMesh
     mesh: Mesh | None = None
+    frozen: bool = False
     held_out: SparseScene | None = None
     decisions: dict[str, str] = field(default_factory=dict)
     reports: tuple[StageReport, ...] = ()

@@ -10,10 +10,7 @@ if TYPE_CHECKING:
     from pimper_torch.cli.doctor.photograph import Photograph
 
 DETAIL_PX = 1600
-"""Longer side to which a run shrinks larger photographs: the largest size with measured results.
-
-Files of cameras have twice as many pixels as their lenses and colour filters resolve.
-"""
+"""Longer side to which a run shrinks larger photographs (docs/decisions.md, "The working size")."""
 # Choices: sizes if memory is short, in steps, so that a little more of it changes nothing; and the
 # share of the free memory, as estimates are within a factor of 1.5.
 _SIZES_PX, _SHARE_OF_FREE = range(DETAIL_PX, 500, -100), 0.6
