@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 from scenes import trusted
 
+from pimper_torch.io.assets.gltf import MATTE, gltf_of
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.write import write_asset
 from pimper_torch.radiometry import srgb_from_linear
@@ -115,6 +116,14 @@ def shown(tmp_path_factory):
     parts["summary"] = quiet | {"simplified": None, "scale": {"unit": "mm"}}
     parts["summary"] |= {"diagnosis": "The cameras only rotated."}
     write_page(folder / "plain.html", **parts)
+    text = "Not usable: The cameras only rotated."
+    verdict = {"score": 0.0, "text": text}
+    parts["summary"] |= {"verdict": verdict, "warnings": [text, "Dark.", "Dark."]}
+    write_page(folder / "bad.html", **parts)
+    vertices, faces = mesh.vertices_world.numpy(), mesh.faces.flip(1).numpy()
+    inside_out = gltf_of({"POSITION": vertices, "NORMAL": vertices}, faces, MATTE)
+    parts |= {"asset": inside_out, "surface": mesh, "mesh": mesh}
+    write_page(folder / "inside_out.html", **parts)
     return folder / "report.html", mesh, scene, lights, materials
 
 

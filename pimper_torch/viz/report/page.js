@@ -198,6 +198,19 @@
   const REMOTE = 1e-3; // the surface's radius over the distance of a distant light
   // Coefficients of spherical harmonics for an irradiance of 1, and for 1 where the surface faces an axis.
   const [EVEN, ALONG] = [Math.PI / 0.886227, Math.PI / (2 * 0.511664)];
+  const HATCHING = `
+    if (!gl_FrontFacing) gl_FragColor.rgb = vec3(0.3);
+    if (!gl_FrontFacing || vSeen < 0.5)
+      gl_FragColor.rgb *= mix(0.4, 1.0, step(0.5, fract((gl_FragCoord.x + gl_FragCoord.y) / 9.0)));
+  `;
+  const SAMPLES = 240; // of a profile: about one per pixel of its curve
+  const TOOLS = { measure: "Click the first point on the surface.", profile: "Draw a line over the surface." };
+  const length = (distance) => `${digits(data.unit.factor * distance, 3)} ${data.unit.name}`;
+  const save = (suffix, blob) => {
+    const href = URL.createObjectURL(blob);
+    make("a", { download: `${data.title}.${suffix}`, href }).click();
+    setTimeout(() => URL.revokeObjectURL(href), 60000);
+  };
   const OPENGL = new THREE.Matrix4().makeScale(1, -1, -1); // from x right, y down, z forward
 
   class Surface {
@@ -220,7 +233,8 @@
       this.ambient = new THREE.AmbientLight();
       this.probe = new THREE.LightProbe(); // light from all sides that depends on the normal, unlike ambient light
       this.shade = { value: 1 }; // 1 if the surface occludes the sky
-      this.openSky(object.geometry);
+      this.addBytes("openness", 255);
+      this.addBytes("seen", 1);
       this.markers = new THREE.Group();
       this.lamps = new THREE.Group();
       this.markers.visible = this.lamps.visible = false;
@@ -243,22 +257,23 @@
       new ResizeObserver(() => this.resize()).observe(this.stage);
     }
 
-    // Visible fraction of the sky per vertex.
-    openSky(geometry) {
-      const open = Float32Array.from(atob(data.openness), (one) => one.charCodeAt(0) / 255);
-      geometry.setAttribute("openness", new THREE.Float32BufferAttribute(open, 1));
+    // Values per vertex: the visible fraction of the sky, and whether a photograph shows it.
+    addBytes(name, one) {
+      const values = Float32Array.from(atob(data[name]), (each) => each.charCodeAt(0) / one);
+      this.object.geometry.setAttribute(name, new THREE.Float32BufferAttribute(values, 1));
     }
 
-    // Attenuate light from all sides by the visible fraction of the sky.
-    shaded(material) {
+    // Hatch inner sides and what no photograph shows; attenuate light from all sides by `shade` and
+    // the visible fraction of the sky.
+    finish(material, shade) {
       material.onBeforeCompile = (shader) => {
-        shader.uniforms.shade = this.shade;
-        shader.vertexShader = "attribute float openness; varying float vOpenness;\n" + shader.vertexShader
-          .replace("#include <begin_vertex>", "#include <begin_vertex>\nvOpenness = openness;");
-        shader.fragmentShader = "uniform float shade; varying float vOpenness;\n" + shader.fragmentShader
-          .replace("#include <aomap_fragment>", "reflectedLight.indirectDiffuse *= mix(1.0, vOpenness, shade);");
+        shader.uniforms.shade = shade;
+        shader.vertexShader = "attribute float openness, seen; varying float vOpenness, vSeen;\n" + shader.vertexShader
+          .replace("#include <begin_vertex>", "#include <begin_vertex>\nvOpenness = openness; vSeen = seen;");
+        shader.fragmentShader = "uniform float shade; varying float vOpenness, vSeen;\n" + shader.fragmentShader
+          .replace("#include <aomap_fragment>", "reflectedLight.indirectDiffuse *= mix(1.0, vOpenness, shade);")
+          .replace(/}\s*$/, `${HATCHING}}`);
       };
-      return material;
     }
 
     makeLayers() {
@@ -269,8 +284,8 @@
       const grey = new THREE.MeshPhysicalMaterial({ color: 0xb8b8b8, roughness: 1, normalMap, side });
       grey.specularIntensity = 0;
       const layers = [
-        { title: "lit", material: this.shaded(material) },
-        { title: "shape", material: this.shaded(grey) },
+        { title: "lit", material },
+        { title: "shape", material: grey },
         { title: "albedo", material: new THREE.MeshBasicMaterial({ map, side }), unlit: true },
         { title: "normals", material: new THREE.MeshNormalMaterial({ normalMap, side }), unlit: true },
       ];
@@ -280,6 +295,7 @@
           material: new THREE.MeshBasicMaterial({ vertexColors: true, side }) });
       }
       layers.forEach((layer) => {
+        this.finish(layer.material, layer.unlit ? { value: 0 } : this.shade);
         layer.normalMap = layer.material.normalMap;
         layer.button = make("button", { type: "button", "aria-pressed": "false", text: layer.title,
           on: () => this.show(layer) });

@@ -18,7 +18,7 @@ from pimper_torch.io.assets.write import write_asset
 from pimper_torch.records import Mesh, Removal, Silhouettes, SparseScene, TexturedMesh
 from pimper_torch.runtime.ledger import closing_line
 from pimper_torch.stages.texturing.bake import halved
-from pimper_torch.viz.report.openness import openness
+from pimper_torch.viz.report.openness import openness, photographed
 from pimper_torch.viz.report.predictions import Prediction, view_entries
 from pimper_torch.viz.report.vertex_layers import VertexLayer, length_unit, surface_layers
 from pimper_torch.viz.turn import up_world
@@ -65,13 +65,14 @@ def write_page(
         layers: In addition to those of ``mesh``; the page skips those that the asset lacks.
     """
     unit = length_unit(mesh, (summary.get("scale") or {}).get("unit"))
-    shade = (255 * openness(surface)).round().to(torch.uint8).numpy().tobytes()
+    shade, seen = (255 * openness(surface)).round(), photographed(surface, scene.cameras)
     data = {
         "title": title,
         "reference": reference,
         "up": up_world(scene.cameras).tolist(),
         "unit": asdict(unit),
-        "openness": base64.b64encode(shade).decode("ascii"),
+        "openness": _bytes(shade),
+        "seen": _bytes(seen),
         "views": view_entries(scene, silhouettes, predictions, lights_world),
         "layers": [asdict(layer) for layer in (*surface_layers(mesh, unit), *layers)],
         "summary": {name: summary.get(name) for name in _SHOWN},
@@ -100,6 +101,10 @@ def asset_within(asset: TexturedMesh, path: Path, placement: Placement) -> bytes
         smaller, coarser = Path(folder) / path.name, halved(asset)
         write_asset(coarser, smaller, placement)
         return asset_within(coarser, smaller, placement)
+
+
+def _bytes(values: Tensor) -> str:
+    return base64.b64encode(values.to(torch.uint8).numpy().tobytes()).decode("ascii")
 
 
 def _read(name: str) -> str:
