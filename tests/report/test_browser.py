@@ -32,7 +32,9 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 LEFT_OUT = {"what": "points", "total": 90000, "reason": "without albedo", "names": []}
 VIEW = {"name": "a.png", "psnr_db": 31.0, "psnr_matte_db": None}
+GOOD = "Good: from 6 of 7 photographs."
 SUMMARY = {
+    "verdict": {"score": 0.7, "text": GOOD, "scores": {}},
     "diagnosis": None,
     "warnings": ["Lower `factorize.min_views`, or `--masks` and <b>bold</b>."],
     "seconds": 150.4,
@@ -113,7 +115,7 @@ def shown(tmp_path_factory):
     }
     write_page(folder / "report.html", **parts, lights_world=lights_world)
     quiet = {**SUMMARY, "left_out": [], "failures": [], "warnings": [], "relighting": None}
-    parts["summary"] = quiet | {"simplified": None, "scale": {"unit": "mm"}}
+    parts["summary"] = quiet | {"simplified": None, "scale": {"unit": "mm"}, "verdict": None}
     parts["summary"] |= {"diagnosis": "The cameras only rotated."}
     write_page(folder / "plain.html", **parts)
     text = "Not usable: The cameras only rotated."
@@ -509,6 +511,8 @@ def test_headline_and_tables_agree(opened):
         "6 of 7 photographs, 2,999 facets, 83,045 vertices in mesh.ply (560,140 before "
         "simplification), 150 s"
     )
+    assert opened.locator("details[open]").count() == 0
+    opened.locator("summary", has_text="Stages").click()
     assert opened.get_by_text("150 s up to this page, at most 900 MB, in warp").is_visible()
     assert cells(opened, "Stages")[1:] == [
         ["warp", "8.0", "", "500", "samples 12,345"],
@@ -523,7 +527,6 @@ def test_headline_and_tables_agree(opened):
         ["Pass 1"],
         ["fuse.albedo", "45,000", "90,000", "points", "without albedo"],
     ]
-    assert opened.locator("details[open]").count() == 0
     assert cells(opened, "Failed")[1:] == [["fuse", "patch 3, 5", "no light", "left"]]
     assert cells(opened, "Settings")[1:] == [["zeta", "0.5"], ["fuse"], ["terms", '["normals"]']]
     assert cells(opened, "Photographs predicted")[1:] == [
@@ -547,6 +550,21 @@ def test_sections_without_content_are_omitted(opened, shown):
     assert not opened.get_by_label("environment").is_visible()
     choose(opened, "expected error")
     assert opened.locator("#high").inner_text().endswith(" mm or more")
+
+
+def test_the_verdict_is_above_everything(opened):
+    words = opened.get_by_text(GOOD)
+    assert words.count() == 1
+    below = [opened.locator(one).bounding_box()["y"] for one in ("header", "#stage")]
+    assert words.bounding_box()["y"] + words.bounding_box()["height"] <= min(below)
+
+
+def test_each_sentence_is_said_once(opened, shown):
+    opening(opened, shown[0].with_name("bad.html"))
+    opened.asked[:] = opened.asked[:1]
+    assert opened.get_by_text("The cameras only rotated.").count() == 1
+    assert opened.locator("#verdict.doubtful").inner_text().startswith("Not usable: The cameras")
+    assert opened.locator("li").all_inner_texts() == ["Dark."]
 
 
 @pytest.fixture
@@ -584,6 +602,7 @@ def test_the_surface_stays_visible_on_a_phone(phone):
 
 
 def test_figures_of_a_stage_are_below_it_on_a_phone(phone):
+    phone.locator("summary", has_text="Stages").tap()
     row = phone.locator("tr", has_text="samples 12,345")
     name, figures = (row.locator(kind).bounding_box() for kind in ("td.name", "td.text"))
     assert figures["y"] >= name["y"] + name["height"]
@@ -599,5 +618,5 @@ def test_a_browser_without_webgl_still_shows_photographs_and_tables(browser, sho
     assert "cannot be drawn" in page.locator("#trouble").inner_text()
     page.locator("#thumbnails button").first.click()
     page.locator("#prediction img").wait_for(state="visible")
-    assert page.get_by_role("heading", name="Stages").is_visible()
+    assert page.get_by_text("Stages", exact=True).is_visible()
     plain.close()

@@ -143,8 +143,13 @@
   const faint = (text) => make("p", { class: "faint" }, ...prose(text));
   const some = (names) => names.slice(0, 8).join(", ") + (names.length > 8 ? ` and ${names.length - 8} more` : "");
 
-  const warnings = [...(summary.diagnosis ? [summary.diagnosis] : []), ...(summary.warnings || [])];
-  if (summary.verdict) section("Verdict", make("p", {}, ...prose(summary.verdict.text)));
+  const { score, text: verdict } = summary.verdict || { score: 1, text: "" };
+  find("verdict").append(...prose(verdict));
+  find("verdict").classList.toggle("doubtful", score < 0.5);
+  find("verdict").hidden = !verdict;
+  // Each sentence once: the verdict on a bad result is also a warning, and contains the diagnosis.
+  const warnings = [...new Set([summary.diagnosis || "", ...(summary.warnings || [])])]
+    .filter((text) => !verdict.includes(text));
   section("Warnings", warnings.length
     ? make("ul", {}, ...warnings.map((text) => make("li", {}, ...prose(text)))) : faint("None."));
 
@@ -168,7 +173,7 @@
     .filter(([, value]) => value !== null)
     .map(([key, value]) => `${key.replaceAll("_", " ")} ${Number.isInteger(value) ? thousands(value) : digits(value, 4)}`)
     .join(", ");
-  section("Stages",
+  folded("Stages",
     faint(`${summary.seconds.toFixed(0)} s up to this page, at most ${(summary.peak_memory_mb || 0).toFixed(0)} MB`
       + `${summary.peak_memory_stage ? `, in ${summary.peak_memory_stage}` : ""}`),
     table([["stage", "name"], ["seconds", "number"], ["", "bar"], ["peak MB", "number"], ["figures", "text"]],
