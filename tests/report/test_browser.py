@@ -332,6 +332,25 @@ def test_keys_and_buttons_step_through_photographs(opened, shown):
     assert opened.evaluate("document.activeElement.innerText") == names[1]
 
 
+def test_keys_step_through_photographs_after_a_slider_was_touched(opened, shown):
+    names, press = shown[2].views.names, opened.keyboard.press
+    opened.locator("#ambient").click()
+    press("ArrowRight")
+    assert pressed(opened) == [names[0]]
+    opened.locator("#opacity").click()
+    press("ArrowRight")
+    assert pressed(opened) == [names[1]]
+    opened.get_by_label("lights").check()  # a checkbox has no use for arrow keys
+    press("ArrowRight")
+    assert pressed(opened) == [names[2]]
+    for control in ("#ambient", "#lamp"):  # Escape returns the arrow keys
+        opened.locator(control).focus()
+        press("Escape")
+        assert pressed(opened) == []
+        press("ArrowRight")
+        assert pressed(opened) == [names[0]]
+
+
 def test_the_focus_ring_is_shown_only_for_keys(opened):
     outline = "getComputedStyle(document.getElementById('lamp')).outlineStyle"
     opened.locator("#lamp").click()
@@ -599,6 +618,11 @@ def test_the_surface_stays_visible_on_a_phone(phone):
     assert 0.3 * 844 < stage["height"] < 0.5 * 844
     assert row["y"] >= stage["y"] + stage["height"]  # visible together with it
     assert row["y"] + row["height"] <= 844
+
+
+def test_a_phone_is_not_told_of_arrow_keys(phone, opened):
+    assert "arrow keys" in opened.locator("body").inner_text()
+    assert "arrow keys" not in phone.locator("body").inner_text()
 
 
 def test_figures_of_a_stage_are_below_it_on_a_phone(phone):

@@ -76,7 +76,7 @@
       + `(root mean square). Higher is better; this is number ${rank} of ${all.length}.`;
   };
 
-  const HINT = find("hint").textContent;
+  const HINT = [...find("hint").childNodes];
   let selected = -1;
   const select = (index) => {
     selected = selected === index ? -1 : index;
@@ -84,7 +84,7 @@
     const view = data.views[selected];
     find("compared").hidden = !view;
     document.body.classList.toggle("chosen", Boolean(view));
-    find("hint").textContent = view ? thumbnails[selected].title : HINT;
+    find("hint").replaceChildren(...(view ? [thumbnails[selected].title] : HINT));
     if (view) {
       find("photo").replaceChildren(picture(view.photo, view, true));
       find("predicted").hidden = find("different").hidden = !view.prediction;
@@ -112,12 +112,19 @@
   find("previous").addEventListener("click", () => step(-1));
   find("next").addEventListener("click", () => step(1));
   document.addEventListener("keydown", (event) => {
-    if (event.altKey || event.ctrlKey || event.metaKey || event.target.closest("input, #lamp, .scroll")) return;
+    if (event.altKey || event.ctrlKey || event.metaKey) return;
     const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    if (by) event.preventDefault();
-    if (by) step(by);
-    else if (event.key === "Escape" && selected >= 0) select(selected);
+    if (by && !event.target.closest("input[type=range], #lamp, .scroll")) {
+      event.preventDefault();
+      step(by);
+    } else if (event.key === "Escape") {
+      document.activeElement.blur(); // of a slider, which uses arrow keys itself
+      if (selected >= 0) select(selected);
+    }
   });
+  for (const slider of document.querySelectorAll("input[type=range]")) {
+    slider.addEventListener("pointerup", () => slider.blur()); // else it would keep the arrow keys
+  }
 
   // ---- Tables ------------------------------------------------------------------------------
 
