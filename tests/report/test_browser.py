@@ -5,6 +5,7 @@ import re
 import shutil
 import time
 from io import BytesIO
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -430,6 +431,79 @@ def test_the_lamp_of_the_shape_is_the_same_for_every_photograph(opened):
             places.append((bulb.get_attribute("cx"), bulb.get_attribute("cy")))
     assert places[0] == places[1]
     assert places[2] != places[3]
+
+
+def bulb(page):
+    """Return the place of the lamp in its disc, y upwards."""
+    canvas(page)
+    point = page.locator("#lamp .bulb")
+    return np.array([float(point.get_attribute("cx")), -float(point.get_attribute("cy"))])
+
+
+def test_the_shape_opens_under_raking_light(opened):
+    lit = bulb(opened)
+    choose(opened, "shape")
+    assert 0.9 < np.linalg.norm(bulb(opened)) < 1
+    opened.locator("#lamp").click()
+    assert np.linalg.norm(bulb(opened)) < 0.1
+    choose(opened, "lit")
+    np.testing.assert_array_equal(bulb(opened), lit)
+
+
+def test_the_lamp_orbits_until_it_is_moved(opened):
+    choose(opened, "shape")
+    button = opened.get_by_role("button", name="lamp orbits")
+    places = [bulb(opened)]
+    button.click()
+    for _ in range(2):
+        opened.wait_for_timeout(800)
+        places.append(bulb(opened))
+    radii = [np.linalg.norm(place) for place in places]
+    np.testing.assert_allclose(radii, radii[0], atol=1e-6)
+    turns = [np.cross(first, second) for first, second in pairwise(places)]
+    assert max(turns) < -0.05  # clockwise
+    opened.locator("#lamp").click()
+    assert button.get_attribute("aria-pressed") == "false"
+    still = bulb(opened)
+    opened.wait_for_timeout(300)
+    np.testing.assert_array_equal(bulb(opened), still)
+    choose(opened, "normals")
+    assert not button.is_visible()
+
+
+def hatched(page, shown, path):
+    """Return the pixels of view 1's albedo on a page, over those of the page of the ball."""
+    found = []
+    for place in (shown[0], path):
+        opening(page, place)
+        choose(page, "albedo")
+        behind(page, 1)
+        drawn, side = canvas(page), page.locator("#stage").bounding_box()
+        width, height = int(side["width"]), int(side["height"])
+        middle = drawn[height // 2 - 40 : height // 2 + 40, width // 2 - 40 : width // 2 + 40]
+        found.append(linear(middle).reshape(-1, 3))
+    page.asked[:] = page.asked[:1]
+    return found
+
+
+def test_what_no_photograph_shows_is_hatched(opened, shown, tmp_path):
+    page = shown[0].read_text(encoding="utf-8")
+    seen = re.search(r'"seen": "([^"]*)"', page)[1]
+    none = base64.b64encode(bytes(len(base64.b64decode(seen)))).decode()
+    (tmp_path / "unseen.html").write_text(page.replace(seen, none), encoding="utf-8")
+    plain, drawn = hatched(opened, shown, tmp_path / "unseen.html")
+    unchanged = np.abs(drawn - plain).max(axis=1) < 0.01
+    assert 0.4 < unchanged.mean() < 0.6
+    assert (drawn[~unchanged] < 0.7 * plain[~unchanged] + 0.01).mean() > 0.9
+
+
+def test_the_inside_is_hatched_in_grey(opened, shown):
+    _, drawn = hatched(opened, shown, shown[0].with_name("inside_out.html"))
+    assert np.abs(drawn - drawn.mean(axis=1, keepdims=True)).max() < 0.01
+    levels, counts = np.unique((255 * drawn[:, 0]).round(), return_counts=True)
+    two = np.sort(counts)[-2:].sum()
+    assert two > 0.75 * len(drawn)  # the others are at the stripes' borders
+    assert len(levels) > 1
 
 
 def test_the_environment_is_the_first_order_light_of_the_photograph(opened, shown):

@@ -207,6 +207,7 @@
   const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"];
   const [NEAR, FAR, FOV_DEG] = [0.01, 100, 30]; // planes in units of the scene's radius
   const MARKED = 2.7; // maximum distance of drawn cameras, in radii: the surface then has a third of the image
+  const ORBIT_MS = 8000; // of one turn of the lamp
   const REMOTE = 1e-3; // the surface's radius over the distance of a distant light
   // Coefficients of spherical harmonics for an irradiance of 1, and for 1 where the surface faces an axis.
   const [EVEN, ALONG] = [Math.PI / 0.886227, Math.PI / (2 * 0.511664)];
@@ -252,6 +253,8 @@
       this.markers.visible = this.lamps.visible = false;
       this.world.add(object, this.light, this.ambient, this.probe, this.markers, this.lamps);
       this.lamp = { view: new THREE.Vector3(-0.45, 0.55, 0.7).normalize(), fitted: null };
+      this.raking = new THREE.Vector3(-0.8, 0.5, 0.3).normalize(); // the lamp of `shape`
+      this.orbiting = false;
       this.behind = null; // the photograph whose viewpoint is used
       this.layers = this.makeLayers();
       this.makeMarkers();
@@ -337,7 +340,9 @@
     }
 
     showLamp() {
-      find("lamp").style.display = this.shown.unlit || !find("lit").checked ? "none" : "";
+      const shown = !this.shown.unlit && find("lit").checked;
+      find("lamp").style.display = find("orbit").style.display = shown ? "" : "none";
+      this.orbit(false);
     }
 
     paint(layer) {
@@ -435,6 +440,7 @@
       find("detail").addEventListener("change", () => this.show(this.shown));
       find("ambient").addEventListener("input", () => { this.lamp.fitted = null; this.draw(); });
       find("lit").addEventListener("change", () => { this.showLamp(); this.draw(); });
+      find("orbit").addEventListener("click", () => this.orbit(!this.orbiting));
       const environment = find("environment");
       environment.parentElement.hidden = !data.views.some((view) => view.environment);
       environment.addEventListener("change", () => {
@@ -452,6 +458,7 @@
       const lamp = find("lamp");
       const point = (event) => {
         const box = lamp.getBoundingClientRect();
+        this.orbit(false);
         this.aim((2.3 * (event.clientX - box.left)) / box.width - 1.15,
           1.15 - (2.3 * (event.clientY - box.top)) / box.height);
       };
@@ -461,6 +468,7 @@
         const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
         if (!step) return;
         event.preventDefault();
+        this.orbit(false);
         const { x, y } = this.direction();
         this.aim(x + step[0], y + step[1]);
       });
@@ -479,17 +487,37 @@
       const length = Math.hypot(x, y);
       const shrink = Math.min(1, 0.999 / (length || 1));
       [x, y] = [x * shrink, y * shrink];
-      this.lamp = { view: new THREE.Vector3(x, y, Math.sqrt(1 - x * x - y * y)), fitted: null };
+      const towards = new THREE.Vector3(x, y, Math.sqrt(1 - x * x - y * y));
+      if (this.plain) this.raking = towards;
+      else this.lamp = { view: towards, fitted: null };
       this.draw();
     }
 
-    // `shape` has the same light for all photographs: a lamp behind the camera would flatten it.
+    // Let the lamp circle clockwise, at its distance from the middle of the disc; or stop it.
+    orbit(wanted) {
+      find("orbit").setAttribute("aria-pressed", String(wanted));
+      if (this.orbiting === wanted) return;
+      this.orbiting = wanted;
+      let { x, y } = this.direction();
+      if (Math.hypot(x, y) < 0.3) [x, y] = [0, 0.9]; // a circle that changes little
+      const [away, start] = [Math.hypot(x, y), Math.atan2(y, x)];
+      let began = null;
+      const turn = (now) => {
+        if (!this.orbiting) return;
+        const angle = start - (2 * Math.PI * (now - (began ??= now))) / ORBIT_MS;
+        this.aim(away * Math.cos(angle), away * Math.sin(angle));
+        requestAnimationFrame(turn);
+      };
+      if (wanted) requestAnimationFrame(turn);
+    }
+
+    // `shape` has a light of its own for all photographs: a lamp behind the camera would flatten it.
     get plain() { return this.shown.title === "shape"; }
 
     get fitted() { return this.plain ? null : this.lamp.fitted; }
 
     direction() {
-      if (!this.fitted) return this.lamp.view;
+      if (!this.fitted) return this.plain ? this.raking : this.lamp.view;
       return vector(this.fitted.direction).transformDirection(this.camera.matrixWorldInverse);
     }
 
@@ -527,6 +555,7 @@
         return this.leave(true);
       }
       this.behind = view;
+      if (!this.plain) this.orbit(false); // the lamp goes to the photograph's light
       find("fade").hidden = false;
       this.camera.matrixWorld.multiplyMatrices(view.worldFromCamera, OPENGL);
       this.camera.matrixWorld.decompose(this.camera.position, this.camera.quaternion, this.camera.scale);
