@@ -16,6 +16,7 @@ from scenes import trusted
 from pimper_torch.io.assets.gltf import MATTE, gltf_of
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.write import write_asset
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.radiometry.base_color import base_color
 from pimper_torch.records import Materials, Relighting, ViewErrors
@@ -526,26 +527,36 @@ def test_the_environment_is_the_first_order_light_of_the_photograph(opened, show
     assert (canvas(opened) - before).mean() > 2
 
 
+def on_stage(page, x, y):
+    """Return the place in the window of a pixel of the selected photograph."""
+    stage = page.locator("#canvas").bounding_box()
+    side = min(stage["width"], stage["height"])
+    left = stage["x"] + (stage["width"] - side) / 2
+    top = stage["y"] + (stage["height"] - side) / 2
+    return left + x * side / SIDE, top + y * side / SIDE
+
+
+def on_ball(scene, x, y):
+    """Return the point of the ball at a pixel of view 0."""
+    pose = scene.cameras.cam_from_world[0].double()
+    camera = scene.cameras.intrinsics[0].double()
+    ray = pose[:3, :3].mT @ torch.linalg.inv(camera) @ torch.tensor([x, y, 1.0]).double()
+    ray, eye = ray / ray.norm(), scene.cameras.centers_world[0].double()
+    along = -ray @ eye
+    return eye + (along - (along**2 - eye @ eye + 1).sqrt()) * ray
+
+
 def test_two_clicks_measure_a_distance(opened, shown):
     scene = shown[2]
     behind(opened, 0)
     choose(opened, "measure")
     measured = opened.locator("#measured")
     assert measured.inner_text() == "Click the first point on the surface."
-    stage = opened.locator("#canvas").bounding_box()
-    side = min(stage["width"], stage["height"])
 
     def click(x, y):
         """Click a pixel of the photograph; return the point of the ball."""
-        left = stage["x"] + (stage["width"] - side) / 2
-        top = stage["y"] + (stage["height"] - side) / 2
-        opened.mouse.click(left + x * side / SIDE, top + y * side / SIDE)
-        pose = scene.cameras.cam_from_world[0].double()
-        camera = scene.cameras.intrinsics[0].double()
-        ray = pose[:3, :3].mT @ torch.linalg.inv(camera) @ torch.tensor([x, y, 1.0]).double()
-        ray, eye = ray / ray.norm(), scene.cameras.centers_world[0].double()
-        along = -ray @ eye
-        return eye + (along - (along**2 - eye @ eye + 1).sqrt()) * ray
+        opened.mouse.click(*on_stage(opened, x, y))
+        return on_ball(scene, x, y)
 
     click(2.0, 2.0)  # beside the ball
     assert measured.inner_text() == "Click the first point on the surface."
@@ -561,6 +572,79 @@ def test_two_clicks_measure_a_distance(opened, shown):
     assert measured.inner_text() == "Click the second point on the surface."
     choose(opened, "measure")
     assert not measured.is_visible()
+
+
+def draw_line(page, start, end):
+    page.mouse.move(*on_stage(page, *start))
+    page.mouse.down()
+    page.mouse.move(*on_stage(page, *end), steps=3)
+    page.mouse.up()
+
+
+def test_a_drawn_line_gives_the_profile_of_the_surface(opened, shown):
+    """The section through the middle of a ball is a circle."""
+    scene = shown[2]
+    behind(opened, 0)
+    choose(opened, "measure")
+    choose(opened, "profile")  # replaces it
+    measured, graph = opened.locator("#measured"), opened.locator("#graph")
+    assert measured.inner_text() == "Draw a line over the surface."
+    assert opened.locator("#measure").get_attribute("aria-pressed") == "false"
+    assert not graph.is_visible()
+    draw_line(opened, (28.0, 30.0), (52.0, 50.0))  # through the middle
+    assert pressed(opened) == [scene.views.names[0]]  # the view does not turn
+    chord = float((on_ball(scene, 28.0, 30.0) - on_ball(scene, 52.0, 50.0)).norm())
+    height, scaled = 1 - (1 - chord**2 / 4) ** 0.5, 100 / (2 * 3**0.5)
+    value, _, words = measured.inner_text().partition(" ")
+    assert float(value) == pytest.approx(scaled * chord, rel=0.02)
+    assert words == "% of the object's size from end to end"
+    high, low, left, right = (float(one) for one in graph.locator("text").all_text_contents())
+    assert (high, low) == (pytest.approx(scaled * height, rel=0.05), pytest.approx(0, abs=0.01))
+    assert (left, right) == (pytest.approx(0, abs=1e-6), pytest.approx(scaled * chord, rel=0.02))
+    path = graph.locator(".curve").get_attribute("d")
+    points = np.array(re.findall(r"[ML]([\d.e-]+) ([\d.e-]+)", path)).astype(float)
+    assert path.count("M") == 1
+    across = chord * ((points[:, 0] - 52) / 224 - 0.5)
+    circle = (1 - across**2) ** 0.5 - (1 - chord**2 / 4) ** 0.5
+    assert np.abs((98 - points[:, 1]) / 90 * height - circle).max() < 0.02 * height
+    draw_line(opened, (2.0, 2.0), (10.0, 2.0))
+    assert measured.inner_text() == "The line misses the surface."
+    assert not graph.is_visible()
+    choose(opened, "profile")
+    assert not measured.is_visible()
+
+
+def test_the_view_is_saved_as_a_picture(opened, tmp_path):
+    behind(opened, 0)
+    choose(opened, "albedo")
+    drawn = canvas(opened)
+    with opened.expect_download() as download:
+        choose(opened, "save picture")
+    assert download.value.suggested_filename == "ball.png"
+    download.value.save_as(tmp_path / "ball.png")
+    saved = np.asarray(Image.open(tmp_path / "ball.png").convert("RGBA")).astype(float)
+    assert saved.shape[:2] == drawn.shape[:2]
+    opaque = saved[..., 3] == 255
+    assert 0.05 < opaque.mean() < 0.6
+    assert np.abs(saved[..., :3] - drawn)[opaque].mean() < 1
+    assert saved[0, 0, 3] == 0
+
+
+def test_the_surface_is_saved_in_the_frame_of_the_mesh(opened, shown, tmp_path):
+    with opened.expect_download() as download:
+        choose(opened, "save mesh")
+    assert download.value.suggested_filename == "ball.ply"
+    download.value.save_as(tmp_path / "ball.ply")
+    saved, own = read_mesh(tmp_path / "ball.ply"), shown[1]
+    assert len(saved.vertices_world) == len(own.vertices_world)  # without the texture's cuts
+    assert len(saved.faces) == len(own.faces)
+    assert set(map(tuple, saved.vertices_world.mul(1e4).round().int().tolist())) == set(
+        map(tuple, own.vertices_world.mul(1e4).round().int().tolist())
+    )
+    a, b, c = saved.vertices_world[saved.faces].unbind(dim=1)
+    assert (torch.linalg.cross(b - a, c - a) * a).sum(dim=1).min() > 0
+    assert saved.normals_world is not None
+    assert (saved.normals_world - saved.vertices_world).abs().max() < 0.05
 
 
 def ball_pixels(picture):

@@ -258,8 +258,8 @@
       this.behind = null; // the photograph whose viewpoint is used
       this.layers = this.makeLayers();
       this.makeMarkers();
-      this.makeRuler();
       this.controls = new THREE.OrbitControls(this.camera, this.canvas);
+      this.makeRuler();
       let held = false; // a click without dragging keeps the photograph's viewpoint
       this.controls.addEventListener("start", () => { held = true; });
       this.controls.addEventListener("end", () => { held = false; });
@@ -391,9 +391,8 @@
       this.lamps.add(this.ray);
     }
 
-    // Two points of the surface and the line between them, drawn over it.
+    // Points of the surface and lines between them, drawn over it: of `measure` and `profile`.
     makeRuler() {
-      this.ends = [];
       const look = { color: 0xffd24a, depthTest: false, transparent: true };
       const geometry = new THREE.BufferGeometry();
       this.ruler = new THREE.Group();
@@ -401,33 +400,94 @@
         new THREE.Points(geometry, new THREE.PointsMaterial({ ...look, size: 9, sizeAttenuation: false })));
       for (const one of this.ruler.children) one.frustumCulled = false;
       this.world.add(this.ruler);
-      find("measure").addEventListener("click", () => this.mark(null));
-      this.measuring = false;
+      for (const tool of Object.keys(TOOLS)) find(tool).addEventListener("click", () => this.use(tool));
+      this.use(null);
     }
 
-    // Add an end point; without one, start or stop measuring.
-    mark(place) {
-      const stopped = place === null && this.measuring;
-      this.measuring = !stopped;
-      this.ends = place === null ? [] : [...this.ends.slice(0, this.ends.length % 2), place];
-      this.ruler.visible = this.ends.length > 0;
-      if (this.ruler.visible) this.ruler.children[0].geometry.setFromPoints([this.ends[0], this.ends.at(-1)]);
-      const { factor, name } = data.unit;
-      find("measured").textContent = this.ends.length < 2
-        ? `Click the ${this.ends.length ? "second" : "first"} point on the surface.`
-        : `${digits(factor * this.ends[0].distanceTo(this.ends[1]), 3)} ${name}`;
-      find("measured").hidden = stopped;
-      find("measure").setAttribute("aria-pressed", String(!stopped));
+    // Start a tool; the one in use is stopped.
+    use(tool) {
+      this.tool = this.tool === tool ? null : tool;
+      for (const name of Object.keys(TOOLS)) find(name).setAttribute("aria-pressed", String(this.tool === name));
+      find("measured").hidden = !this.tool;
+      this.controls.enableRotate = this.tool !== "profile"; // a line is drawn instead
+      this.ends = [];
+      this.report(TOOLS[this.tool] || "", []);
+    }
+
+    // Show a text, the curve of a profile, and lines over the surface.
+    report(text, line, curve = null) {
+      find("measured").textContent = text;
+      find("graph").toggleAttribute("hidden", !curve);
+      if (curve) this.plot(curve);
+      this.ruler.visible = line.length > 0;
+      this.ruler.children[1].visible = !curve;
+      this.ruler.children.forEach((one) => one.geometry.dispose());
+      const geometry = new THREE.BufferGeometry().setFromPoints(line);
+      for (const one of this.ruler.children) one.geometry = geometry;
       this.draw();
     }
 
-    // The point of the surface under the pointer.
-    under(event) {
+    // Add an end point of the distance.
+    mark(place) {
+      this.ends = [...this.ends.slice(0, this.ends.length % 2), place];
+      const [first, last] = [this.ends[0], this.ends.at(-1)];
+      this.report(this.ends.length < 2 ? "Click the second point on the surface."
+        : length(first.distanceTo(last)), [first, last]);
+    }
+
+    // The ray through a point of the window.
+    caster(x, y) {
       const box = this.canvas.getBoundingClientRect();
       const caster = new THREE.Raycaster();
-      caster.setFromCamera(new THREE.Vector2(2 * (event.clientX - box.left) / box.width - 1,
-        1 - 2 * (event.clientY - box.top) / box.height), this.camera);
-      return caster.intersectObject(this.object)[0]?.point;
+      caster.setFromCamera(new THREE.Vector2(2 * (x - box.left) / box.width - 1,
+        1 - 2 * (y - box.top) / box.height), this.camera);
+      return caster;
+    }
+
+    // The facets that a plane cuts, as a surface.
+    cut(normal, origin) {
+      const { index, attributes: { position } } = this.object.geometry, place = new THREE.Vector3();
+      const sides = Array.from({ length: position.count },
+        (_, at) => place.fromBufferAttribute(position, at).sub(origin).dot(normal) > 0);
+      const corners = [];
+      for (let at = 0; at < index.count; at += 3) {
+        const [a, b, c] = [index.getX(at), index.getX(at + 1), index.getX(at + 2)];
+        if (sides[a] !== sides[b] || sides[a] !== sides[c]) corners.push(a, b, c);
+      }
+      const geometry = new THREE.BufferGeometry().setAttribute("position", position).setIndex(corners);
+      geometry.boundingSphere = this.object.geometry.boundingSphere;
+      return new THREE.Mesh(geometry, this.object.material);
+    }
+
+    // Section of the surface under a line of the window: height over the line between the ends.
+    profile([x0, y0], [x1, y1]) {
+      const eye = this.camera.position;
+      const [first, last] = [this.caster(x0, y0), this.caster(x1, y1)].map((one) => one.ray.direction);
+      const normal = first.clone().cross(last).normalize();
+      const facets = this.cut(normal, eye);
+      const hits = Array.from({ length: SAMPLES }, (_, at) => {
+        const share = at / (SAMPLES - 1);
+        return this.caster(x0 + share * (x1 - x0), y0 + share * (y1 - y0)).intersectObject(facets)[0]?.point;
+      });
+      const found = hits.filter(Boolean), start = found[0];
+      if (found.length < 2) return this.report("The line misses the surface.", []);
+      const along = found.at(-1).clone().sub(start).normalize(), up = along.clone().cross(normal);
+      if (up.dot(eye.clone().sub(start)) < 0) up.negate();
+      const { factor } = data.unit;
+      const curve = hits.map((hit) => hit && [along, up].map((axis) => factor * hit.clone().sub(start).dot(axis)));
+      const line = hits.flatMap((hit, at) => hit && hits[at + 1] ? [hit, hits[at + 1]] : []);
+      return this.report(`${length(start.distanceTo(found.at(-1)))} from end to end`, line, curve);
+    }
+
+    // Draw heights; gaps remain where the line misses the surface.
+    plot(curve) {
+      const found = curve.filter(Boolean), [xs, ys] = [0, 1].map((at) => found.map((one) => one[at]));
+      const [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+      find("graph").querySelector(".curve").setAttribute("d", curve.map((one, at) => one
+        && `${curve[at - 1] ? "L" : "M"}${52 + 224 * (one[0] - left) / (right - left || 1)} `
+          + `${98 - 90 * (one[1] - low) / (high - low || 1)}`).join(""));
+      const texts = [high, low, left, right].map((one) => digits(Math.abs(one) < 1e-6 * right ? 0 : one, 3));
+      find("graph").querySelectorAll("text").forEach((one, at) => { one.textContent = texts[at]; });
     }
 
     listen() {
@@ -472,14 +532,53 @@
         const { x, y } = this.direction();
         this.aim(x + step[0], y + step[1]);
       });
-      let down = null;
-      this.canvas.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
-      this.canvas.addEventListener("pointerup", (event) => {
-        if (!down || Math.hypot(event.clientX - down[0], event.clientY - down[1]) >= 5) return;
-        const place = this.measuring && this.under(event);
-        if (place) this.mark(place);
-        else if (!this.measuring) this.pick(event);
+      let down = null; // where the primary pointer was pressed
+      this.canvas.addEventListener("pointerdown", (event) => {
+        down = event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;
       });
+      this.canvas.addEventListener("pointermove", (event) => {
+        if (down && event.buttons && this.tool === "profile") this.profile(down, [event.clientX, event.clientY]);
+      });
+      this.canvas.addEventListener("pointerup", (event) => {
+        const still = down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 5;
+        down = null;
+        if (!still) return;
+        const place = this.tool === "measure" && this.caster(event.clientX, event.clientY).intersectObject(this.object)[0];
+        if (place) this.mark(place.point);
+        else if (!this.tool) this.pick(event);
+      });
+      find("save-picture").addEventListener("click", () => {
+        this.drawNow(); // the canvas is empty after a frame
+        this.canvas.toBlob((blob) => save("png", blob));
+      });
+      find("save-mesh").addEventListener("click", () => save("ply", new Blob(this.ply())));
+    }
+
+    // The surface as binary PLY in the frame of mesh.ply, without the cuts of its texture.
+    ply() {
+      const { index, attributes: { position, normal } } = this.object.geometry;
+      const { offset_world: offset = [0, 0, 0] } = this.object.userData;
+      const numbers = new Map(), kept = [];
+      const welded = Array.from({ length: position.count }, (_, at) => {
+        const key = [position.getX(at), position.getY(at), position.getZ(at)].join();
+        if (!numbers.has(key)) numbers.set(key, kept.push(at) - 1);
+        return numbers.get(key);
+      });
+      const header = ["ply", "format binary_little_endian 1.0", `element vertex ${kept.length}`,
+        ...["x", "y", "z"].map((one) => `property double ${one}`),
+        ...["nx", "ny", "nz"].map((one) => `property float ${one}`),
+        `element face ${index.count / 3}`, "property list uchar int vertex_indices", "end_header", ""];
+      const vertices = new DataView(new ArrayBuffer(36 * kept.length));
+      kept.forEach((at, row) => ["getX", "getY", "getZ"].forEach((get, axis) => {
+        vertices.setFloat64(36 * row + 8 * axis, position[get](at) + offset[axis], true);
+        vertices.setFloat32(36 * row + 24 + 4 * axis, normal[get](at), true);
+      }));
+      const faces = new DataView(new ArrayBuffer((13 * index.count) / 3));
+      for (let face = 0; face < index.count / 3; face++) {
+        faces.setUint8(13 * face, 3);
+        for (let at = 0; at < 3; at++) faces.setInt32(13 * face + 1 + 4 * at, welded[index.getX(3 * face + at)], true);
+      }
+      return [header.join("\n"), vertices, faces];
     }
 
     // Set the light to a point of the hemisphere on the viewer's side.
