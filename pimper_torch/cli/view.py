@@ -42,8 +42,8 @@ def run(job: _Job, output: Output) -> None:
 
     # Ctrl-C is the regular end.
     with Viewer(job.host, job.port) as viewer, suppress(KeyboardInterrupt):
-        print_address(viewer, output, job.port)
         add_folder(viewer, job.out, job.photos)
+        print_address(viewer, output, job.port)
         viewer.wait()
 
 

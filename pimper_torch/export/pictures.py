@@ -9,8 +9,9 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from pimper_torch.chains.running import ChainRun
+from pimper_torch.geometry.visibility import visible_vertices
 from pimper_torch.records import FinishedMesh, Reconstruction, Record, Relighting, TexturedMesh
-from pimper_torch.records.shapes import PerVertex
+from pimper_torch.records.shapes import PerVertex, VertexMask
 from pimper_torch.runtime.progress import part
 from pimper_torch.scale.marker_scale import Marker, find_markers
 from pimper_torch.stages.sfm.sparse_scene import point_colors
@@ -30,6 +31,7 @@ class Pictures(Record):
         overview: Bytes of ``overview.png``.
         turn: Bytes of ``turn.webp``.
         openness: Of the asset's vertices.
+        seen: Whether a photograph shows each of them.
         views: JSON of :func:`~pimper_torch.viz.report.predictions.view_images`.
         points: Colours of the sparse cloud.
         markers: Printed ones in the photographs.
@@ -38,6 +40,7 @@ class Pictures(Record):
     overview: UInt8[Tensor, " overview"]
     turn: UInt8[Tensor, " turn"]
     openness: PerVertex
+    seen: VertexMask
     views: str
     points: UInt8[Tensor, "point 3"]
     markers: tuple[Marker, ...]
@@ -63,6 +66,7 @@ class Draw(Stage):
                 overview=overview,
                 turn=turn,
                 openness=openness(asset.mesh),
+                seen=visible_vertices(asset.mesh, result.cameras).any(dim=0),
                 views=json.dumps(view_images(result.scene, result.silhouettes, predicted)),
                 points=point_colors(result.scene),
                 markers=tuple(find_markers(result.scene)),

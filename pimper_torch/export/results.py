@@ -175,6 +175,7 @@ def _write_page(
         mesh=result.mesh,
         asset=asset_within(completed(result)[1], folder / "asset.glb", placement),
         openness=pictures.openness,
+        seen=pictures.seen,
         scene=result.scene,
         silhouettes=result.silhouettes,
         reference=result.coarse.reference,

@@ -15,10 +15,12 @@ from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import normalize
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from pimper_torch.geometry.pixels import pixel_centers
-from pimper_torch.geometry.projection import rays_through
+from pimper_torch.geometry.projection import project, rays_through
+from pimper_torch.geometry.surfaces import carried_normals
 from pimper_torch.records import Cameras, Mesh, Record
 from pimper_torch.records.shapes import Faces, Scalars, Vectors, Vertices
 from pimper_torch.runtime.memory import emptied_on_release
@@ -197,6 +199,34 @@ def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:
     rays = rays_through(pixels.reshape(-1, 2), pose, intrinsics).reshape(height, width, 3)
     caster = ray_caster(mesh) if isinstance(mesh, Mesh) else mesh
     return caster.cast(cameras.centers_world[view], rays)
+
+
+# Distance of occluding surface from a vertex, over the mesh's diagonal, that is not its own.
+_OWN = 0.005
+
+
+@torch.no_grad()
+def visible_vertices(
+    mesh: Mesh, cameras: Cameras, min_cosine: float = 0.0
+) -> Bool[Tensor, "view vertex"]:
+    """Return which vertices each camera sees: in its image, facing it and not occluded.
+
+    A discrete choice, for example constant over the steps of a training loop.
+
+    Args:
+        min_cosine: Least cosine between the normal and the direction to the camera.
+    """
+    points, caster = mesh.vertices_world, ray_caster(mesh)
+    normals = normalize(carried_normals(mesh), dim=-1)
+    size = (points.amax(dim=0) - points.amin(dim=0)).norm()
+    rows = []
+    for view, center in enumerate(cameras.centers_world.to(points)):
+        camera = cameras.cam_from_world[view], cameras.intrinsics[view]
+        pixels, depth = project(points, *(matrix.to(points) for matrix in camera))
+        seen = (normalize(center - points, dim=1) * normals).sum(dim=1) > min_cosine
+        seen &= ((pixels > 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
+        rows.append(seen & ~caster.occluded(points, center, float(_OWN * size)))
+    return torch.stack(rows)
 
 
 def _reaches(reach: Lengths, shape: torch.Size) -> Rows:

@@ -4,7 +4,7 @@ from pimper_torch.losses.normals import NormalLoss
 from pimper_torch.losses.photometric import PhotometricLoss
 from pimper_torch.losses.point_to_surface import PointToSurfaceLoss
 from pimper_torch.losses.silhouette import SilhouetteLoss
-from pimper_torch.losses.visible import visible_vertices
+from pimper_torch.losses.visible import well_visible
 
 __all__ = ["NormalLoss", "PhotometricLoss", "PointToSurfaceLoss", "SilhouetteLoss"]
-__all__ += ["visible_vertices"]
+__all__ += ["well_visible"]

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from pimper_torch.losses.visible import Visible, in_view, interpolated_at, visible_vertices
+from pimper_torch.losses.visible import Visible, in_view, interpolated_at, well_visible
 from pimper_torch.records import NormalPrior, SparseScene, Surface
 from pimper_torch.records.shapes import Scalar
 from pimper_torch.runtime.errors import InputError
@@ -35,10 +35,10 @@ class NormalLoss(nn.Module):
         """Return the mean over all photographs that have a map.
 
         Args:
-            visible: By :func:`~pimper_torch.losses.visible.visible_vertices`, the default.
+            visible: By :func:`~pimper_torch.losses.visible.well_visible`, the default.
         """
         cameras, losses = scene.cameras, []
-        visible = visible_vertices(surface, cameras) if visible is None else visible
+        visible = well_visible(surface, cameras) if visible is None else visible
         for row, name in enumerate(self.truth.names):
             view = scene.views.names.index(name)
             (width, height), shown = self.truth.sizes_px[row].tolist(), visible[view]

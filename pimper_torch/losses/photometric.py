@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pimper_torch.losses.visible import Visible, in_view, interpolated_at, visible_vertices
+from pimper_torch.losses.visible import Visible, in_view, interpolated_at, well_visible
 from pimper_torch.records import SparseScene, Surface
 from pimper_torch.records.shapes import Scalar
 
@@ -36,7 +36,7 @@ class PhotometricLoss(nn.Module):
     @torch.no_grad()
     def visible(self, surface: Surface, scene: SparseScene) -> Visible:
         """Return the vertices that each photograph shows, neither dark nor saturated."""
-        visible = visible_vertices(surface, scene.cameras)
+        visible = well_visible(surface, scene.cameras)
         grey = torch.stack([_grey(surface, scene, view) for view in range(len(visible))])
         return visible & (grey > self.darkest) & (grey < self.brightest)
 

@@ -1,41 +1,26 @@
-"""Vertices that cameras see, and values of images there."""
+"""Values of images at vertices."""
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import grid_sample
 
 from pimper_torch.geometry.pixels import grid_from_pixels
 from pimper_torch.geometry.projection import project
-from pimper_torch.geometry.visibility import ray_caster
+from pimper_torch.geometry.visibility import visible_vertices
 from pimper_torch.records import Cameras, Surface
 from pimper_torch.records.shapes import Points
 
 Visible = Bool[Tensor, "view vertex"]
 
-# Distance in front of a vertex, over the surface's diagonal, within which it does not occlude it.
-_TOLERANCE = 0.005
+_MIN_COSINE = 0.4  # vertices at more than 66 degrees are foreshortened: a choice
 
 
-@torch.no_grad()
-def visible_vertices(surface: Surface, cameras: Cameras, min_cosine: float = 0.4) -> Visible:
-    """Return which vertices the photographs determine, and each camera sees unoccluded.
+def well_visible(surface: Surface, cameras: Cameras) -> Visible:
+    """Return the vertices that the photographs determine, and each camera sees not too obliquely.
 
-    A discrete choice: compute it once, and pass it to the losses of all steps.
-
-    Args:
-        min_cosine: Least cosine between the normal and the direction to the camera.
+    Pass those of a first step to the losses of all steps, as they are a discrete choice.
     """
-    points, caster = surface.vertices_world, ray_caster(surface.mesh)
-    size = (points.amax(dim=0) - points.amin(dim=0)).norm()
-    rows = []
-    for view, center in enumerate(cameras.centers_world.to(points)):
-        towards = normalize(center - points, dim=1)
-        pixels, depth = in_view(points, cameras, view)
-        seen = surface.supported & ((towards * surface.normals_world).sum(dim=1) > min_cosine)
-        seen &= ((pixels > 0) & (pixels < cameras.sizes_px[view])).all(dim=1) & (depth > 0)
-        rows.append(seen & ~caster.occluded(points, center, float(_TOLERANCE * size)))
-    return torch.stack(rows)
+    return visible_vertices(surface.mesh, cameras, _MIN_COSINE) & surface.supported
 
 
 def in_view(

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, redirect_stdout
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ class Viewer(AbstractContextManager["Viewer", None]):
         self._newest: tuple[str, Mesh] | None = None
         # Pose, vertical field of view, and aspect ratio (width over height).
         self._cameras: dict[str, tuple[Float[Tensor, "4 4"], float, float]] = {}
+        self._lenses: dict[int, list[float]] = {}  # field of view and aspect ratio of each page
         self._frusta: dict[str, Any] = {}
         self._panes: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # photographs, and corners
         scene, gui = self.server.scene, self.server.gui
@@ -68,20 +70,17 @@ class Viewer(AbstractContextManager["Viewer", None]):
         self._bar = gui.add_html("", visible=False)
         self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
         self._fade = gui.add_slider("photograph opacity", 0.0, 1.0, 0.05, 0.0, visible=False)
-        self._light = [
-            gui.add_slider("light from right", -1.0, 1.0, 0.05, -0.45),
-            gui.add_slider("light from above", -1.0, 1.0, 0.05, 0.55),
-        ]
+        self._light = gui.add_text("light", "-0.45 0.55")  # the disc hides and sets it
+        gui.add_html(Path(__file__).with_name("lamp.html").read_text(encoding="utf-8"))
         self._about = gui.add_markdown("No surface yet.")
-        self._see_whole(1.0)
+        self._see_whole(torch.cat([torch.eye(3), -torch.eye(3)]))
         self._layer.on_update(lambda _: self._paint())
         # Without a client, `choose` itself has set the value.
         self._chosen.on_update(
             lambda event: self.choose(self._chosen.value) if event.client else None
         )
         self._fade.on_update(lambda _: self._lay_photograph())
-        for slider in self._light:
-            slider.on_update(lambda _: self._turn_lights())
+        self._light.on_update(lambda _: self._turn_lights())
         self.server.on_client_connect(self._welcome)
 
     def __exit__(self, *_: object) -> None:
@@ -172,10 +171,11 @@ class Viewer(AbstractContextManager["Viewer", None]):
                     node.visible = False
             self._surfaces.append(f"/surfaces/{len(self._surfaces)}: {name}")
             self._newest = name, mesh
-            vertices = transform(self._viewer_from_world, mesh.vertices_world.double())
-            self._see_whole(float(vertices.norm(dim=1).max()))
+            self._see_whole(transform(self._viewer_from_world, mesh.vertices_world.double()))
             self._layer.options = layers_of(mesh)
             self._paint()
+            if len(self._surfaces) == 1:
+                self.choose(NO_PHOTOGRAPH)
 
     def choose(self, name: str) -> None:
         """Move every open page to the viewpoint of a photograph, and hide all frusta.
@@ -194,22 +194,31 @@ class Viewer(AbstractContextManager["Viewer", None]):
     def _welcome(self, client: Any) -> None:  # noqa: ANN401 - viser's
         """Initialize a new page: the same scene, under a light that follows its viewpoint."""
         client.scene.add_light_directional("/light", intensity=_DIRECT)
-        client.camera.on_update(lambda _: self._turn_lights())
         self._move_to_camera(client)
+        client.camera.on_update(lambda _: self._follow(client))
         self._turn_lights()
 
     def _move_to_camera(self, client: Any) -> None:  # noqa: ANN401 - viser's
         """Move a page to the selected camera, with its complete image inside the window."""
-        pose, fov, aspect = self._cameras[self._chosen.value]
-        half = math.tan(fov / 2) * max(1.0, aspect / client.camera.aspect)
+        pose, *self._lenses[client.client_id] = self._cameras[self._chosen.value]
         with client.atomic():
-            _put(client.camera, pose, 2 * math.atan(half))
+            _put(client.camera, pose, self._fov_of(client))
+
+    def _fov_of(self, client: Any) -> float:  # noqa: ANN401 - viser's
+        """Return the vertical field of view with a page's complete image inside its window."""
+        fov, aspect = self._lenses[client.client_id]
+        return 2 * math.atan(math.tan(fov / 2) * max(1.0, aspect / client.camera.aspect))
+
+    def _follow(self, client: Any) -> None:  # noqa: ANN401 - viser's
+        """Adapt a page to a new viewpoint, or to a new size of its window."""
+        client.camera.fov = self._fov_of(client)
+        self._turn_lights()
 
     def _turn_lights(self) -> None:
-        """Set the light of every page to the sliders' direction, relative to its viewpoint."""
+        """Set the light of every page to the disc's direction, relative to its viewpoint."""
         from viser.transforms import SO3
 
-        right, up = (slider.value for slider in self._light)
+        right, up = map(float, self._light.value.split())
         towards = np.array([right, -up, -math.sqrt(max(0.0, 1 - right**2 - up**2))])
         for client in self.server.get_clients().values():
             if lamp := client.scene.get_handle_by_name("/light"):
@@ -225,12 +234,13 @@ class Viewer(AbstractContextManager["Viewer", None]):
 
     def _show_frusta(self) -> None:
         """Hide all frusta at a photograph's viewpoint; otherwise those in front of the surface."""
-        (home, fov, _), size = self._cameras[NO_PHOTOGRAPH], 2 * _SCALE
+        (home, fov, aspect), size = self._cameras[NO_PHOTOGRAPH], 2 * _SCALE
+        half = math.atan(math.tan(fov / 2) * max(1.0, aspect))
         for name, frustum in self._frusta.items():
             away = self._cameras[name][0][:3, 3] - home[:3, 3]
             angle = cosine_similarity(away, home[:3, 2], dim=0).clamp(-1, 1).acos()
             near = away.norm() < home[:3, 3].norm()
-            covers = near & (angle < fov / 2 + torch.atan(size / away.norm()))
+            covers = near & (angle < half + torch.atan(size / away.norm()))
             frustum.visible = self._chosen.value == NO_PHOTOGRAPH and not bool(covers)
 
     def _paint(self) -> None:
@@ -245,12 +255,16 @@ class Viewer(AbstractContextManager["Viewer", None]):
             self._bar.content = "" if layer is None else color_bar(layer)
             self._bar.visible = layer is not None
 
-    def _see_whole(self, radius: float) -> None:
-        """Set the initial viewpoint, from above, to contain a radius around the origin."""
-        fov, up = math.radians(50), torch.tensor([0.0, 0.0, 1.0])
-        eye = 1.08 * radius / math.sin(fov / 2) * torch.tensor([[0.94, 0.0, 0.34]])
-        pose = invert_rigid(look_at(eye, 0 * up, up))[0].double()
-        self._cameras[NO_PHOTOGRAPH] = pose, fov, 1.0
+    def _see_whole(self, points: Points) -> None:
+        """Set the initial viewpoint, from above, such that points fill the image."""
+        middle, up = (points.amin(dim=0) + points.amax(dim=0)) / 2, points.new_tensor([0.0, 0, 1])
+        # A choice: so near that perspective is visible.
+        away = 2.4 * (points - middle).norm(dim=1).max() * up.new_tensor([[0.94, 0.0, 0.34]])
+        cam_from_viewer = look_at(middle + away, middle, up)[0]
+        across, down, depth = transform(cam_from_viewer, points).unbind(dim=1)
+        half = [1.05 * float((side / depth).abs().max()) for side in (across, down)]
+        pose, fov = invert_rigid(cam_from_viewer[None])[0].double(), 2 * math.atan(half[1])
+        self._cameras[NO_PHOTOGRAPH] = pose, fov, half[0] / half[1]
         _put(self.server.initial_camera, pose, fov)
         self._show_frusta()
 

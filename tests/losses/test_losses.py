@@ -13,7 +13,7 @@ from pimper_bench.scenes import render_shape, sparse_scene
 from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
 from pimper_bench.scenes.scene_lights import wandering_lights
-from pimper_torch.geometry.visibility import cast_view
+from pimper_torch.geometry.visibility import cast_view, visible_vertices
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_a_true_surface_predicts_the_photographs(scene, ball):
 
 
 def test_shadows_and_occluded_vertices_do_not_count(scene, ball):
-    visible = pt.losses.visible_vertices(ball, scene.cameras, min_cosine=0.0)
+    visible = visible_vertices(ball.mesh, scene.cameras)
     center = scene.cameras.centers_world[0]
     beyond = (ball.vertices_world * center).sum(dim=1) < 1.0  # behind the horizon of the sphere
     assert not visible[0, beyond].any()
@@ -143,7 +143,7 @@ def test_normals_in_photographs(scene, ball):
     turn[:2, :2] = torch.tensor(
         [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     )
-    visible = pt.losses.visible_vertices(ball, scene.cameras)
+    visible = pt.losses.well_visible(ball, scene.cameras)
     turned = loss(ball.replace(normals_world=ball.normals_world @ turn.mT), scene, visible)
     assert 0 < turned < 1 - math.cos(angle)
     direction = torch.randn(ball.normals_world.shape, generator=torch.Generator().manual_seed(0))

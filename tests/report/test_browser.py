@@ -5,6 +5,7 @@ import re
 import shutil
 import time
 from io import BytesIO
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ import torch
 from PIL import Image
 from scenes import trusted
 
+from pimper_torch.io.assets.gltf import MATTE, gltf_of
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.write import write_asset
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.radiometry.base_color import base_color
 from pimper_torch.records import Materials, Relighting, ViewErrors
@@ -32,7 +35,9 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 LEFT_OUT = {"what": "points", "total": 90000, "reason": "without albedo", "names": []}
 VIEW = {"name": "a.png", "psnr_db": 31.0, "psnr_matte_db": None}
+GOOD = "Good: from 6 of 7 photographs."
 SUMMARY = {
+    "verdict": {"score": 0.7, "text": GOOD, "scores": {}},
     "diagnosis": None,
     "warnings": ["Lower `factorize.min_views`, or `--masks` and <b>bold</b>."],
     "seconds": 150.4,
@@ -113,9 +118,17 @@ def shown(tmp_path_factory):
     }
     write_page(folder / "report.html", **parts, lights_world=lights_world)
     quiet = {**SUMMARY, "left_out": [], "failures": [], "warnings": [], "relighting": None}
-    parts["summary"] = quiet | {"simplified": None, "scale": {"unit": "mm"}}
+    parts["summary"] = quiet | {"simplified": None, "scale": {"unit": "mm"}, "verdict": None}
     parts["summary"] |= {"diagnosis": "The cameras only rotated."}
     write_page(folder / "plain.html", **parts)
+    text = "Not usable: The cameras only rotated."
+    verdict = {"score": 0.0, "text": text}
+    parts["summary"] |= {"verdict": verdict, "warnings": [text, "Dark.", "Dark."]}
+    write_page(folder / "bad.html", **parts)
+    vertices, faces = mesh.vertices_world.numpy(), mesh.faces.flip(1).numpy()
+    inside_out = gltf_of({"POSITION": vertices, "NORMAL": vertices}, faces, MATTE)
+    parts |= {"asset": inside_out, "surface": mesh, "mesh": mesh}
+    write_page(folder / "inside_out.html", **parts)
     return folder / "report.html", mesh, scene, lights, materials
 
 
@@ -322,6 +335,25 @@ def test_keys_and_buttons_step_through_photographs(opened, shown):
     assert opened.evaluate("document.activeElement.innerText") == names[1]
 
 
+def test_keys_step_through_photographs_after_a_slider_was_touched(opened, shown):
+    names, press = shown[2].views.names, opened.keyboard.press
+    opened.locator("#ambient").click()
+    press("ArrowRight")
+    assert pressed(opened) == [names[0]]
+    opened.locator("#opacity").click()
+    press("ArrowRight")
+    assert pressed(opened) == [names[1]]
+    opened.get_by_label("lights").check()  # a checkbox has no use for arrow keys
+    press("ArrowRight")
+    assert pressed(opened) == [names[2]]
+    for control in ("#ambient", "#lamp"):  # Escape returns the arrow keys
+        opened.locator(control).focus()
+        press("Escape")
+        assert pressed(opened) == []
+        press("ArrowRight")
+        assert pressed(opened) == [names[0]]
+
+
 def test_the_focus_ring_is_shown_only_for_keys(opened):
     outline = "getComputedStyle(document.getElementById('lamp')).outlineStyle"
     opened.locator("#lamp").click()
@@ -403,6 +435,87 @@ def test_the_lamp_of_the_shape_is_the_same_for_every_photograph(opened):
     assert places[2] != places[3]
 
 
+def bulb(page):
+    """Return the place of the lamp in its disc, y upwards."""
+    canvas(page)
+    point = page.locator("#lamp .bulb")
+    return np.array([float(point.get_attribute("cx")), -float(point.get_attribute("cy"))])
+
+
+# The place of the lamp in its disc, once it is elsewhere than before.
+MOVED = """([x, y]) => {
+  const { cx, cy } = document.querySelector("#lamp .bulb");
+  const place = [cx.baseVal.value, -cy.baseVal.value];
+  return Math.hypot(place[0] - x, place[1] - y) > 0.05 && place;
+}"""
+
+
+def test_the_shape_opens_under_raking_light(opened):
+    lit = bulb(opened)
+    choose(opened, "shape")
+    assert 0.9 < np.linalg.norm(bulb(opened)) < 1
+    opened.locator("#lamp").click()
+    assert np.linalg.norm(bulb(opened)) < 0.1
+    choose(opened, "lit")
+    np.testing.assert_array_equal(bulb(opened), lit)
+
+
+def test_the_lamp_orbits_until_it_is_moved(opened):
+    choose(opened, "shape")
+    button = opened.get_by_role("button", name="lamp orbits")
+    places = [bulb(opened)]
+    button.click()
+    for _ in range(2):
+        moved = opened.wait_for_function(MOVED, arg=places[-1].tolist())
+        places.append(np.array(moved.json_value()))
+    radii = [np.linalg.norm(place) for place in places]
+    np.testing.assert_allclose(radii, radii[0], atol=1e-6)
+    turns = [np.cross(first, second) for first, second in pairwise(places)]
+    assert max(turns) < -0.03  # clockwise
+    opened.locator("#lamp").click()
+    assert button.get_attribute("aria-pressed") == "false"
+    still = bulb(opened)
+    opened.wait_for_timeout(300)
+    np.testing.assert_array_equal(bulb(opened), still)
+    choose(opened, "normals")
+    assert not button.is_visible()
+
+
+def hatched(page, shown, path):
+    """Return the pixels of view 1's albedo on a page, over those of the page of the ball."""
+    found = []
+    for place in (shown[0], path):
+        opening(page, place)
+        choose(page, "albedo")
+        behind(page, 1)
+        drawn, side = canvas(page), page.locator("#stage").bounding_box()
+        width, height = int(side["width"]), int(side["height"])
+        middle = drawn[height // 2 - 40 : height // 2 + 40, width // 2 - 40 : width // 2 + 40]
+        found.append(linear(middle).reshape(-1, 3))
+    page.asked[:] = page.asked[:1]
+    return found
+
+
+def test_what_no_photograph_shows_is_hatched(opened, shown, tmp_path):
+    page = shown[0].read_text(encoding="utf-8")
+    seen = re.search(r'"seen": "([^"]*)"', page)[1]
+    none = base64.b64encode(bytes(len(base64.b64decode(seen)))).decode()
+    (tmp_path / "unseen.html").write_text(page.replace(seen, none), encoding="utf-8")
+    plain, drawn = hatched(opened, shown, tmp_path / "unseen.html")
+    unchanged = np.abs(drawn - plain).max(axis=1) < 0.01
+    assert 0.4 < unchanged.mean() < 0.6
+    assert (drawn[~unchanged] < 0.7 * plain[~unchanged] + 0.01).mean() > 0.9
+
+
+def test_the_inside_is_hatched_in_grey(opened, shown):
+    _, drawn = hatched(opened, shown, shown[0].with_name("inside_out.html"))
+    assert np.abs(drawn - drawn.mean(axis=1, keepdims=True)).max() < 0.01
+    levels, counts = np.unique((255 * drawn[:, 0]).round(), return_counts=True)
+    two = np.sort(counts)[-2:].sum()
+    assert two > 0.75 * len(drawn)  # the others are at the stripes' borders
+    assert len(levels) > 1
+
+
 def test_the_environment_is_the_first_order_light_of_the_photograph(opened, shown):
     _, mesh, scene, _, _ = shown
     behind(opened, 2)
@@ -423,26 +536,36 @@ def test_the_environment_is_the_first_order_light_of_the_photograph(opened, show
     assert (canvas(opened) - before).mean() > 2
 
 
+def on_stage(page, x, y):
+    """Return the place in the window of a pixel of the selected photograph."""
+    stage = page.locator("#canvas").bounding_box()
+    side = min(stage["width"], stage["height"])
+    left = stage["x"] + (stage["width"] - side) / 2
+    top = stage["y"] + (stage["height"] - side) / 2
+    return left + x * side / SIDE, top + y * side / SIDE
+
+
+def on_ball(scene, x, y):
+    """Return the point of the ball at a pixel of view 0."""
+    pose = scene.cameras.cam_from_world[0].double()
+    camera = scene.cameras.intrinsics[0].double()
+    ray = pose[:3, :3].mT @ torch.linalg.inv(camera) @ torch.tensor([x, y, 1.0]).double()
+    ray, eye = ray / ray.norm(), scene.cameras.centers_world[0].double()
+    along = -ray @ eye
+    return eye + (along - (along**2 - eye @ eye + 1).sqrt()) * ray
+
+
 def test_two_clicks_measure_a_distance(opened, shown):
     scene = shown[2]
     behind(opened, 0)
     choose(opened, "measure")
     measured = opened.locator("#measured")
     assert measured.inner_text() == "Click the first point on the surface."
-    stage = opened.locator("#canvas").bounding_box()
-    side = min(stage["width"], stage["height"])
 
     def click(x, y):
         """Click a pixel of the photograph; return the point of the ball."""
-        left = stage["x"] + (stage["width"] - side) / 2
-        top = stage["y"] + (stage["height"] - side) / 2
-        opened.mouse.click(left + x * side / SIDE, top + y * side / SIDE)
-        pose = scene.cameras.cam_from_world[0].double()
-        camera = scene.cameras.intrinsics[0].double()
-        ray = pose[:3, :3].mT @ torch.linalg.inv(camera) @ torch.tensor([x, y, 1.0]).double()
-        ray, eye = ray / ray.norm(), scene.cameras.centers_world[0].double()
-        along = -ray @ eye
-        return eye + (along - (along**2 - eye @ eye + 1).sqrt()) * ray
+        opened.mouse.click(*on_stage(opened, x, y))
+        return on_ball(scene, x, y)
 
     click(2.0, 2.0)  # beside the ball
     assert measured.inner_text() == "Click the first point on the surface."
@@ -458,6 +581,79 @@ def test_two_clicks_measure_a_distance(opened, shown):
     assert measured.inner_text() == "Click the second point on the surface."
     choose(opened, "measure")
     assert not measured.is_visible()
+
+
+def draw_line(page, start, end):
+    page.mouse.move(*on_stage(page, *start))
+    page.mouse.down()
+    page.mouse.move(*on_stage(page, *end), steps=3)
+    page.mouse.up()
+
+
+def test_a_drawn_line_gives_the_profile_of_the_surface(opened, shown):
+    """The section through the middle of a ball is a circle."""
+    scene = shown[2]
+    behind(opened, 0)
+    choose(opened, "measure")
+    choose(opened, "profile")  # replaces it
+    measured, graph = opened.locator("#measured"), opened.locator("#graph")
+    assert measured.inner_text() == "Draw a line over the surface."
+    assert opened.locator("#measure").get_attribute("aria-pressed") == "false"
+    assert not graph.is_visible()
+    draw_line(opened, (28.0, 30.0), (52.0, 50.0))  # through the middle
+    assert pressed(opened) == [scene.views.names[0]]  # the view does not turn
+    chord = float((on_ball(scene, 28.0, 30.0) - on_ball(scene, 52.0, 50.0)).norm())
+    height, scaled = 1 - (1 - chord**2 / 4) ** 0.5, 100 / (2 * 3**0.5)
+    value, _, words = measured.inner_text().partition(" ")
+    assert float(value) == pytest.approx(scaled * chord, rel=0.02)
+    assert words == "% of the object's size from end to end"
+    high, low, left, right = (float(one) for one in graph.locator("text").all_text_contents())
+    assert (high, low) == (pytest.approx(scaled * height, rel=0.05), pytest.approx(0, abs=0.01))
+    assert (left, right) == (pytest.approx(0, abs=1e-6), pytest.approx(scaled * chord, rel=0.02))
+    path = graph.locator(".curve").get_attribute("d")
+    points = np.array(re.findall(r"[ML]([\d.e-]+) ([\d.e-]+)", path)).astype(float)
+    assert path.count("M") == 1
+    across = chord * ((points[:, 0] - 52) / 224 - 0.5)
+    circle = (1 - across**2) ** 0.5 - (1 - chord**2 / 4) ** 0.5
+    assert np.abs((98 - points[:, 1]) / 90 * height - circle).max() < 0.02 * height
+    draw_line(opened, (2.0, 2.0), (10.0, 2.0))
+    assert measured.inner_text() == "The line misses the surface."
+    assert not graph.is_visible()
+    choose(opened, "profile")
+    assert not measured.is_visible()
+
+
+def test_the_view_is_saved_as_a_picture(opened, tmp_path):
+    behind(opened, 0)
+    choose(opened, "albedo")
+    drawn = canvas(opened)
+    with opened.expect_download() as download:
+        choose(opened, "save picture")
+    assert download.value.suggested_filename == "ball.png"
+    download.value.save_as(tmp_path / "ball.png")
+    saved = np.asarray(Image.open(tmp_path / "ball.png").convert("RGBA")).astype(float)
+    assert saved.shape[:2] == drawn.shape[:2]
+    opaque = saved[..., 3] == 255
+    assert 0.05 < opaque.mean() < 0.6
+    assert np.abs(saved[..., :3] - drawn)[opaque].mean() < 1
+    assert saved[0, 0, 3] == 0
+
+
+def test_the_surface_is_saved_in_the_frame_of_the_mesh(opened, shown, tmp_path):
+    with opened.expect_download() as download:
+        choose(opened, "save mesh")
+    assert download.value.suggested_filename == "ball.ply"
+    download.value.save_as(tmp_path / "ball.ply")
+    saved, own = read_mesh(tmp_path / "ball.ply"), shown[1]
+    assert len(saved.vertices_world) == len(own.vertices_world)  # without the texture's cuts
+    assert len(saved.faces) == len(own.faces)
+    assert set(map(tuple, saved.vertices_world.mul(1e4).round().int().tolist())) == set(
+        map(tuple, own.vertices_world.mul(1e4).round().int().tolist())
+    )
+    a, b, c = saved.vertices_world[saved.faces].unbind(dim=1)
+    assert (torch.linalg.cross(b - a, c - a) * a).sum(dim=1).min() > 0
+    assert saved.normals_world is not None
+    assert (saved.normals_world - saved.vertices_world).abs().max() < 0.05
 
 
 def ball_pixels(picture):
@@ -501,6 +697,8 @@ def test_headline_and_tables_agree(opened):
         "6 of 7 photographs, 2,999 facets, 83,045 vertices in mesh.ply (560,140 before "
         "simplification), 150 s"
     )
+    assert opened.locator("details[open]").count() == 0
+    opened.locator("summary", has_text="Stages").click()
     assert opened.get_by_text("150 s up to this page, at most 900 MB, in warp").is_visible()
     assert cells(opened, "Stages")[1:] == [
         ["warp", "8.0", "", "500", "samples 12,345"],
@@ -515,7 +713,6 @@ def test_headline_and_tables_agree(opened):
         ["Pass 1"],
         ["fuse.albedo", "45,000", "90,000", "points", "without albedo"],
     ]
-    assert opened.locator("details[open]").count() == 0
     assert cells(opened, "Failed")[1:] == [["fuse", "patch 3, 5", "no light", "left"]]
     assert cells(opened, "Settings")[1:] == [["zeta", "0.5"], ["fuse"], ["terms", '["normals"]']]
     assert cells(opened, "Photographs predicted")[1:] == [
@@ -539,6 +736,21 @@ def test_sections_without_content_are_omitted(opened, shown):
     assert not opened.get_by_label("environment").is_visible()
     choose(opened, "expected error")
     assert opened.locator("#high").inner_text().endswith(" mm or more")
+
+
+def test_the_verdict_is_above_everything(opened):
+    words = opened.get_by_text(GOOD)
+    assert words.count() == 1
+    below = [opened.locator(one).bounding_box()["y"] for one in ("header", "#stage")]
+    assert words.bounding_box()["y"] + words.bounding_box()["height"] <= min(below)
+
+
+def test_each_sentence_is_said_once(opened, shown):
+    opening(opened, shown[0].with_name("bad.html"))
+    opened.asked[:] = opened.asked[:1]
+    assert opened.get_by_text("The cameras only rotated.").count() == 1
+    assert opened.locator("#verdict.doubtful").inner_text().startswith("Not usable: The cameras")
+    assert opened.locator("li").all_inner_texts() == ["Dark."]
 
 
 @pytest.fixture
@@ -575,7 +787,13 @@ def test_the_surface_stays_visible_on_a_phone(phone):
     assert row["y"] + row["height"] <= 844
 
 
+def test_a_phone_is_not_told_of_arrow_keys(phone, opened):
+    assert "arrow keys" in opened.locator("body").inner_text()
+    assert "arrow keys" not in phone.locator("body").inner_text()
+
+
 def test_figures_of_a_stage_are_below_it_on_a_phone(phone):
+    phone.locator("summary", has_text="Stages").tap()
     row = phone.locator("tr", has_text="samples 12,345")
     name, figures = (row.locator(kind).bounding_box() for kind in ("td.name", "td.text"))
     assert figures["y"] >= name["y"] + name["height"]
@@ -591,5 +809,5 @@ def test_a_browser_without_webgl_still_shows_photographs_and_tables(browser, sho
     assert "cannot be drawn" in page.locator("#trouble").inner_text()
     page.locator("#thumbnails button").first.click()
     page.locator("#prediction img").wait_for(state="visible")
-    assert page.get_by_role("heading", name="Stages").is_visible()
+    assert page.get_by_text("Stages", exact=True).is_visible()
     plain.close()

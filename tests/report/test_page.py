@@ -12,6 +12,8 @@ from scenes import CORNERS, FACETS
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.visibility import visible_vertices
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.records import Materials, Mesh, Relighting, ViewErrors, ViewLights
 from pimper_torch.viz.report.openness import openness
@@ -289,3 +291,36 @@ def test_the_floor_of_a_pit_is_lit_by_the_sky_above_its_rim(depth):
     pit = Mesh(vertices_world=points, faces=torch.cat([floor, wall, other]), normals_world=upward)
     # One ray is a fiftieth of the centre's irradiance.
     assert float(openness(pit)[0]) == pytest.approx(1 / (1 + depth**2), abs=0.04)
+
+
+def one_camera(width=300):
+    """A camera at distance 3 on the x axis; with 300 pixels, it has the unit ball in its image."""
+    eye, up = torch.tensor([[3.0, 0.0, 0.0]]), torch.tensor([0.0, 0.0, 1.0])
+    cameras = pinholes(look_at(eye, torch.zeros(3), up), 300.0, 300, 300)
+    return cameras.replace(sizes_px=torch.tensor([[width, 300]]))
+
+
+def test_a_camera_shows_a_ball_up_to_its_horizon():
+    """The horizon of the unit ball from distance d is at 1 / d along the axis."""
+    vertices, faces = icosphere(4)
+    vertices = vertices.float()
+    ball = Mesh(vertices_world=vertices, faces=faces, normals_world=vertices)
+    shown, x, y, _ = visible_vertices(ball, one_camera())[0], *vertices.unbind(dim=1)
+    clear = (x - 1 / 3).abs() > 0.05
+    assert torch.equal(shown[clear], (x > 1 / 3)[clear])
+    # The camera's right is +y; the left half of the image shows y < 0.
+    half = visible_vertices(ball, one_camera(width=150))[0]
+    clear &= y.abs() > 0.01
+    assert torch.equal(half[clear], (shown & (y < 0))[clear])
+
+
+def test_a_camera_does_not_show_what_is_occluded():
+    """A shield between the camera and a ball."""
+    vertices, faces = icosphere(3)
+    corners = torch.tensor([[2.0, -1, -1], [2, 1, -1], [2, 1, 1], [2, -1, 1]])
+    both = Mesh(
+        vertices_world=torch.cat([vertices.float(), corners]),
+        faces=torch.cat([faces, len(vertices) + torch.tensor([[0, 1, 2], [0, 2, 3]])]),
+    )
+    shown = visible_vertices(both, one_camera())[0]
+    assert not shown[: len(vertices)].any()

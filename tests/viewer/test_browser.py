@@ -135,6 +135,57 @@ def until(page, true):
         page.wait_for_timeout(500)
 
 
+def filled(page):
+    """Return the larger fraction of the canvas' width or height that a surface takes."""
+    box = page.locator("canvas").first.bounding_box()
+    left, top = int(box["x"]), int(box["y"])
+    with Image.open(io.BytesIO(page.screenshot())) as picture:
+        colored = np.asarray(picture.convert("RGB"), dtype=float)
+    inside = colored[top : top + int(box["height"]), left : left + int(box["width"])]
+    shown = np.ptp(inside, axis=2) > 60  # the ground is grey
+    return max(shown.any(axis=1).mean(), shown.any(axis=0).mean())
+
+
+def test_the_surface_fills_the_window_also_after_its_resize(viewer, page):
+    viewer.add_pass("ball", ball(0.3, level=4).to(torch.float32))
+    viewer._layer.value = "normals"
+    page.set_viewport_size({"width": 900, "height": 600})
+    page.goto(viewer.address)
+    for width, height in ((900, 600), (500, 900), (1000, 500)):
+        page.set_viewport_size({"width": width, "height": height})
+        until(page, lambda _: 0.85 < filled(page) < 1)
+
+
+def test_the_light_is_set_by_a_disc(viewer, page):
+    viewer.add_pass("ball", ball(1.0, level=4).to(torch.float32))
+    page.set_viewport_size({"width": 900, "height": 600})
+    page.goto(viewer.address)
+    until(page, drawn)
+    assert not page.get_by_text("light", exact=True).is_visible()  # the text field of the disc
+    disc = page.locator("#lamp").bounding_box()
+    middle = disc["x"] + disc["width"] / 2, disc["y"] + disc["height"] / 2
+    for side in (-1, 1):
+        page.mouse.move(*middle)
+        page.mouse.down()
+        page.mouse.move(middle[0] + 0.4 * side * disc["width"], middle[1], steps=3)
+        page.mouse.up()
+        until(page, lambda _, side=side: side * brighter_right(page) > 0.05)
+    right, up = map(float, viewer._light.value.split())
+    assert (right, up) == (pytest.approx(0.92, abs=0.03), pytest.approx(0, abs=0.03))
+    page.locator("#lamp").focus()
+    page.keyboard.press("ArrowUp")
+    until(page, lambda _: float(viewer._light.value.split()[1]) > 0.05)
+
+
+def brighter_right(page):
+    """Return by how much the right half of the canvas is brighter, 0 to 1."""
+    box = page.locator("canvas").first.bounding_box()
+    with Image.open(io.BytesIO(page.screenshot())) as picture:
+        grey = np.asarray(picture.convert("L"), dtype=float)[200:, int(box["x"]) :] / 255
+    half = int(box["width"]) // 2
+    return grey[:, half : 2 * half].mean() - grey[:, :half].mean()
+
+
 def test_a_click_on_a_frustum_moves_the_viewpoint_there(viewer, page, reconstruction):
     fetched, errors = [], []
     page.on("request", lambda request: fetched.append(request.url))

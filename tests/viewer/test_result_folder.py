@@ -68,6 +68,14 @@ def test_the_command_serves_a_page_until_ctrl_c(ball):
         assert process.wait(timeout=30) == 0
 
 
+def test_errors_are_printed_before_the_address(tmp_path, capsys):
+    (tmp_path / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\n")
+    assert main(["view", str(tmp_path / "broken.ply"), "--port", "0"]) == 2
+    captured = capsys.readouterr()
+    assert "broken.ply" in captured.err
+    assert "viewer is at" not in captured.out + captured.err
+
+
 @pytest.mark.parametrize(
     ("line", "needed"),
     [

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.export.result import Result
+from pimper_torch.geometry.pinholes import look_at
 from pimper_torch.geometry.rigid import invert_rigid, transform
 from pimper_torch.radiometry import linear_from_srgb
 from pimper_torch.records import Mesh
@@ -65,7 +66,7 @@ def client(page, monkeypatch):
     camera = SimpleNamespace(up_direction=None, aspect=2.0, wxyz=np.array([1.0, 0, 0, 0]))
     lamp = SimpleNamespace(position=None)
     scene = SimpleNamespace(get_handle_by_name={"/light": lamp}.get)
-    client = SimpleNamespace(camera=camera, scene=scene, atomic=nullcontext)
+    client = SimpleNamespace(camera=camera, scene=scene, atomic=nullcontext, client_id=0)
     monkeypatch.setattr(page.server, "get_clients", lambda: {0: client})
     return client
 
@@ -108,18 +109,23 @@ def test_the_last_surface_is_shown_and_earlier_ones_are_kept(viewer, reconstruct
 
 
 def test_a_selected_photograph_hides_the_frusta_and_none_shows_the_complete_surface(
-    page, camera, reconstruction
+    page, client, camera, reconstruction
 ):
     page.choose(reconstruction.scene.views.names[0])
     assert not any(frustum.visible for frustum in page._frusta.values())
     page.choose(NO_PHOTOGRAPH)
     assert any(frustum.visible for frustum in page._frusta.values())
     vertices = transform(page._viewer_from_world, reconstruction.mesh.vertices_world.double())
-    rays, eye = vertices - torch.as_tensor(camera.position), torch.as_tensor(camera.position)
-    angles = torch.cosine_similarity(rays, -eye.double(), dim=1).acos()
-    # The farthest vertex may be nearer to the viewpoint than the centre, or farther.
-    assert camera.fov / 4 < float(angles.max()) <= camera.fov / 2 + 1e-6
     np.testing.assert_array_equal(page.server.initial_camera.position, camera.position)
+    eye, middle = torch.as_tensor(camera.position)[None], torch.as_tensor(camera.look_at)
+    pose = look_at(eye, middle.double(), torch.as_tensor(camera.up_direction).double())[0]
+    for aspect in (2.0, 0.5):  # also after the window's resize
+        camera.aspect = aspect
+        page._follow(client)
+        x, y, z = transform(pose, vertices).unbind(dim=1)
+        half = math.tan(camera.fov / 2)
+        across, down = (x / z).abs().max() / (half * aspect), (y / z).abs().max() / half
+        assert 0.94 < max(across, down) < 0.96  # the margin
 
 
 @pytest.fixture
@@ -180,15 +186,14 @@ def test_layers_have_the_expected_colours(ball, monkeypatch):
     assert (np.diff(error.sum(axis=1)[outward[:, 2].argsort()]) > -1e-6).all()
 
 
-def test_the_sliders_set_the_light_relative_to_the_viewpoint(page, client):
+def test_the_disc_sets_the_light_relative_to_the_viewpoint(page, client):
     """The viewpoint looks along z with y down, then rotates about y to look along x."""
     lamp = client.scene.get_handle_by_name("/light")
     for right, up, direction in [(0, 0, (0, 0, -1)), (0.6, 0, (0.6, 0, -0.8)), (0, 1, (0, -1, 0))]:
-        for slider, value in zip(page._light, (right, up), strict=True):
-            slider.value = value
+        page._light.value = f"{right} {up}"
         page._turn_lights()
         np.testing.assert_allclose(lamp.position, direction, atol=1e-9)
-    page._light[1].value = 0
+    page._light.value = "0.0 0.0"
     client.camera.wxyz = np.array([0.5**0.5, 0, 0.5**0.5, 0])
     page._turn_lights()
     np.testing.assert_allclose(lamp.position, (-1, 0, 0), atol=1e-9)
@@ -203,7 +208,7 @@ def test_frusta_between_the_eye_and_the_surface_are_hidden(viewer):
     viewer.add_pass("ball", Mesh(vertices_world=vertices.float() / 2, faces=faces))
     hidden = {name for name, frustum in viewer._frusta.items() if not frustum.visible}
     assert not hidden  # the viewpoint is nearer than the cameras
-    viewer._see_whole(1.35)  # now farther: the first camera is in front of it
+    viewer._see_whole(1.35 * vertices)  # now farther: the first camera is in front of it
     assert {name for name, one in viewer._frusta.items() if not one.visible} == {"0.jpg"}
 
 

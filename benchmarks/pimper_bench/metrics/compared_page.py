@@ -13,6 +13,7 @@ from pimper_bench.metrics.similarity import transfer
 from pimper_torch.export.result import read_result
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.surfaces import unit_face_normals
+from pimper_torch.geometry.visibility import visible_vertices
 from pimper_torch.io.assets.mesh_files import MeshFiles
 from pimper_torch.io.assets.write import write_asset
 from pimper_torch.records import Mesh
@@ -65,6 +66,7 @@ def write_compared_page(
             mesh=result.mesh,
             asset=glb.read_bytes(),
             openness=openness(asset.mesh),
+            seen=visible_vertices(asset.mesh, scene.cameras).any(dim=0),
             scene=scene,
             silhouettes=result.silhouettes,
             reference=scene.views.names.index(result.reference),

@@ -76,7 +76,7 @@
       + `(root mean square). Higher is better; this is number ${rank} of ${all.length}.`;
   };
 
-  const HINT = find("hint").textContent;
+  const HINT = [...find("hint").childNodes];
   let selected = -1;
   const select = (index) => {
     selected = selected === index ? -1 : index;
@@ -84,7 +84,7 @@
     const view = data.views[selected];
     find("compared").hidden = !view;
     document.body.classList.toggle("chosen", Boolean(view));
-    find("hint").textContent = view ? thumbnails[selected].title : HINT;
+    find("hint").replaceChildren(...(view ? [thumbnails[selected].title] : HINT));
     if (view) {
       find("photo").replaceChildren(picture(view.photo, view, true));
       find("predicted").hidden = find("different").hidden = !view.prediction;
@@ -112,12 +112,19 @@
   find("previous").addEventListener("click", () => step(-1));
   find("next").addEventListener("click", () => step(1));
   document.addEventListener("keydown", (event) => {
-    if (event.altKey || event.ctrlKey || event.metaKey || event.target.closest("input, #lamp, .scroll")) return;
+    if (event.altKey || event.ctrlKey || event.metaKey) return;
     const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    if (by) event.preventDefault();
-    if (by) step(by);
-    else if (event.key === "Escape" && selected >= 0) select(selected);
+    if (by && !event.target.closest("input[type=range], #lamp, .scroll")) {
+      event.preventDefault();
+      step(by);
+    } else if (event.key === "Escape") {
+      document.activeElement.blur(); // of a slider, which uses arrow keys itself
+      if (selected >= 0) select(selected);
+    }
   });
+  for (const slider of document.querySelectorAll("input[type=range]")) {
+    slider.addEventListener("pointerup", () => slider.blur()); // else it would keep the arrow keys
+  }
 
   // ---- Tables ------------------------------------------------------------------------------
 
@@ -143,8 +150,13 @@
   const faint = (text) => make("p", { class: "faint" }, ...prose(text));
   const some = (names) => names.slice(0, 8).join(", ") + (names.length > 8 ? ` and ${names.length - 8} more` : "");
 
-  const warnings = [...(summary.diagnosis ? [summary.diagnosis] : []), ...(summary.warnings || [])];
-  if (summary.verdict) section("Verdict", make("p", {}, ...prose(summary.verdict.text)));
+  const { score, text: verdict } = summary.verdict || { score: 1, text: "" };
+  find("verdict").append(...prose(verdict));
+  find("verdict").classList.toggle("doubtful", score < 0.5);
+  find("verdict").hidden = !verdict;
+  // Each sentence once: the verdict on a bad result is also a warning, and contains the diagnosis.
+  const warnings = [...new Set([summary.diagnosis || "", ...(summary.warnings || [])])]
+    .filter((text) => !verdict.includes(text));
   section("Warnings", warnings.length
     ? make("ul", {}, ...warnings.map((text) => make("li", {}, ...prose(text)))) : faint("None."));
 
@@ -168,7 +180,7 @@
     .filter(([, value]) => value !== null)
     .map(([key, value]) => `${key.replaceAll("_", " ")} ${Number.isInteger(value) ? thousands(value) : digits(value, 4)}`)
     .join(", ");
-  section("Stages",
+  folded("Stages",
     faint(`${summary.seconds.toFixed(0)} s up to this page, at most ${(summary.peak_memory_mb || 0).toFixed(0)} MB`
       + `${summary.peak_memory_stage ? `, in ${summary.peak_memory_stage}` : ""}`),
     table([["stage", "name"], ["seconds", "number"], ["", "bar"], ["peak MB", "number"], ["figures", "text"]],
@@ -195,9 +207,23 @@
   const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"];
   const [NEAR, FAR, FOV_DEG] = [0.01, 100, 30]; // planes in units of the scene's radius
   const MARKED = 2.7; // maximum distance of drawn cameras, in radii: the surface then has a third of the image
+  const ORBIT_MS = 8000; // of one turn of the lamp
   const REMOTE = 1e-3; // the surface's radius over the distance of a distant light
   // Coefficients of spherical harmonics for an irradiance of 1, and for 1 where the surface faces an axis.
   const [EVEN, ALONG] = [Math.PI / 0.886227, Math.PI / (2 * 0.511664)];
+  const HATCHING = `
+    if (!gl_FrontFacing) gl_FragColor.rgb = vec3(0.3);
+    if (!gl_FrontFacing || vSeen < 0.5)
+      gl_FragColor.rgb *= mix(0.4, 1.0, step(0.5, fract((gl_FragCoord.x + gl_FragCoord.y) / 9.0)));
+  `;
+  const SAMPLES = 240; // of a profile: about one per pixel of its curve
+  const TOOLS = { measure: "Click the first point on the surface.", profile: "Draw a line over the surface." };
+  const length = (distance) => `${digits(data.unit.factor * distance, 3)} ${data.unit.name}`;
+  const save = (suffix, blob) => {
+    const href = URL.createObjectURL(blob);
+    make("a", { download: `${data.title}.${suffix}`, href }).click();
+    setTimeout(() => URL.revokeObjectURL(href), 60000);
+  };
   const OPENGL = new THREE.Matrix4().makeScale(1, -1, -1); // from x right, y down, z forward
 
   class Surface {
@@ -220,17 +246,20 @@
       this.ambient = new THREE.AmbientLight();
       this.probe = new THREE.LightProbe(); // light from all sides that depends on the normal, unlike ambient light
       this.shade = { value: 1 }; // 1 if the surface occludes the sky
-      this.openSky(object.geometry);
+      this.addBytes("openness", 255);
+      this.addBytes("seen", 1);
       this.markers = new THREE.Group();
       this.lamps = new THREE.Group();
       this.markers.visible = this.lamps.visible = false;
       this.world.add(object, this.light, this.ambient, this.probe, this.markers, this.lamps);
       this.lamp = { view: new THREE.Vector3(-0.45, 0.55, 0.7).normalize(), fitted: null };
+      this.raking = new THREE.Vector3(-0.8, 0.5, 0.3).normalize(); // the lamp of `shape`
+      this.orbiting = false;
       this.behind = null; // the photograph whose viewpoint is used
       this.layers = this.makeLayers();
       this.makeMarkers();
-      this.makeRuler();
       this.controls = new THREE.OrbitControls(this.camera, this.canvas);
+      this.makeRuler();
       let held = false; // a click without dragging keeps the photograph's viewpoint
       this.controls.addEventListener("start", () => { held = true; });
       this.controls.addEventListener("end", () => { held = false; });
@@ -243,22 +272,23 @@
       new ResizeObserver(() => this.resize()).observe(this.stage);
     }
 
-    // Visible fraction of the sky per vertex.
-    openSky(geometry) {
-      const open = Float32Array.from(atob(data.openness), (one) => one.charCodeAt(0) / 255);
-      geometry.setAttribute("openness", new THREE.Float32BufferAttribute(open, 1));
+    // Values per vertex: the visible fraction of the sky, and whether a photograph shows it.
+    addBytes(name, one) {
+      const values = Float32Array.from(atob(data[name]), (each) => each.charCodeAt(0) / one);
+      this.object.geometry.setAttribute(name, new THREE.Float32BufferAttribute(values, 1));
     }
 
-    // Attenuate light from all sides by the visible fraction of the sky.
-    shaded(material) {
+    // Hatch inner sides and what no photograph shows; attenuate light from all sides by `shade` and
+    // the visible fraction of the sky.
+    finish(material, shade) {
       material.onBeforeCompile = (shader) => {
-        shader.uniforms.shade = this.shade;
-        shader.vertexShader = "attribute float openness; varying float vOpenness;\n" + shader.vertexShader
-          .replace("#include <begin_vertex>", "#include <begin_vertex>\nvOpenness = openness;");
-        shader.fragmentShader = "uniform float shade; varying float vOpenness;\n" + shader.fragmentShader
-          .replace("#include <aomap_fragment>", "reflectedLight.indirectDiffuse *= mix(1.0, vOpenness, shade);");
+        shader.uniforms.shade = shade;
+        shader.vertexShader = "attribute float openness, seen; varying float vOpenness, vSeen;\n" + shader.vertexShader
+          .replace("#include <begin_vertex>", "#include <begin_vertex>\nvOpenness = openness; vSeen = seen;");
+        shader.fragmentShader = "uniform float shade; varying float vOpenness, vSeen;\n" + shader.fragmentShader
+          .replace("#include <aomap_fragment>", "reflectedLight.indirectDiffuse *= mix(1.0, vOpenness, shade);")
+          .replace(/}\s*$/, `${HATCHING}}`);
       };
-      return material;
     }
 
     makeLayers() {
@@ -269,8 +299,8 @@
       const grey = new THREE.MeshPhysicalMaterial({ color: 0xb8b8b8, roughness: 1, normalMap, side });
       grey.specularIntensity = 0;
       const layers = [
-        { title: "lit", material: this.shaded(material) },
-        { title: "shape", material: this.shaded(grey) },
+        { title: "lit", material },
+        { title: "shape", material: grey },
         { title: "albedo", material: new THREE.MeshBasicMaterial({ map, side }), unlit: true },
         { title: "normals", material: new THREE.MeshNormalMaterial({ normalMap, side }), unlit: true },
       ];
@@ -280,6 +310,7 @@
           material: new THREE.MeshBasicMaterial({ vertexColors: true, side }) });
       }
       layers.forEach((layer) => {
+        this.finish(layer.material, layer.unlit ? { value: 0 } : this.shade);
         layer.normalMap = layer.material.normalMap;
         layer.button = make("button", { type: "button", "aria-pressed": "false", text: layer.title,
           on: () => this.show(layer) });
@@ -309,7 +340,9 @@
     }
 
     showLamp() {
-      find("lamp").style.display = this.shown.unlit || !find("lit").checked ? "none" : "";
+      const shown = !this.shown.unlit && find("lit").checked;
+      find("lamp").style.display = find("orbit").style.display = shown ? "" : "none";
+      this.orbit(false);
     }
 
     paint(layer) {
@@ -358,9 +391,8 @@
       this.lamps.add(this.ray);
     }
 
-    // Two points of the surface and the line between them, drawn over it.
+    // Points of the surface and lines between them, drawn over it: of `measure` and `profile`.
     makeRuler() {
-      this.ends = [];
       const look = { color: 0xffd24a, depthTest: false, transparent: true };
       const geometry = new THREE.BufferGeometry();
       this.ruler = new THREE.Group();
@@ -368,33 +400,94 @@
         new THREE.Points(geometry, new THREE.PointsMaterial({ ...look, size: 9, sizeAttenuation: false })));
       for (const one of this.ruler.children) one.frustumCulled = false;
       this.world.add(this.ruler);
-      find("measure").addEventListener("click", () => this.mark(null));
-      this.measuring = false;
+      for (const tool of Object.keys(TOOLS)) find(tool).addEventListener("click", () => this.use(tool));
+      this.use(null);
     }
 
-    // Add an end point; without one, start or stop measuring.
-    mark(place) {
-      const stopped = place === null && this.measuring;
-      this.measuring = !stopped;
-      this.ends = place === null ? [] : [...this.ends.slice(0, this.ends.length % 2), place];
-      this.ruler.visible = this.ends.length > 0;
-      if (this.ruler.visible) this.ruler.children[0].geometry.setFromPoints([this.ends[0], this.ends.at(-1)]);
-      const { factor, name } = data.unit;
-      find("measured").textContent = this.ends.length < 2
-        ? `Click the ${this.ends.length ? "second" : "first"} point on the surface.`
-        : `${digits(factor * this.ends[0].distanceTo(this.ends[1]), 3)} ${name}`;
-      find("measured").hidden = stopped;
-      find("measure").setAttribute("aria-pressed", String(!stopped));
+    // Start a tool; the one in use is stopped.
+    use(tool) {
+      this.tool = this.tool === tool ? null : tool;
+      for (const name of Object.keys(TOOLS)) find(name).setAttribute("aria-pressed", String(this.tool === name));
+      find("measured").hidden = !this.tool;
+      this.controls.enableRotate = this.tool !== "profile"; // a line is drawn instead
+      this.ends = [];
+      this.report(TOOLS[this.tool] || "", []);
+    }
+
+    // Show a text, the curve of a profile, and lines over the surface.
+    report(text, line, curve = null) {
+      find("measured").textContent = text;
+      find("graph").toggleAttribute("hidden", !curve);
+      if (curve) this.plot(curve);
+      this.ruler.visible = line.length > 0;
+      this.ruler.children[1].visible = !curve;
+      this.ruler.children.forEach((one) => one.geometry.dispose());
+      const geometry = new THREE.BufferGeometry().setFromPoints(line);
+      for (const one of this.ruler.children) one.geometry = geometry;
       this.draw();
     }
 
-    // The point of the surface under the pointer.
-    under(event) {
+    // Add an end point of the distance.
+    mark(place) {
+      this.ends = [...this.ends.slice(0, this.ends.length % 2), place];
+      const [first, last] = [this.ends[0], this.ends.at(-1)];
+      this.report(this.ends.length < 2 ? "Click the second point on the surface."
+        : length(first.distanceTo(last)), [first, last]);
+    }
+
+    // The ray through a point of the window.
+    caster(x, y) {
       const box = this.canvas.getBoundingClientRect();
       const caster = new THREE.Raycaster();
-      caster.setFromCamera(new THREE.Vector2(2 * (event.clientX - box.left) / box.width - 1,
-        1 - 2 * (event.clientY - box.top) / box.height), this.camera);
-      return caster.intersectObject(this.object)[0]?.point;
+      caster.setFromCamera(new THREE.Vector2(2 * (x - box.left) / box.width - 1,
+        1 - 2 * (y - box.top) / box.height), this.camera);
+      return caster;
+    }
+
+    // The facets that a plane cuts, as a surface.
+    cut(normal, origin) {
+      const { index, attributes: { position } } = this.object.geometry, place = new THREE.Vector3();
+      const sides = Array.from({ length: position.count },
+        (_, at) => place.fromBufferAttribute(position, at).sub(origin).dot(normal) > 0);
+      const corners = [];
+      for (let at = 0; at < index.count; at += 3) {
+        const [a, b, c] = [index.getX(at), index.getX(at + 1), index.getX(at + 2)];
+        if (sides[a] !== sides[b] || sides[a] !== sides[c]) corners.push(a, b, c);
+      }
+      const geometry = new THREE.BufferGeometry().setAttribute("position", position).setIndex(corners);
+      geometry.boundingSphere = this.object.geometry.boundingSphere;
+      return new THREE.Mesh(geometry, this.object.material);
+    }
+
+    // Section of the surface under a line of the window: height over the line between the ends.
+    profile([x0, y0], [x1, y1]) {
+      const eye = this.camera.position;
+      const [first, last] = [this.caster(x0, y0), this.caster(x1, y1)].map((one) => one.ray.direction);
+      const normal = first.clone().cross(last).normalize();
+      const facets = this.cut(normal, eye);
+      const hits = Array.from({ length: SAMPLES }, (_, at) => {
+        const share = at / (SAMPLES - 1);
+        return this.caster(x0 + share * (x1 - x0), y0 + share * (y1 - y0)).intersectObject(facets)[0]?.point;
+      });
+      const found = hits.filter(Boolean), start = found[0];
+      if (found.length < 2) return this.report("The line misses the surface.", []);
+      const along = found.at(-1).clone().sub(start).normalize(), up = along.clone().cross(normal);
+      if (up.dot(eye.clone().sub(start)) < 0) up.negate();
+      const { factor } = data.unit;
+      const curve = hits.map((hit) => hit && [along, up].map((axis) => factor * hit.clone().sub(start).dot(axis)));
+      const line = hits.flatMap((hit, at) => hit && hits[at + 1] ? [hit, hits[at + 1]] : []);
+      return this.report(`${length(start.distanceTo(found.at(-1)))} from end to end`, line, curve);
+    }
+
+    // Draw heights; gaps remain where the line misses the surface.
+    plot(curve) {
+      const found = curve.filter(Boolean), [xs, ys] = [0, 1].map((at) => found.map((one) => one[at]));
+      const [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+      find("graph").querySelector(".curve").setAttribute("d", curve.map((one, at) => one
+        && `${curve[at - 1] ? "L" : "M"}${52 + 224 * (one[0] - left) / (right - left || 1)} `
+          + `${98 - 90 * (one[1] - low) / (high - low || 1)}`).join(""));
+      const texts = [high, low, left, right].map((one) => digits(Math.abs(one) < 1e-6 * right ? 0 : one, 3));
+      find("graph").querySelectorAll("text").forEach((one, at) => { one.textContent = texts[at]; });
     }
 
     listen() {
@@ -407,6 +500,7 @@
       find("detail").addEventListener("change", () => this.show(this.shown));
       find("ambient").addEventListener("input", () => { this.lamp.fitted = null; this.draw(); });
       find("lit").addEventListener("change", () => { this.showLamp(); this.draw(); });
+      find("orbit").addEventListener("click", () => this.orbit(!this.orbiting));
       const environment = find("environment");
       environment.parentElement.hidden = !data.views.some((view) => view.environment);
       environment.addEventListener("change", () => {
@@ -424,6 +518,7 @@
       const lamp = find("lamp");
       const point = (event) => {
         const box = lamp.getBoundingClientRect();
+        this.orbit(false);
         this.aim((2.3 * (event.clientX - box.left)) / box.width - 1.15,
           1.15 - (2.3 * (event.clientY - box.top)) / box.height);
       };
@@ -433,17 +528,57 @@
         const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
         if (!step) return;
         event.preventDefault();
+        this.orbit(false);
         const { x, y } = this.direction();
         this.aim(x + step[0], y + step[1]);
       });
-      let down = null;
-      this.canvas.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
-      this.canvas.addEventListener("pointerup", (event) => {
-        if (!down || Math.hypot(event.clientX - down[0], event.clientY - down[1]) >= 5) return;
-        const place = this.measuring && this.under(event);
-        if (place) this.mark(place);
-        else if (!this.measuring) this.pick(event);
+      let down = null; // where the primary pointer was pressed
+      this.canvas.addEventListener("pointerdown", (event) => {
+        down = event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;
       });
+      this.canvas.addEventListener("pointermove", (event) => {
+        if (down && event.buttons && this.tool === "profile") this.profile(down, [event.clientX, event.clientY]);
+      });
+      this.canvas.addEventListener("pointerup", (event) => {
+        const still = down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 5;
+        down = null;
+        if (!still) return;
+        const place = this.tool === "measure" && this.caster(event.clientX, event.clientY).intersectObject(this.object)[0];
+        if (place) this.mark(place.point);
+        else if (!this.tool) this.pick(event);
+      });
+      find("save-picture").addEventListener("click", () => {
+        this.drawNow(); // the canvas is empty after a frame
+        this.canvas.toBlob((blob) => save("png", blob));
+      });
+      find("save-mesh").addEventListener("click", () => save("ply", new Blob(this.ply())));
+    }
+
+    // The surface as binary PLY in the frame of mesh.ply, without the cuts of its texture.
+    ply() {
+      const { index, attributes: { position, normal } } = this.object.geometry;
+      const { offset_world: offset = [0, 0, 0] } = this.object.userData;
+      const numbers = new Map(), kept = [];
+      const welded = Array.from({ length: position.count }, (_, at) => {
+        const key = [position.getX(at), position.getY(at), position.getZ(at)].join();
+        if (!numbers.has(key)) numbers.set(key, kept.push(at) - 1);
+        return numbers.get(key);
+      });
+      const header = ["ply", "format binary_little_endian 1.0", `element vertex ${kept.length}`,
+        ...["x", "y", "z"].map((one) => `property double ${one}`),
+        ...["nx", "ny", "nz"].map((one) => `property float ${one}`),
+        `element face ${index.count / 3}`, "property list uchar int vertex_indices", "end_header", ""];
+      const vertices = new DataView(new ArrayBuffer(36 * kept.length));
+      kept.forEach((at, row) => ["getX", "getY", "getZ"].forEach((get, axis) => {
+        vertices.setFloat64(36 * row + 8 * axis, position[get](at) + offset[axis], true);
+        vertices.setFloat32(36 * row + 24 + 4 * axis, normal[get](at), true);
+      }));
+      const faces = new DataView(new ArrayBuffer((13 * index.count) / 3));
+      for (let face = 0; face < index.count / 3; face++) {
+        faces.setUint8(13 * face, 3);
+        for (let at = 0; at < 3; at++) faces.setInt32(13 * face + 1 + 4 * at, welded[index.getX(3 * face + at)], true);
+      }
+      return [header.join("\n"), vertices, faces];
     }
 
     // Set the light to a point of the hemisphere on the viewer's side.
@@ -451,17 +586,37 @@
       const length = Math.hypot(x, y);
       const shrink = Math.min(1, 0.999 / (length || 1));
       [x, y] = [x * shrink, y * shrink];
-      this.lamp = { view: new THREE.Vector3(x, y, Math.sqrt(1 - x * x - y * y)), fitted: null };
+      const towards = new THREE.Vector3(x, y, Math.sqrt(1 - x * x - y * y));
+      if (this.plain) this.raking = towards;
+      else this.lamp = { view: towards, fitted: null };
       this.draw();
     }
 
-    // `shape` has the same light for all photographs: a lamp behind the camera would flatten it.
+    // Let the lamp circle clockwise, at its distance from the middle of the disc; or stop it.
+    orbit(wanted) {
+      find("orbit").setAttribute("aria-pressed", String(wanted));
+      if (this.orbiting === wanted) return;
+      this.orbiting = wanted;
+      let { x, y } = this.direction();
+      if (Math.hypot(x, y) < 0.3) [x, y] = [0, 0.9]; // a circle that changes little
+      const [away, start] = [Math.hypot(x, y), Math.atan2(y, x)];
+      let began = null;
+      const turn = (now) => {
+        if (!this.orbiting) return;
+        const angle = start - (2 * Math.PI * (now - (began ??= now))) / ORBIT_MS;
+        this.aim(away * Math.cos(angle), away * Math.sin(angle));
+        requestAnimationFrame(turn);
+      };
+      if (wanted) requestAnimationFrame(turn);
+    }
+
+    // `shape` has a light of its own for all photographs: a lamp behind the camera would flatten it.
     get plain() { return this.shown.title === "shape"; }
 
     get fitted() { return this.plain ? null : this.lamp.fitted; }
 
     direction() {
-      if (!this.fitted) return this.lamp.view;
+      if (!this.fitted) return this.plain ? this.raking : this.lamp.view;
       return vector(this.fitted.direction).transformDirection(this.camera.matrixWorldInverse);
     }
 
@@ -499,6 +654,7 @@
         return this.leave(true);
       }
       this.behind = view;
+      if (!this.plain) this.orbit(false); // the lamp goes to the photograph's light
       find("fade").hidden = false;
       this.camera.matrixWorld.multiplyMatrices(view.worldFromCamera, OPENGL);
       this.camera.matrixWorld.decompose(this.camera.position, this.camera.quaternion, this.camera.scale);

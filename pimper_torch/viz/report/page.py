@@ -15,7 +15,7 @@ from torch import Tensor
 from pimper_torch.io.assets.placement import Placement
 from pimper_torch.io.assets.write import write_asset
 from pimper_torch.records import Mesh, Removal, Silhouettes, SparseScene, TexturedMesh
-from pimper_torch.records.shapes import PerVertex
+from pimper_torch.records.shapes import PerVertex, VertexMask
 from pimper_torch.runtime.ledger import closing_line
 from pimper_torch.stages.texturing.bake import halved
 from pimper_torch.viz.report.predictions import Json, view_entries
@@ -43,6 +43,7 @@ def write_page(
     mesh: Mesh,
     asset: bytes,
     openness: PerVertex,
+    seen: VertexMask,
     scene: SparseScene,
     silhouettes: Silhouettes,
     reference: int,
@@ -60,18 +61,19 @@ def write_page(
             without these, it is in that frame.
         summary: Contents of ``summary.json``; ``settings`` likewise of ``config.yaml``.
         openness: Of the asset's vertices, by :mod:`~pimper_torch.viz.report.openness`.
+        seen: Whether a photograph shows each of them.
         images: Of every view, by :func:`~pimper_torch.viz.report.predictions.view_images`.
         lights_world: First-order light of every view, up to a scale; NaN where unknown.
         layers: In addition to those of ``mesh``; the page skips those that the asset lacks.
     """
     unit = length_unit(mesh, (summary.get("scale") or {}).get("unit"))
-    shade = (255 * openness).round().byte().numpy().tobytes()
     data = {
         "title": title,
         "reference": reference,
         "up": up_world(scene.cameras).tolist(),
         "unit": asdict(unit),
-        "openness": base64.b64encode(shade).decode("ascii"),
+        "openness": _bytes((255 * openness).round()),
+        "seen": _bytes(seen),
         "views": view_entries(scene, silhouettes, images, lights_world),
         "layers": [asdict(layer) for layer in (*surface_layers(mesh, unit), *layers)],
         "summary": {name: summary.get(name) for name in _SHOWN},
@@ -100,6 +102,10 @@ def asset_within(asset: TexturedMesh, path: Path, placement: Placement) -> bytes
         smaller, coarser = Path(folder) / path.name, halved(asset)
         write_asset(coarser, smaller, placement)
         return asset_within(coarser, smaller, placement)
+
+
+def _bytes(values: Tensor) -> str:
+    return base64.b64encode(values.byte().numpy().tobytes()).decode("ascii")
 
 
 def _read(name: str) -> str:
