@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 from scenes import trusted
 
+from pimper_torch.geometry.visibility import visible_vertices
 from pimper_torch.io.assets.gltf import MATTE, gltf_of
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.write import write_asset
@@ -109,6 +110,7 @@ def shown(tmp_path_factory):
         "mesh": mesh,
         "asset": (folder / "asset.glb").read_bytes(),
         "openness": openness(asset.mesh),
+        "seen": visible_vertices(asset.mesh, scene.cameras).any(dim=0),
         "scene": scene,
         "silhouettes": (silhouettes := trusted(inside, "found")),
         "reference": 0,

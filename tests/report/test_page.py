@@ -57,6 +57,7 @@ def written(result, path, **changed):
         "mesh": result.mesh,
         "asset": b"glTF and so on",
         "openness": openness(result.mesh),
+        "seen": visible_vertices(result.mesh, result.cameras).any(dim=0),
         "scene": result.scene,
         "silhouettes": result.silhouettes,
         "reference": 1,
