@@ -70,6 +70,7 @@ class CommonOptions:
         texture: Format of the textures in asset.glb.
         asset_cameras: Include the cameras of the photographs in asset.glb.
         no_report: Do not write report.html.
+        open: Open report.html at the end.
         fresh: Ignore the records that earlier runs kept.
         cache: Folder for the records of stages, which later runs reuse; OUT/.stages by default.
         max_kept: Maximum size of this folder, such as 2GB.
@@ -89,6 +90,7 @@ class CommonOptions:
     texture: TextureFormat = "png"
     asset_cameras: Flag = False
     no_report: Flag = False
+    open: Flag = False
     fresh: Flag = False
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     max_kept: str = MAX_KEPT
