@@ -189,7 +189,7 @@ class Job:
 
 # Rarely used options, listed by `--help-all` only.
 _RARE = (
-    *("--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
+    *("--scales", "--on-failure", "--max-kept", "--camera-distance", "--markers", "--unit"),
     *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
     *("--silhouettes", "--segmenter", "--object-at", "--usdz", "--texture", "--asset-cameras"),
 )

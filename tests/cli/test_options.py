@@ -223,7 +223,7 @@ def listed(command, capsys, page="--help-all"):
     return {name for line in lines for name in re.findall(r"(?:^|, )(--?[\w.-]+)", line)} - COMMON
 
 
-COMMON = {"-h", "--help", "--help-all", "-q", "--quiet", "--json", "--log-level"}
+COMMON = {"-h", "--help", "--help-all", "-q", "--quiet", "-v", "--verbose", "--json", "--log-level"}
 
 
 @pytest.mark.parametrize("command", RUNS)
