@@ -33,6 +33,7 @@ OF_EVERY_COMMAND = """\
 
 all commands:
   -q, --quiet             Print only results, warnings and errors.
+  -v, --verbose           Print also figures of stages: --log-level debug.
   --json                  Print events as lines of JSON to standard output.
   --log-level LEVEL       error, warning, info or debug. (default: info)
   -h, --help              Print this page.

@@ -71,6 +71,7 @@ class CommonOptions:
         texture: Format of the textures in asset.glb.
         asset_cameras: Include the cameras of the photographs in asset.glb.
         no_report: Do not write report.html.
+        open: Open report.html at the end.
         fresh: Ignore the records that earlier runs kept.
         cache: Folder for the records of stages, which later runs reuse; OUT/.stages by default.
         max_kept: Maximum size of this folder, such as 2GB.
@@ -90,6 +91,7 @@ class CommonOptions:
     texture: TextureFormat = "png"
     asset_cameras: Flag = False
     no_report: Flag = False
+    open: Flag = False
     fresh: Flag = False
     cache: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     max_kept: str = MAX_KEPT
@@ -188,7 +190,7 @@ class Job:
 
 # Rarely used options, listed by `--help-all` only.
 _RARE = (
-    *("--scales", "--max-kept", "--camera-distance", "--markers", "--unit"),
+    *("--scales", "--on-failure", "--max-kept", "--camera-distance", "--markers", "--unit"),
     *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
     *("--silhouettes", "--segmenter", "--object-at", "--usdz", "--texture", "--asset-cameras"),
 )

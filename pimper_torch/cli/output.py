@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 Level = Literal["error", "warning", "info", "debug"]
 _LEVELS: tuple[Level, ...] = get_args(Level)
-_QUIET = ("-q", "--quiet")
+_SWITCHES: dict[str, Level] = {
+    **dict.fromkeys(("-q", "--quiet"), "warning"),
+    **dict.fromkeys(("-v", "--verbose"), "debug"),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +35,9 @@ class Output:
     - ``stage-begin``: ``stage``. ``progress``: ``stage``, ``done``, ``total``. Both and
       ``stage-end``: ``seconds_left`` of a run, estimated; ``null`` for other commands.
     - ``view``: ``address`` of the page of the viewer.
-    - ``preview``: ``path`` of an image of the coarse surface, deleted when the run ends.
+    - ``preview``: ``path`` of an image that is replaced by each, and deleted when the run ends;
+      ``shows``: points, coarse surface, or pass 1 and so on.
+    - ``stopping``: after Ctrl-C, ``passes`` whose result is written, of ``total``.
     - ``stage-end``: ``stage``, ``seconds``, ``peak_memory_mb``, ``figures``, and ``kept``:
       whether the record is from an earlier run; time and memory are then those of that run.
     - ``warning``: ``message``. ``finding``, of ``doctor``: ``check``, ``severity``, ``found``,
@@ -76,6 +81,13 @@ class Output:
         if self.shows("info"):
             self.emit(text)
 
+    def link(self, path: Path) -> str:
+        """Return a path as text, which terminals open on a click."""
+        stream = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # behind a bar
+        if not stream.isatty():
+            return str(path)
+        return f"\033]8;;{path.absolute().as_uri()}\033\\{path}\033]8;;\033\\"
+
     def result(self, paths: Mapping[str, Path] | None = None, **figures: object) -> None:
         """Write the event of a command's success."""
         self.event("result", paths=paths or {}, **figures)
@@ -93,7 +105,7 @@ class Output:
 
     @contextmanager
     def observer(self) -> Iterator[tuple["Forecast", "RunTable"]]:
-        """Display the stages of the ``with`` block: a bar or a line per stage, or events.
+        """Display the stages of the ``with`` block: one bar, a line per stage, or events.
 
         Yields:
             The observer of the stages, which estimates the time left, and their reports.
@@ -108,7 +120,7 @@ class Output:
         if self.as_json:
             display = nullcontext(Events(self.event, 0.5))
         elif self.shows("info"):
-            display = Bars(Console(stderr=True), None if self.shows("debug") else 3)
+            display = Bars(Console(stderr=True), self.shows("debug"))
         with display as observer, observed(observer) as table:
             yield observer, table
 
@@ -120,13 +132,13 @@ def split(arguments: Sequence[str]) -> tuple[Output, list[str]]:
     >>> output.as_json, rest
     (True, ['photos', '-o', 'out'])
     """
-    level, rest = "warning" if {*_QUIET} & {*arguments} else "info", []
+    level, rest = str(next((_SWITCHES[one] for one in arguments if one in _SWITCHES), "info")), []
     words = iter(arguments)
     for word in words:
         name, equals, value = word.partition("=")
         if name == "--log-level":
             level = value if equals else next(words, "")
-        elif word not in (*_QUIET, "--json"):
+        elif word not in (*_SWITCHES, "--json"):
             rest.append(word)
     require(level in _LEVELS, "--log-level", level, f"one of {', '.join(_LEVELS)}")
     return Output(as_json="--json" in arguments, level=cast(Level, level)), rest
@@ -150,4 +162,7 @@ def print_message(kind: str, message: str) -> None:
 
     color = "bold red" if kind == "error" else "bold yellow"
     text = Text.assemble((f"{kind}: ", color), " ".join(message.split()))
-    Console(stderr=True, soft_wrap=True).print(text)
+    console = Console(stderr=True, soft_wrap=True)
+    with console.capture() as shown:
+        console.print(text)
+    sys.stderr.write(shown.get())  # which a bar prints above itself

@@ -15,6 +15,16 @@ SIGNALS = tuple(
 )
 
 
+watcher: int | None = None
+"""Process that passes signals on to this one, if there is one."""
+
+
+def taken_up() -> None:
+    """Tell the watcher that a signal was handled: the next one counts as the first."""
+    if watcher is not None:
+        os.kill(watcher, signal.SIGUSR1)
+
+
 class Stopped(KeyboardInterrupt):
     """Exception for a signal that stops the process.
 

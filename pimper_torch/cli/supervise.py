@@ -2,8 +2,8 @@
 
 If the worker is killed, for example because memory ran out, the watcher survives and reports it.
 The watcher also passes on signals, which a long library call does not handle: a worker that has not
-ended a few seconds after SIGTERM or SIGHUP is killed; a second Ctrl-C kills it immediately. Without
-``fork``, as on Windows, there is only one process.
+ended a few seconds after SIGTERM or SIGHUP is killed; a second Ctrl-C kills it immediately, unless
+the worker has taken up the first. Without ``fork``, as on Windows, there is only one process.
 """
 
 import ctypes
@@ -16,6 +16,7 @@ import time
 import types
 from contextlib import suppress
 
+from pimper_torch.cli import stopping
 from pimper_torch.cli.stopping import SIGNALS
 from pimper_torch.runtime.scratch import remove_scratch
 
@@ -56,10 +57,15 @@ def main() -> int:
             else:
                 os.kill(worker, signal.SIGKILL if again else number)
 
+    def forget(number: int, frame: types.FrameType | None) -> None:
+        first.clear()
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # for example by nohup
             signal.signal(number, handle)
     if worker == 0:
+        stopping.watcher = watcher
         exit_with_parent(watcher)
         faulthandler.enable()  # a crash prints the stacks of all threads
         code = _run()  # signals stay blocked until they can be raised
@@ -68,6 +74,7 @@ def main() -> int:
             os._exit(code)
         return code
     signal.signal(signal.SIGALRM, handle)
+    signal.signal(signal.SIGUSR1, forget)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     _, status = os.waitpid(worker, 0)  # signals are handled meanwhile
     signal.setitimer(signal.ITIMER_REAL, 0)

@@ -17,6 +17,7 @@ from pimper_torch.export.picture_files import write_mask
 from pimper_torch.export.pictures import Pictures, completed, drawn
 from pimper_torch.export.result_folder.folders import written_whole
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
+from pimper_torch.geometry.pinholes import up_world
 from pimper_torch.io.assets.mesh_files import MeshFiles as MeshFiles
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.usd import write_usdz
@@ -35,7 +36,6 @@ from pimper_torch.stages.sfm.sparse_scene import write_model
 from pimper_torch.viz.maps import normal_colors, view_maps
 from pimper_torch.viz.report.page import asset_within, write_page
 from pimper_torch.viz.tiles import array
-from pimper_torch.viz.turn import up_world
 
 RESULT_NAMES = (
     "mesh.ply",

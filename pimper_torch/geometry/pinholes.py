@@ -1,4 +1,4 @@
-"""Pinhole cameras from a viewpoint, a target and a focal length."""
+"""Pinhole cameras from a viewpoint, a target and a focal length, and the up direction."""
 
 import torch
 from jaxtyping import Float
@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 
 from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Cameras
-from pimper_torch.records.shapes import Poses, ViewVectors
+from pimper_torch.records.shapes import Poses, Vector, ViewVectors
 
 
 def look_at(
@@ -30,3 +30,13 @@ def pinholes(cam_from_world: Poses, focal_px: float, width: int, height: int) ->
         cam_from_world=cam_from_world,
         sizes_px=torch.tensor([[width, height]]).repeat(num_views, 1),
     )
+
+
+def up_world(cameras: Cameras) -> Vector:
+    """Return the up direction of images: y, unless the photographs contradict it.
+
+    The frame has y up if a plane or level cameras determined it; otherwise up is the mean up
+    direction of the photographs.
+    """
+    mean = normalize(-cameras.cam_from_world[:, 1, :3].mean(dim=0), dim=0)
+    return torch.tensor([0.0, 1.0, 0.0]).to(mean) if float(mean[1]) > 0.5 else mean

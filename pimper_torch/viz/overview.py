@@ -5,7 +5,7 @@ from io import BytesIO
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate, max_pool2d, pad
@@ -14,11 +14,12 @@ from pimper_torch.geometry.poisson import reduced
 from pimper_torch.geometry.projection import project
 from pimper_torch.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale
-from pimper_torch.records import Reconstruction, Silhouettes
-from pimper_torch.records.scene import CoarseMesh, SparseScene
-from pimper_torch.records.shapes import Mask, Vertices
+from pimper_torch.records import Mesh, Reconstruction, Silhouettes
+from pimper_torch.records.scene import SparseScene
+from pimper_torch.records.shapes import Mask, Points, Vertices
 from pimper_torch.records.views import Cameras, Views
 from pimper_torch.runtime.mapped import drop_pages
+from pimper_torch.stages.sfm.sparse_scene import point_colors
 from pimper_torch.viz import tiles
 from pimper_torch.viz.maps import normal_colors, view_maps
 from pimper_torch.viz.render import crop, crop_to, image_bounds, orbit, shade
@@ -182,29 +183,60 @@ def border(mask: Mask) -> Mask:
 
 @torch.no_grad()
 def draw_preview(
-    scene: SparseScene, coarse: CoarseMesh, path: Path | str, panel_px: int = 360
+    scene: SparseScene,
+    mesh: Mesh | None,
+    reference: int,
+    path: Path | str,
+    panel_px: int = 360,
 ) -> None:
-    """Draw the reference photograph and three views of the coarse surface as PNG.
+    """Draw a photograph and three views of the surface as PNG.
 
     Args:
+        mesh: None draws the sparse points, except the outermost ones.
+        reference: View of the photograph.
         path: An existing file is replaced when the new one is complete.
         panel_px: Longer side of an image of the surface, and height of the photograph.
     """
     path = Path(path)
-    camera = scene.cameras.take([coarse.reference]).to("cpu")
-    mesh = coarse.mesh.to("cpu")
+    camera = scene.cameras.take([reference]).to("cpu")
     width, height = camera.sizes_px[0].tolist()
-    image = scene.views.images[coarse.reference, :, :height, :width].cpu()[None]
+    image = scene.views.images[reference, :, :height, :width].cpu()[None]
     size = (panel_px, max(1, round(panel_px * width / height)))
     photograph = interpolate(image, size=size, mode="area")[0].movedim(0, -1)
-    center = mesh.vertices_world.mean(dim=0)
+    if mesh is None:
+        points, colors = scene.points_world.cpu(), point_colors(scene).cpu()
+        low, high = points.quantile(points.new_tensor([0.05, 0.95]), dim=0)
+        inner = ((low <= points) & (points <= high)).all(dim=1)
+        points, colors = points[inner], colors[inner]
+    else:
+        mesh = mesh.to("cpu")
+        points = mesh.vertices_world
     panels = [to_bytes(photograph.expand(*size, 3))]
     for angle in (0.0, -40.0, 40.0):
-        rotated = crop_to(orbit(camera, center, angle), mesh.vertices_world, panel_px, 0.05)
-        drawn = (255 * shade(mesh, rotated)).round().to(torch.uint8)
+        rotated = crop_to(orbit(camera, points.mean(dim=0), angle), points, panel_px, 0.05)
+        if mesh is None:
+            drawn = _dots(points, colors, rotated)
+        else:
+            drawn = (255 * shade(mesh, rotated)).round().to(torch.uint8)
         above = (panel_px - len(drawn)) // 2
         below = panel_px - len(drawn) - above
         panels.append(pad(drawn, (0, 0, 0, 0, above, below), value=255))
     fresh = path.with_name(f"{path.name}.new")
     Image.fromarray(torch.cat(panels, dim=1).numpy()).save(fresh, format="PNG")
     fresh.replace(path)
+
+
+def _dots(
+    points: Points, colors: UInt8[Tensor, "point 3"], camera: Cameras
+) -> UInt8[Tensor, "height width 3"]:
+    """Draw points as squares of two pixels on white; the nearest ones are drawn last."""
+    pixels, depth = project(points, camera.cam_from_world[0], camera.intrinsics[0])
+    order = depth.argsort(descending=True)
+    order = order[depth[order] > 0]
+    width, height = camera.sizes_px[0].tolist()
+    drawn = torch.full((height, width, 3), 255, dtype=torch.uint8)
+    left, top = pixels[order].long().unbind(dim=1)
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        at = (top + down).clamp(0, height - 1), (left + right).clamp(0, width - 1)
+        drawn[at] = colors[order]
+    return drawn

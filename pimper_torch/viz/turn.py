@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from torch.nn.functional import avg_pool2d, normalize
 
-from pimper_torch.geometry.pinholes import look_at, pinholes
+from pimper_torch.geometry.pinholes import look_at, pinholes, up_world
 from pimper_torch.geometry.rigid import rotate
 from pimper_torch.geometry.surfaces import vertex_normals
 from pimper_torch.geometry.visibility import cast_view
@@ -24,16 +24,6 @@ _FRAMES, _FRAME_MS = 30, 100
 _OVERSAMPLING = 2
 _ELEVATION_DEG, _FOV_DEG, _MARGIN = 15.0, 30.0, 1.03
 _QUALITY, _EXPOSURE = 70, 1.4  # the exposure preserves the albedo's brightness under raking light
-
-
-def up_world(cameras: Cameras) -> Vector:
-    """Return the up direction of images: y, unless the photographs contradict it.
-
-    The frame has y up if a plane or level cameras determined it; otherwise up is the mean up
-    direction of the photographs.
-    """
-    mean = normalize(-cameras.cam_from_world[:, 1, :3].mean(dim=0), dim=0)
-    return torch.tensor([0.0, 1.0, 0.0]).to(mean) if float(mean[1]) > 0.5 else mean
 
 
 @torch.no_grad()

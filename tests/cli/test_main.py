@@ -1,13 +1,16 @@
 import errno
+import io
 import json
 import math
 import os
+import re
 import shlex
 import signal
 import subprocess
 import sys
 import tempfile
 import warnings
+import webbrowser
 from pathlib import Path
 
 import pytest
@@ -16,6 +19,7 @@ from command_line import run
 from PIL import Image
 
 import pimper_torch as pt
+from pimper_torch.chains.chain import Step
 from pimper_torch.cli.output import Output
 from pimper_torch.export.result_folder.marker import MARKER, seal
 from pimper_torch.export.results import RESULT_NAMES
@@ -48,10 +52,48 @@ def test_a_run_writes_the_result_and_prints_its_path(reconstruct, chain, tmp_pat
     assert sparse is None
     printed = capsys.readouterr()
     assert f"{tmp_path}/out/mesh.ply" in printed.out
-    assert "3 of 4 photographs" in printed.out
     for stage in ("read", "warp", "write"):
         assert stage in printed.err
+    assert "samples 1,200" not in printed.err
+    verdict, place, took = printed.out.splitlines()
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert verdict == summary["verdict"]["text"]
+    assert place.endswith(f"{tmp_path}/out/report.html shows it.")
+    stages = tmp_path / "out" / ".stages"
+    size = sum(path.stat().st_size for path in stages.glob("*.safetensors")) / 1e6
+    expected = (
+        rf"It took (\d+) s; {stages} keeps {size:.0f} MB for further runs, and `pimper clean "
+    )
+    (seconds,) = re.match(expected, took).groups()
+    assert int(seconds) >= round(summary["seconds"]) - 1
+
+
+@pytest.mark.parametrize("option", ["-v", "--verbose", "--log-level=debug"])
+def test_the_table_and_figures_of_stages_are_shown_on_request(reconstruct, capsys, option):
+    assert reconstruct(option) == 0
+    printed = capsys.readouterr()
     assert "samples 1,200" in printed.err
+    assert "stage             seconds   peak MB" in printed.out
+    assert "3 of 4 photographs" in printed.out
+
+
+@pytest.mark.parametrize(("given", "opened"), [([], 1), (["--no-report"], 0), (["--json"], 0)])
+def test_the_report_is_opened_on_request(reconstruct, tmp_path, monkeypatch, given, opened):
+    pages = []
+    monkeypatch.setattr(webbrowser, "open", pages.append)
+    assert reconstruct("--open", *given) == 0
+    assert pages == [(tmp_path / "out" / "report.html").as_uri()] * opened
+    assert reconstruct("--overwrite") == 0
+    assert len(pages) == opened
+
+
+def test_a_path_is_a_link_on_a_terminal_alone(monkeypatch, tmp_path):
+    path = tmp_path / "a b.png"
+    assert Output().link(path) == str(path)
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    uri = "file://" + str(path).replace(" ", "%20")
+    assert Output().link(path) == f"\x1b]8;;{uri}\x1b\\{path}\x1b]8;;\x1b\\"
 
 
 @pytest.mark.parametrize(
@@ -78,7 +120,7 @@ def test_a_run_ends_with_the_removals_of_guards(
     )
     reduced = reconstruction.replace(left_out=(gone,))
     chain.__call__ = lambda *_: reduced
-    assert reconstruct() == 0
+    assert reconstruct("-v") == 0
     assert "Excluded: 3.png (sfm.missing)." in capsys.readouterr().out
     (written,) = json.loads((tmp_path / "out" / "summary.json").read_text())["left_out"]
     assert Removal(**{**written, "names": tuple(written["names"])}) == gone
@@ -428,18 +470,27 @@ def times(out):
     return {path: path.stat().st_mtime_ns for path in out.iterdir() if path.name != ".stages"}
 
 
-def test_the_coarse_surface_is_a_preview_until_the_run_ends(
+def test_a_picture_of_what_is_found_is_there_until_the_run_ends(
     reconstruct, chain, reconstruction, tmp_path, capsys
 ):
-    out = tmp_path / "out"
+    out, drawn = tmp_path / "out", []
+    picture = out / ".stages" / "preview.png"
     assert reconstruct() == 0
     former = times(out)
     capsys.readouterr()
+    fields = {"heights": reconstruction.patches, "surface": reconstruction}
+    step = Step(scale=0.5, last=False, prepared=reconstruction, **fields)
 
     def show(self):
-        self.preview(reconstruction.scene, reconstruction.coarse)
-        with Image.open(out / ".stages" / "preview.png") as picture:
-            assert picture.height == 360
+        drawn.clear()
+        for record in (reconstruction.scene, reconstruction.coarse, step, step):
+            if record is reconstruction.coarse:
+                self.preview(reconstruction.scene, record)
+            else:
+                self.watch(record)
+            with Image.open(picture) as image:
+                assert image.height == 360
+            drawn.append(picture.read_bytes())
 
     def show_and_fail(self):
         show(self)
@@ -448,13 +499,17 @@ def test_the_coarse_surface_is_a_preview_until_the_run_ends(
 
     chain.work = show_and_fail
     assert reconstruct("--json", "--overwrite", "--fresh") == 2
-    (printed,) = [one for one in events(capsys) if one["event"] == "preview"]
-    assert printed["path"] == str(out / ".stages" / "preview.png")
+    printed = [one for one in events(capsys) if one["event"] == "preview"]
+    assert [one["shows"] for one in printed] == ["points", "coarse surface", "pass 1", "pass 2"]
+    assert {one["path"] for one in printed} == {str(picture)}
+    assert len({*drawn}) == 3  # both passes have the same surface
     assert times(out) == former
     chain.work = show
     assert reconstruct("--overwrite", "--fresh") == 0
-    assert f"{printed['path']} shows the coarse surface" in capsys.readouterr().out
+    line = f"{picture} shows what is found so far, until the run ends."
+    assert capsys.readouterr().out.count(line) == 1
     assert times(out).keys() == former.keys()
+    assert not picture.exists()
 
 
 def test_values_without_json_form_become_null_or_text(capsys):

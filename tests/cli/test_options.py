@@ -29,7 +29,7 @@ RUNS = {
         "--faces all --max-memory 20GB --scales (0.5,) --on-failure fail "
         "--hold-out 2 --preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
-        "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj "
+        "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj --open "
         "--usdz --texture webp --asset-cameras "
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
         "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report "
@@ -47,7 +47,7 @@ RUNS = {
         "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
         "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
         "--usdz --texture jpeg --asset-cameras --max-kept 1.5GB --max-memory 20GB "
-        "--on-failure skip --view --hold-out 0"
+        "--on-failure skip --view --hold-out 0 --open"
     ],
     "render": [
         "{ball} --out {out} {tiny} --overwrite --seed 3 --path arc --span-deg 20 --fill 0.5 "
@@ -223,7 +223,7 @@ def listed(command, capsys, page="--help-all"):
     return {name for line in lines for name in re.findall(r"(?:^|, )(--?[\w.-]+)", line)} - COMMON
 
 
-COMMON = {"-h", "--help", "--help-all", "-q", "--quiet", "--json", "--log-level"}
+COMMON = {"-h", "--help", "--help-all", "-q", "--quiet", "-v", "--verbose", "--json", "--log-level"}
 
 
 @pytest.mark.parametrize("command", RUNS)

@@ -180,6 +180,23 @@ def test_a_second_ctrl_c_ends_an_uninterruptible_run(tmp_path, late):
     assert ("a second Ctrl-C stops it immediately.\n" in err) is late
 
 
+def test_after_a_ctrl_c_that_was_taken_up_the_next_one_counts_as_the_first(tmp_path):
+    code = f"""
+from pimper_torch.cli.stopping import Stopped, taken_up
+try:
+    {WAITS}
+except Stopped:
+    taken_up()
+{WAITS.removeprefix(READY).strip()}
+"""
+    ran = Ran(tmp_path, at_run(code))
+    os.killpg(ran.process.pid, signal.SIGINT)
+    time.sleep(5)  # longer than the patience
+    assert ran.process.poll() is None
+    os.killpg(ran.process.pid, signal.SIGINT)
+    assert ran.end() == (130, "", "error: interrupted; no result was written.\n")
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="others look once a second")
 def test_the_worker_exits_with_its_parent(tmp_path):
     ran = Ran(tmp_path, at_run(WAITS))

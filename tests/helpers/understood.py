@@ -61,7 +61,8 @@ def option(text: str) -> None:
     """
     words = text.removeprefix("-- ").split()
     named = {word.partition("=")[0] for word in words if word.startswith("--")}
-    if named <= {"--help", "--help-all", "--version", "--quiet", "--json", "--log-level"}:
+    everywhere = {"--quiet", "--verbose", "--json", "--log-level"}
+    if named <= {"--help", "--help-all", "--version"} | everywhere:
         return
     names = [name for name in COMMANDS if name != "config"]  # accepts any text
     having = [name for name in names if named <= {*options(name)}]

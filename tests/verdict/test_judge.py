@@ -12,7 +12,7 @@ from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.records import Materials, Relighting, Silhouettes, ViewErrors, ViewLights
-from pimper_torch.stages.verdict.judge import LIMITS, Judge, score_of
+from pimper_torch.stages.verdict.judge import LIMITS, Judge, in_unit, score_of
 
 judge = Judge()
 
@@ -76,12 +76,26 @@ def expecting(result, error):
 def test_a_result_that_agrees_with_its_photographs_is_good(result):
     found = judge(result)
     assert found.good
-    assert found.text == "Good: from 3 of 3 photographs."
+    assert found.text == "Good: from 3 of 3 photographs; the back was not photographed."
     assert judge(expecting(result, 0.0288)).text == (
-        "Good: from 3 of 3 photographs, with an expected error of 1.00% of the extent."
+        "Good: from 3 of 3 photographs, with an expected error of 1.00% of the extent; the back "
+        "was not photographed."
     )
     assert found.score == min(found.scores.values()) >= 0.5
     assert {"covered", "sticking_out"} <= found.scores.keys() <= LIMITS.keys()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"), [(0.196, "0.2 mm"), (2.345, "2.3 mm"), (1234.0, "1200 mm")]
+)
+def test_the_expected_error_is_in_the_unit_of_a_scaled_result(result, error, said):
+    mesh = expecting(result, error).mesh
+    text = judge(expecting(result, 0.0288)).text
+    assert in_unit(text, mesh, "mm") == text.replace(
+        "1.00% of the extent", f"{said} (1.00% of the extent)"
+    )
+    assert in_unit("Look at a.png.", mesh, "mm") == "Look at a.png."
+    assert in_unit(text, mesh.replace(expected_error=None), "mm") == text
 
 
 def test_unreliable_cameras_are_not_usable(result):

@@ -137,7 +137,7 @@ def test_the_headline_counts(reconstruction):
 def test_the_photograph_and_three_views_of_the_surface_are_side_by_side(reconstruction, tmp_path):
     path = tmp_path / "preview.png"
     coarse = reconstruction.coarse
-    draw_preview(reconstruction.scene, coarse, path, 90)
+    draw_preview(reconstruction.scene, coarse.mesh, coarse.reference, path, 90)
     sheet = drawn(path)
     assert sheet.shape[0] == 90
     own = reconstruction.cameras.take([coarse.reference])
@@ -184,3 +184,24 @@ def test_every_view_has_its_tile_and_its_silhouette():
         assert_close(tile[~drawn], grey.expand(int((~drawn).sum()), 3))
     last = thumbnail_sheet(views, silhouettes, [2, 0], width_px=60, across=2)
     assert torch.equal(last, torch.cat([sheet[20:, :30], sheet[:20, :30]], dim=1))
+
+
+def test_before_there_is_a_surface_the_points_are_drawn_in_their_colours(reconstruction, tmp_path):
+    path, scene = tmp_path / "preview.png", reconstruction.scene
+    grid = torch.linspace(-0.5, 0.5, 20)
+    points = torch.cartesian_prod(grid, grid, torch.zeros(1))
+    far = torch.tensor([[100.0, 0, 0]])
+    none = scene.observation_point[:0]
+    scene = scene.replace(
+        points_world=torch.cat([points, far]),
+        reprojection_errors_px=torch.zeros(401),
+        observation_point=none,
+        observation_view=none,
+        observation_pixels=scene.observation_pixels[:0],
+    )
+    draw_preview(scene, None, 0, path, 90)
+    sheet = drawn(path)
+    width, height = scene.cameras.sizes_px[0].tolist()
+    dots = (sheet[:, round(90 * width / height) :] == 0).all(axis=-1)  # points that nobody observed
+    # Four pixels for each of 324 points; with the far point, all of them would be in a few pixels.
+    assert dots.mean() > 0.1

@@ -5,10 +5,11 @@ from PIL import Image
 from torch.testing import assert_close
 
 from pimper_bench.scenes.procedural_meshes import icosphere
+from pimper_torch.geometry.pinholes import up_world
 from pimper_torch.geometry.projection import project
 from pimper_torch.records import Mesh
 from pimper_torch.viz import turn
-from pimper_torch.viz.turn import circling, draw_turn, up_world
+from pimper_torch.viz.turn import circling, draw_turn
 
 UP = torch.tensor([0.0, 1.0, 0.0])
 

@@ -53,25 +53,30 @@ def planned(
     if num_views > 66:  # each is matched with its 20 most similar views, many pairs twice
         pairs = 14.0 * num_views
     stages = [
-        ("reconstruct", 0.5 if cameras else 0.6 * megapixels + 0.05 * pairs + 1.0 * num_views),
-        ("silhouettes", 0.1 if masks else 1.0 + 0.7 * num_views),
-        ("contours", 0.3 + 0.1 * megapixels),
-        ("coarse_surface", 3.0 + 0.5 * num_views),
+        ("reconstruct", 0.5 if cameras else 0.6 * megapixels + 0.025 * pairs + 0.55 * num_views),
+        ("silhouettes", 0.1 if masks else 1.0 + 0.55 * num_views),
+        ("contours", 0.3 + 0.15 * megapixels),
+        ("coarse_surface", 3.0 + 0.85 * num_views),
+        ("explain", 0.2),
+        ("pyramids", 0.05 * megapixels),
     ]
     for scale in scales:
         stages += [
             ("decompose", 0.1 + 3.0 * one * scale**2),
-            ("light", 3.0),
-            ("photometry", 1.2 * megapixels**0.75 * scale**2),
-            ("fuse", 0.7 + 22.0 * one * scale**2),
-            ("repair", 0.8 * one * scale**2),
+            ("light", 1.8),
+            ("depth_from_light", 0.1 * num_views if scale == scales[0] else 0.0),
+            ("photometry", 1.5 + 0.65 * megapixels**0.75 * scale**2),
+            ("fuse", 0.8 + 26.0 * one * scale**2),
+            ("repair", 1.2 * one * scale**2),
+            ("explain", 0.1 + 1.8 * one * scale**2),
         ]
     return [
-        *stages,
+        *((name, seconds) for name, seconds in stages if seconds),
         ("extract", 0.5 + 4.0 * one * scales[-1] ** 2),
-        ("simplify", 1.7 * one),
-        ("relight", 4.0 + 0.5 * one),
-        ("texture", 1.5 + 3.7 * one),
+        ("simplify", 2.5 * one),
+        ("relight", 5.0 + 0.5 * one),
+        ("texture", 2.0 + 4.0 * one),
+        ("judge_textures", 0.035 * num_views),
         ("draw", 2.0 + 0.1 * num_views + 1.5 * one),
         ("write", 1.0 + 1.0 * one),
     ]

@@ -15,7 +15,7 @@ from pimper_torch.runtime.errors import OutputError
 LOCK, NEW, HOLDER = "lock", "new", "holder.txt"
 """Names in the folder of kept stages: its lock, the result being written, owner of the lock."""
 PREVIEW = "preview.png"
-"""Image of the coarse surface in the folder of kept stages, during a run."""
+"""Image of what is found so far in the folder of kept stages, during a run."""
 
 _PASSING = (HOLDER, PREVIEW, f"{PREVIEW}.new")
 

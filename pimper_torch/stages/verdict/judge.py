@@ -1,5 +1,6 @@
 """The stage that says whether a result is good, and if not, why."""
 
+import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -8,8 +9,9 @@ import torch
 from torch import Tensor
 
 from pimper_torch.geometry.coverage import coverage_by
-from pimper_torch.records import Reconstruction, SilhouetteCoverage, Silhouettes, Verdict
+from pimper_torch.records import Mesh, Reconstruction, SilhouetteCoverage, Silhouettes, Verdict
 from pimper_torch.stages.stage import Stage
+from pimper_torch.stages.verdict.sides import unphotographed
 
 # Values of each figure that score 0, a half and 1: unusable, the last of good results, and best.
 # Fitted to ten captures of the fleet and the demo: docs/decisions.md, "The verdict".
@@ -65,7 +67,7 @@ class _Figure(NamedTuple):
 
 
 def _praise(result: Reconstruction) -> str:
-    """Return what a good result is made of, and how accurate it should be."""
+    """Return what a good result is made of, how accurate it should be, and what it lacks."""
     mesh, count = result.mesh, len(result.scene.views.names)
     text = f"from {count} of {count + len(result.scene.unregistered)} photographs"
     if mesh.expected_error is not None:
@@ -73,7 +75,19 @@ def _praise(result: Reconstruction) -> str:
         text += (
             f", with an expected error of {mesh.expected_error.median() / extent:.2%} of the extent"
         )
+    everything = result.silhouettes.source == "everything"  # has no sides
+    if sides := [] if everything else unphotographed(mesh, result.cameras):
+        verb = "was" if len(sides) == 1 else "were"
+        text += f"; {' and '.join(f'the {side}' for side in sides)} {verb} not photographed"
     return text
+
+
+def in_unit(text: str, mesh: Mesh, unit: str) -> str:
+    """Return the text of a verdict with the expected error also in the unit of the scaled mesh."""
+    if mesh.expected_error is None:
+        return text
+    error = f"{float(f'{mesh.expected_error.median():.2g}'):g} {unit}"
+    return re.sub(r"(?<=expected error of )\S+ of the extent", rf"{error} (\g<0>)", text)
 
 
 def score_of(name: str, value: float) -> float:

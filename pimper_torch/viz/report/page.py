@@ -12,6 +12,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from pimper_torch.geometry.pinholes import up_world
 from pimper_torch.io.assets.placement import Placement
 from pimper_torch.io.assets.write import write_asset
 from pimper_torch.records import Mesh, Removal, Silhouettes, SparseScene, TexturedMesh
@@ -20,7 +21,6 @@ from pimper_torch.runtime.ledger import closing_line
 from pimper_torch.stages.texturing.bake import halved
 from pimper_torch.viz.report.predictions import Json, view_entries
 from pimper_torch.viz.report.vertex_layers import VertexLayer, length_unit, surface_layers
-from pimper_torch.viz.turn import up_world
 
 HEAD = "<title>pimper_torch report</title>"
 """Part of every page; identifies a page of an earlier run."""
