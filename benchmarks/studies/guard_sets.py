@@ -85,7 +85,7 @@ SETS = {
     "limbs-grey": Set("limbs", 24, 480, ROUND | PATTERN | GREY),
     "jar-glossy": Set("jar", 16, 640, {"specular": 0.08, "roughness": 0.15}),
     "potatoes-glossy": Set("potatoes", 24, 480, ROUND | {"specular": 0.08, "roughness": 0.2}),
-    "skull": Set("skull", 24, 900),
+    "skull": Set("skull", 26, 900),
     **{
         f"{mesh}-{name}-{seed}": Set(f"{mesh}.obj", 30, 800, {**LAMP, **path, "seed": seed})
         for mesh in ("spot", "ogre", "armadillo")

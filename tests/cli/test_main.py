@@ -165,7 +165,7 @@ def test_the_demo_runs_on_the_photographs_of_the_package(chain, tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     assert run("demo", "--max-size-px", "60") == 0
     assert held(tmp_path / "pimper_demo") == sorted({*RESULT_NAMES, MARKER, ".stages"} - ASKED_FOR)
-    assert chain.given[1].num_views == 24
+    assert chain.given[1].num_views == 26
     assert "37.jpg" in chain.given[1].names
 
 

@@ -44,7 +44,7 @@ RUNS = {
         "{table} -o {out} --slurm part",
     ],
     "demo": [
-        "-o {out} --preset default --scales (0.5,) --reference 38 --device cpu --max-size-px 60 "
+        "-o {out} --preset default --scales (0.5,) --reference 39 --device cpu --max-size-px 60 "
         "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
         "--usdz --texture jpeg --asset-cameras --max-kept 1.5GB --max-memory 20GB "
         "--on-failure skip --view --hold-out 0 --open"
@@ -198,7 +198,7 @@ def test_every_option_of_the_demo_reaches_the_chain(chain, tmp_path):
     (line,) = RUNS["demo"]
     assert run("demo", line, {}, tmp_path) == 0
     config, views, _ = chain.given
-    assert config.coarse_surface.reference == "38"
+    assert config.coarse_surface.reference == "39"
     assert config.scales == (0.5,)
     assert max(views.images.shape[-2:]) == 60
     kept = tmp_path / "out_kept"

@@ -14,7 +14,7 @@ def main(site_packages: str) -> None:
     home = Path(str(pt.__file__)).parent
     assert home == Path(site_packages) / "pimper_torch", home
     assert {"default", "fast", "paper"} <= set(presets())
-    assert len(list(bundled_photographs().glob("*.jpg"))) == 24
+    assert len(list(bundled_photographs().glob("*.jpg"))) == 26
     assert (bundled_photographs() / "ATTRIBUTION.md").is_file()
     assert (home / "py.typed").is_file()
     chain = pt.load_chain("default")

@@ -196,7 +196,7 @@ def test_eight_photographs_of_the_skull_are_registered():
     from pimper_torch.io.photographs import load_views
 
     views = load_views(str(files("pimper_torch").joinpath("data/skull")))
-    chosen = [views.names.index(f"{number}.jpg") for number in (35, 36, 37, 38, 53, 54, 55, 56)]
+    chosen = [views.names.index(f"{number}.jpg") for number in (46, 47, 48, 49, 60, 62, 63, 64)]
     with collected(Progress) as events:
         scene = Reconstruct(ReconstructConfig(threads=2))(views.take(chosen))
     progress = [(event.done, event.total) for event in events]
@@ -226,7 +226,8 @@ def test_the_same_photographs_give_the_same_bits_on_any_number_of_threads(small,
         monkeypatch.setattr(module, "MOST_PAIRED", small)
     monkeypatch.setattr(retrieval, "_NEIGHBOURS", 3)
     views = load_views(str(files("pimper_torch").joinpath("data/skull")), max_size_px=600)
-    some = views.take([views.names.index(f"{number}.jpg") for number in range(35, 42)])
+    chosen = (19, 36, 37, 39, 52, 54, 56)
+    some = views.take([views.names.index(f"{number}.jpg") for number in chosen])
     found = {
         digest(structure_from_motion(some, ReconstructConfig(threads=threads)))
         for threads in (1, 2, 2, 2)
