@@ -100,7 +100,7 @@ def mapped(matrix, pixels):
 
 
 def follows(first, second, generator):
-    return follows_camera_in_place(first, second, first.new_tensor([300.0, 300]), 2.0, generator)
+    return follows_camera_in_place(first, second, first.new_tensor([300.0, 300]), 2.0)
 
 
 def test_matches_of_a_rotating_camera_are_found_among_outliers(generator):

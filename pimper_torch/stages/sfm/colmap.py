@@ -11,7 +11,6 @@ from torch import Tensor
 from pimper_torch.geometry.colmap_library import loaded, quiet
 from pimper_torch.geometry.lens_models import camera_of, distort, lens_of
 from pimper_torch.geometry.rigid import rigid, transform
-from pimper_torch.io.cameras.model_files import read_model as read_model
 from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.errors import OutputError
 

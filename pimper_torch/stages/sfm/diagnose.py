@@ -171,7 +171,6 @@ def following_fraction(model: SparseModel) -> float:
     centre = (everywhere.amin(dim=0) + everywhere.amax(dim=0)) / 2
     # 2 px of 800, or 0.09 degrees of parallax with a normal lens.
     max_error_px = 0.0025 * max(max(lens.width, lens.height) for lens in model.lenses)
-    generator = torch.Generator().manual_seed(0)
     largest = 0.0
     # Three references, evenly over the sequence: a single one may be blurred or covered.
     for reference in sorted({(2 * slot + 1) * model.num_views // 6 for slot in range(3)}):
@@ -180,7 +179,7 @@ def following_fraction(model: SparseModel) -> float:
             if view != reference:
                 both = np.intersect1d(points[view], points[reference], return_indices=True)
                 ends = pixels[view][both[1]], pixels[reference][both[2]]
-                follows = follows_camera_in_place(*ends, centre, max_error_px, generator)
+                follows = follows_camera_in_place(*ends, centre, max_error_px)
                 enough = int(follows.sum()) >= MIN_MATCHES
                 fractions.append(float(follows.double().mean()) if enough else 0.0)
         largest = max(largest, float(torch.tensor(fractions or [0.0]).median()))

@@ -18,7 +18,6 @@ from pimper_torch.records import Record
 from pimper_torch.records.shapes import Matrix3
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.runtime.progress import track
-from pimper_torch.runtime.scratch import scratch
 from pimper_torch.stages.sfm.features import Workspace, image_ids
 from pimper_torch.stages.sfm.reconstruct_config import MIN_MATCHES, ReconstructConfig
 
@@ -64,10 +63,7 @@ def match_pairs(
     options.use_gpu = False
     options.num_threads = settings.num_threads
     options.sift.max_ratio = settings.max_ratio
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.min_num_inliers = fewest
-    verification.ransac.max_error = settings.max_error_px
-    verification.ransac.random_seed = settings.seed
+    verification = _verification(settings, fewest)
     pairing = pycolmap.ImportedPairingOptions()
     with quiet(), tempfile.TemporaryDirectory(dir=space.folder) as folder:
         pairing.match_list_path = Path(folder) / "pairs.txt"
@@ -77,6 +73,15 @@ def match_pairs(
             pycolmap.match_image_pairs(
                 space.database, options, pairing, verification, pycolmap.Device.cpu
             )
+
+
+def _verification(settings: ReconstructConfig, fewest: int) -> Any:  # noqa: ANN401 - pycolmap is untyped
+    """Return COLMAP's options of epipolar geometry."""
+    options = loaded().TwoViewGeometryOptions()
+    options.min_num_inliers = fewest
+    options.ransac.max_error = settings.max_error_px
+    options.ransac.random_seed = settings.seed
+    return options
 
 
 def all_pairs(count: int) -> list[PhotographPair]:
@@ -242,8 +247,6 @@ def read_features(database: Any, image: int) -> Features:  # noqa: ANN401 - pyco
 class Verifier:
     """Photographs and matches of COLMAP's database, and verification of a subset, in parallel.
 
-    Uses its own database: COLMAP's function for a single pair would hold Python's lock.
-
     Attributes:
         pairs: Matches before verification.
         geometries: Geometries of all pairs verified so far.
@@ -258,36 +261,21 @@ class Verifier:
 
     def __call__(self, pairs: Matches) -> dict[PhotographPair, Rows]:
         """Return the verified matches of each pair."""
-        pycolmap, settings = loaded(), self.settings
-        options = pycolmap.TwoViewGeometryOptions()
-        options.min_num_inliers = MIN_MATCHES
-        options.ransac.max_error = settings.max_error_px
-        options.ransac.random_seed = settings.seed
+        options = _verification(self.settings, MIN_MATCHES)
         # Enough if half of the matches are correct. COLMAP's own 10,000 take 0.1 s in each pair
         # with wrong moving matches, which are most pairs on a turntable.
         options.ransac.max_num_trials = 1000
-        verifying = pycolmap.GeometricVerifierOptions()
-        verifying.num_threads = settings.num_threads
-        ids = {pair: tuple(self.ids[view] for view in pair) for pair in pairs}
-        with scratch() as folder:
-            path = folder / "pairs.db"
-            with pycolmap.Database.open(path) as database:
-                for camera in {camera.camera_id: camera for camera in self.cameras}.values():
-                    database.write_camera(camera, use_camera_id=True)
-                views = zip(self.ids, self.cameras, self.keypoints, strict=True)
-                for image, camera, pixels in views:
-                    record = pycolmap.Image(
-                        name=str(image), camera_id=camera.camera_id, image_id=image
-                    )
-                    database.write_image(record, use_image_id=True)
-                    database.write_keypoints(image, pixels.numpy())
-                for pair, rows in pairs.items():
-                    database.write_matches(*ids[pair], rows.numpy().astype(np.uint32))
-            pycolmap.geometric_verification(path, verifying, two_view_geometry_options=options)
-            with pycolmap.Database.open(path) as database:
-                geometries = {pair: database.read_two_view_geometry(*ids[pair]) for pair in pairs}
-        self.geometries.update(geometries)
-        return {pair: indices(geometry.inlier_matches) for pair, geometry in geometries.items()}
+
+        def geometry(pair: PhotographPair) -> Any:  # noqa: ANN401 - pycolmap is untyped
+            first, second = ((self.cameras[i], self.keypoints[i].double().numpy()) for i in pair)
+            rows = pairs[pair].numpy().astype(np.uint32)
+            return loaded().estimate_two_view_geometry(*first, *second, rows, options)
+
+        listed = list(pairs)
+        self.geometries.update(
+            zip(listed, side_by_side(geometry, listed, tracked=False), strict=True)
+        )
+        return {pair: indices(self.geometries[pair].inlier_matches) for pair in listed}
 
 
 def read_verifier(database: Any, settings: ReconstructConfig) -> Verifier:  # noqa: ANN401 - pycolmap is untyped
