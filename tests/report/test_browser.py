@@ -129,7 +129,8 @@ def shown(tmp_path_factory):
     write_page(folder / "bad.html", **parts)
     vertices, faces = mesh.vertices_world.numpy(), mesh.faces.flip(1).numpy()
     inside_out = gltf_of({"POSITION": vertices, "NORMAL": vertices}, faces, MATTE)
-    parts |= {"asset": inside_out, "surface": mesh, "mesh": mesh}
+    parts |= {"asset": inside_out, "openness": openness(mesh), "mesh": mesh}
+    parts["seen"] = visible_vertices(mesh, scene.cameras).any(dim=0)
     write_page(folder / "inside_out.html", **parts)
     return folder / "report.html", mesh, scene, lights, materials
 
