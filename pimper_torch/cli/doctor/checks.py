@@ -12,7 +12,7 @@ from pimper_torch.cli.doctor.photograph import Photograph, summarize_views
 from pimper_torch.records import Views
 from pimper_torch.runtime.errors import some
 
-# The demo's photographs and rendered scenes satisfy these.
+# The demo's photographs and rendered scenes satisfy these and the other limits.
 _BLUR_PX, _BLUR_RATIO = 1.5, 1.6  # absolute, and relative to the median of the folder
 
 

@@ -61,7 +61,7 @@ def _gradient(grey: Map, sigma: float) -> Float[Tensor, "2 height_in width_in"]:
 
 
 EXAMINED_PX = 1024  # longer side, at which a blur of a pixel at 2000 is still measured
-_SMALL_PX = 480  # longer side of the small copy, which connects the demo's photographs
+_SMALL_PX = 600  # longer side of the small copy, which connects the demo's photographs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
