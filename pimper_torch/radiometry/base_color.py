@@ -14,11 +14,14 @@ def albedo_scale(mesh: Mesh) -> float:
     """Return the factor that scales a mesh's albedo, known up to a scale, to [0, 1].
 
     It scales the 99th percentile of the brightest channel to 0.9, because highlights may have
-    corrupted brighter vertices.
+    corrupted brighter vertices. Vertices with a confidence of at most a half do not count, if there
+    are others: grazing views make them up to ten times as bright.
     """
     if mesh.albedo is None or not len(mesh.albedo):
         return 1.0
     brightest = mesh.albedo.detach().amax(dim=-1).nan_to_num(0)
+    if mesh.confidence is not None and bool((sure := mesh.confidence > 0.5).any()):
+        brightest = brightest[sure]
     positive = brightest[brightest > 0]
     if not len(positive):
         return 1.0

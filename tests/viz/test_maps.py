@@ -58,5 +58,11 @@ def test_the_scale_of_albedo_ignores_highlights_and_unknown_albedo(plane):
     albedo[5:500] = 0.0
     many = Mesh(vertices_world=torch.zeros(1000, 3), faces=plane.faces, albedo=albedo)
     assert albedo_scale(many) == pytest.approx(0.45)
+    unsure = many.replace(albedo=20 * albedo, confidence=torch.full((1000,), 0.5))
+    assert albedo_scale(unsure) == pytest.approx(0.045 / 2)  # as without confidence
+    albedo[100:200] = 20.0
+    confidence = torch.ones(1000)
+    confidence[100:200] = 0.1
+    assert albedo_scale(many.replace(albedo=albedo, confidence=confidence)) == pytest.approx(0.45)
     assert albedo_scale(plane) == 1.0
     assert albedo_scale(plane.replace(albedo=torch.zeros(4, 3))) == 1.0
