@@ -189,6 +189,8 @@ def _paragraph(message: str, name: str, options: Sequence[Option], arguments: Se
     text = " ".join(row for row in rows if re.search(r"\w", row))
     text = text.partition("For full helptext")[0].strip()
     text = text.replace(f"Missing from pimper {name}:", "missing:")
+    if stray := re.match(r"missing: -o OUT.* Unrecognized options: ([^-\s]\S*)$", text):
+        text = f"{stray[1]} is not an option; needed: `-o {stray[1]}`, if it is for the result."
     invalid = re.match(r"Error parsing (?:-\w/)?(--[\w.-]+)", text)
     for option in options if invalid else ():
         if invalid and invalid[1] in option.names:  # tyro's text names Python types

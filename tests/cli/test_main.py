@@ -290,6 +290,14 @@ def test_a_folder_in_place_of_a_command_names_the_command(tmp_path, capsys):
     assert f"such as `pimper view {tmp_path}`" in capsys.readouterr().err
 
 
+def test_a_folder_for_the_result_without_its_option_is_named(tmp_path, capsys):
+    assert run("reconstruct", str(tmp_path), "there") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.startswith("error: there is not an option; needed: `-o there`, if it is for the")
+    assert run("reconstruct", str(tmp_path), "--there") == 2
+    assert "missing: -o OUT" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", ["reconstruct", "batch"])
 def test_a_result_in_place_of_photographs_is_refused(command, tmp_path, capsys):
     (tmp_path / "result").mkdir()
