@@ -151,7 +151,8 @@ def a_scene_in_tensors(_: pytest.MonkeyPatch) -> dict[str, object]:
 
 def a_scene_and_a_chain(_: pytest.MonkeyPatch) -> dict[str, object]:
     _, scene = photographed()
-    return {"scene": scene, "chain": pimper_torch.load_chain("default", {"scales": [1.0]})}
+    chain = pimper_torch.load_chain("default", {"scales": [1.0]})
+    return {"scene": scene, "chain": chain, "pt": pimper_torch, "torch": torch}
 
 
 @pytest.mark.usefixtures("small_pictures")
@@ -272,6 +273,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/python.md", 1): a_scene_and_a_mesh,
     ("docs/python.md", 2): a_scene_in_tensors,
     ("docs/python.md", 3): a_scene_and_a_chain,
+    ("docs/python.md", 4): a_scene_and_a_chain,
     ("docs/parts.md", 0): a_matrix_and_patches,
     ("docs/parts.md", 1): photographs_of_one_viewpoint,
     ("docs/parts.md", 2): a_normal_map,

@@ -91,17 +91,19 @@ def with_model_points(scene: SparseScene, model: SparseModel) -> SparseScene:
     )
 
 
-def write_model(scene: SparseScene, folder: Path, colors: UInt8[Tensor, "point 3"]) -> None:
+def write_model(
+    scene: SparseScene, folder: Path, colors: UInt8[Tensor, "point 3"] | None = None
+) -> None:
     """Write the scene as a COLMAP model in the frame of its original model.
 
     Cameras have the photographs' own lenses, not pinholes, and observations are in distorted
     pixels: the model belongs to the loaded photographs; reading it with them gives the same scene.
 
     Args:
-        colors: By :func:`point_colors`.
+        colors: Those of :func:`point_colors`, if they are known.
     """
     model = model_of_scene(scene).replace(lenses=scene.lenses)
-    write_binary(model, colors, folder)
+    write_binary(model, point_colors(scene) if colors is None else colors, folder)
 
 
 def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:

@@ -17,7 +17,7 @@ def render(scene, out, *options):
 
 
 def test_a_scene_is_rendered_with_the_options_given(ball, tmp_path, capsys):
-    options = ("--path", "turntable", "--bits", "16", "--encoding", "linear", "--seed", "4")
+    options = ("-v", "--path", "turntable", "--bits", "16", "--encoding", "linear", "--seed", "4")
     assert render(ball, tmp_path / "out", *options) == 0
     settings = json.loads((tmp_path / "out" / "truth" / "scene.json").read_text())["settings"]
     assert settings["path"] == "turntable"
