@@ -3,6 +3,7 @@
 import math
 
 import torch
+from jaxtyping import Bool, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -65,7 +66,9 @@ def _crossed(mesh: ClosedMesh) -> FaceMask:
     return crossed
 
 
-def _crossings(vertices: Vertices, first: Faces, second: Faces) -> tuple[FaceMask, FaceMask]:
+def _crossings(
+    vertices: Vertices, first: Int[Tensor, "first 3"], second: Int[Tensor, "second 3"]
+) -> tuple[Bool[Tensor, " first"], Bool[Tensor, " second"]]:
     """Return the first faces with edges through second faces, and these; not those that touch."""
     through = torch.zeros(len(second), dtype=torch.bool)
     ends = half_edges(first)
