@@ -48,8 +48,9 @@ class Found:
             add_found(self.viewer, record)
         if isinstance(record, Step):
             self.passes += 1
-            mesh, reference = record.surface.mesh, record.coarse.reference
-            self._draw(record.scene, mesh, reference, f"pass {self.passes}")
+            if not record.last:  # the result is drawn instead
+                mesh, reference = record.surface.mesh, record.coarse.reference
+                self._draw(record.scene, mesh, reference, f"pass {self.passes}")
         elif len(record.points_world) > 10:  # of fewer, all may be outermost
             names = record.views.names
             spellings = [(name, Path(name).stem) for name in names]
