@@ -7,6 +7,7 @@ from pimper_torch.losses.visible import Visible, in_view, interpolated_at, well_
 from pimper_torch.records import NormalPrior, SparseScene, Surface
 from pimper_torch.records.shapes import Scalar
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.file_names import view_named
 
 
 class NormalLoss(nn.Module):
@@ -36,11 +37,14 @@ class NormalLoss(nn.Module):
 
         Args:
             visible: By :func:`~pimper_torch.losses.visible.well_visible`, the default.
+
+        Raises:
+            InputError: A map belongs to no photograph, or no map has a visible normal.
         """
         cameras, losses = scene.cameras, []
         visible = well_visible(surface, cameras) if visible is None else visible
         for row, name in enumerate(self.truth.names):
-            view = scene.views.names.index(name)
+            view = view_named(name, scene.views.names)
             (width, height), shown = self.truth.sizes_px[row].tolist(), visible[view]
             pixels, _ = in_view(surface.vertices_world[shown], cameras, view)
             pixels = pixels / cameras.sizes_px[view] * self.truth.sizes_px[row]
@@ -54,4 +58,7 @@ class NormalLoss(nn.Module):
             normals = surface.normals_world[shown][inside].to(true) @ rotation.mT
             cosine = torch.cosine_similarity(normals, true[inside, :3], dim=1)
             losses.append(1 - cosine)
-        return torch.cat(losses).mean()
+        every = torch.cat(losses)
+        if not len(every):
+            raise InputError("truth: no map has a normal where the surface is visible.")
+        return every.mean()

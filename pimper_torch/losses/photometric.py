@@ -1,5 +1,7 @@
 """Error of the photographs that a surface predicts."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -7,7 +9,9 @@ from torch import Tensor, nn
 from pimper_torch.losses.visible import Visible, in_view, interpolated_at, well_visible
 from pimper_torch.records import SparseScene, Surface
 from pimper_torch.records.shapes import Scalar
+from pimper_torch.runtime.errors import InputError
 
+_UNKNOWNS = 4  # of the light of a photograph
 _ROUNDS = 60  # of reweighting: with 12, gradients are off by up to 0.8 %
 
 
@@ -47,22 +51,36 @@ class PhotometricLoss(nn.Module):
 
         Args:
             visible: By :meth:`visible`, for example of the first step; by default of this surface.
+
+        Raises:
+            InputError: No photograph shows more vertices than its light has unknowns.
         """
         visible = self.visible(surface, scene) if visible is None else visible
-        scaled = [error / self.scale for error in self.errors(surface, scene, visible)]
-        losses = [self.scale**2 * error.square().log1p().mean() for error in scaled if len(error)]
-        return torch.stack(losses).mean()
+        views = (visible.sum(dim=1) > _UNKNOWNS).nonzero()[:, 0].tolist()
+        if not views:
+            raise InputError(
+                f"surface: no photograph shows more than {_UNKNOWNS} of its vertices; needed: one "
+                "at least. The cameras may not belong to it, or the photographs may be too dark."
+            )
+        errors = self.errors(surface, scene, visible, views)
+        losses = [(error / self.scale).square().log1p().mean() for error in errors]
+        return self.scale**2 * torch.stack(losses).mean()
 
     def errors(
-        self, surface: Surface, scene: SparseScene, visible: Visible
+        self,
+        surface: Surface,
+        scene: SparseScene,
+        visible: Visible,
+        views: Sequence[int] | None = None,
     ) -> list[Float[Tensor, " visible"]]:
-        """Return the errors of each photograph at its visible vertices, over its contrast."""
+        """Return the errors of photographs, all by default, at visible vertices over contrast."""
         basis = torch.cat(
             [torch.ones_like(surface.normals_world[:, :1]), surface.normals_world], dim=1
         )
         basis = basis * surface.albedo.mean(dim=1, keepdim=True)
         found = []
-        for view, shown in enumerate(visible):
+        for view in range(len(visible)) if views is None else views:
+            shown = visible[view]
             radiance, known = _grey(surface, scene, view)[shown], basis[shown]
             contrast = radiance.std()
             found.append((radiance - known @ self._light(known, radiance, contrast)) / contrast)

@@ -5,7 +5,7 @@ import os
 import re
 
 import pytest
-from scenes import write_ball
+from command_line import small_run
 
 from pimper_torch.cli.main import main
 from pimper_torch.io.photograph_files import list_images
@@ -13,7 +13,6 @@ from pimper_torch.store import actual, deferred, digest, tensor_hash
 
 pytestmark = pytest.mark.filterwarnings("ignore::pimper_torch.runtime.errors.PimperWarning")
 
-SMALL = "--num-views 5 --width 64 --height 48 --processes 1 --supersample 1"
 PRESET = "scales: [0.5]\nsweep: {min_views: 2, num_views: 4}\nextract: {max_expected_error: 9}\n"
 BAR = ["--scale-bar", "view_000,32,24", "view_001,30,20", "25"]
 
@@ -22,13 +21,7 @@ BAR = ["--scale-bar", "view_000,32,24", "view_001,30,20", "25"]
 def line(tmp_path_factory):
     """Arguments of a run on a small ball, whose records are kept in one folder."""
     folder = tmp_path_factory.mktemp("ball")
-    write_ball(folder / "ball.ply", level=2)
-    (folder / "preset.yaml").write_text(PRESET)
-    scene = folder / "scene"
-    assert main(["render", str(folder / "ball.ply"), "-o", str(scene), *SMALL.split()]) == 0
-    given = ["--sparse", scene / "truth" / "sparse", "--masks", scene / "masks"]
-    given += ["--mesh", scene / "truth" / "mesh.ply", "--preset", folder / "preset.yaml"]
-    arguments = ["reconstruct", *map(str, [scene / "photos", *given])]
+    arguments = small_run(folder, PRESET)
     assert main([*arguments, "-o", str(folder / "first"), "--cache", str(folder / "kept")]) == 0
     return arguments, folder / "kept"
 

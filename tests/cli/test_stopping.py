@@ -7,7 +7,7 @@ import time
 
 import pytest
 import yaml
-from scenes import write_ball
+from command_line import small_run
 
 from pimper_torch.cli.main import main
 from pimper_torch.stages.photometry.gauge import FixGauge
@@ -17,7 +17,6 @@ pytestmark = [
     pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX"),
 ]
 
-SMALL = "--num-views 5 --width 64 --height 48 --processes 1 --supersample 1"
 PRESET = "scales: [0.25, 0.5, 1.0]\nsweep: {min_views: 2, num_views: 4}\n"
 PRESET += "extract: {max_expected_error: 9}\n"
 
@@ -25,14 +24,7 @@ PRESET += "extract: {max_expected_error: 9}\n"
 @pytest.fixture(scope="module")
 def line(tmp_path_factory):
     """Arguments of a run of three passes on a small ball."""
-    folder = tmp_path_factory.mktemp("ball")
-    write_ball(folder / "ball.ply", level=2)
-    (folder / "preset.yaml").write_text(PRESET)
-    scene = folder / "scene"
-    assert main(["render", str(folder / "ball.ply"), "-o", str(scene), *SMALL.split()]) == 0
-    given = ["--sparse", scene / "truth" / "sparse", "--masks", scene / "masks"]
-    given += ["--mesh", scene / "truth" / "mesh.ply", "--preset", folder / "preset.yaml"]
-    return ["reconstruct", *map(str, [scene / "photos", *given]), "--no-report"]
+    return [*small_run(tmp_path_factory.mktemp("ball"), PRESET), "--no-report"]
 
 
 @pytest.fixture

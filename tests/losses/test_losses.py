@@ -68,6 +68,23 @@ def test_shadows_and_occluded_vertices_do_not_count(scene, ball):
     assert darkest.visible(ball, scene).sum() < 0.5 * visible.sum()
 
 
+def test_photographs_with_too_few_visible_vertices_do_not_count(scene, ball):
+    loss = pt.losses.PhotometricLoss()
+    visible = loss.visible(ball, scene)
+    alone = loss(ball, scene, visible & (torch.arange(5) == 1)[:, None])
+    few = visible.clone()
+    for view in (0, 2, 3, 4):  # one vertex has no contrast, four determine the light
+        few[view, visible[view].nonzero()[view:, 0]] = False
+    images = scene.views.images.clone().requires_grad_()
+    changed = scene.replace(views=scene.views.replace(images=images))
+    found = loss(ball, changed, few)
+    assert_close(found, alone)
+    found.backward()
+    assert images.grad.isfinite().all()
+    with pytest.raises(pt.InputError, match="no photograph shows more than 4"):
+        loss(ball, scene, torch.zeros_like(visible))
+
+
 @pytest.mark.parametrize("name", ["normals", "vertices", "images", "poses"])
 def test_gradients_of_the_photometric_loss_agree_with_finite_differences(scene, ball, name):
     loss, generator = pt.losses.PhotometricLoss(), torch.Generator().manual_seed(1)
@@ -155,6 +172,8 @@ def test_normals_in_photographs(scene, ball):
     assert_close(*found, rtol=1e-4, atol=1e-9)
     with pytest.raises(pt.InputError, match="needed: camera axes"):
         pt.losses.NormalLoss(truth.replace(frame="world"))
+    with pytest.raises(pt.InputError, match="no map has a normal where"):
+        loss(ball, scene, torch.zeros_like(visible))
 
 
 def test_distances_to_silhouettes(scene, ball):
