@@ -44,6 +44,7 @@ from pimper_torch.runtime.ledger import left_out_of
 from pimper_torch.runtime.reporting import Observer, SilentObserver, observed, stage, table_of
 from pimper_torch.stages.coarse.depth_points import DepthPoints
 from pimper_torch.stages.meshing.finish import Simplify
+from pimper_torch.stages.patches.transfer import transfer
 from pimper_torch.stages.relighting.held_out import JudgeTextures, Relight
 from pimper_torch.stages.stage import Stage, check_handed
 from pimper_torch.stages.texturing.bake import Texture
@@ -91,12 +92,13 @@ class Step(Record):
         return self.prepared.held_out
 
     def frozen(self) -> Prepared:
-        """Return what was prepared with the facets of this step, for steps of a training loop.
+        """Return what was prepared with the facets and templates of this step's surface.
 
-        They skip the search for facets, which takes most of a step's time and is not
-        differentiable.
+        Steps from it have the last scale alone. They neither search for facets nor choose the views
+        and samples of a template, which takes time and is not differentiable.
         """
-        return self.prepared.replace(coarse=self.coarse.detach(), frozen=True)
+        patches = transfer(self.patches.detach(), self.surface.detach().mesh)
+        return self.prepared.replace(coarse=patches.coarse, patches=patches)
 
     @property
     def photometric(self) -> PhotometricPatches:

@@ -98,8 +98,9 @@ class CoarseToFine(Chain):
         cameras, surface = scene.cameras, None
         with stage("pyramids"):
             sources = build_pyramids(scene.views, self.config.warp.saturation_level)
-        for scale, last in run.passes(self.config.scales):
-            patches = run(self.decompose, coarse, cameras, surface, scale)
+        scales = self.config.scales if prepared.patches is None else self.config.scales[-1:]
+        for scale, last in run.passes(scales):
+            patches = prepared.patches or run(self.decompose, coarse, cameras, surface, scale)
             light = self._light(run, scene, patches, sources)
             if surface is None:
                 points = self._swept_points(run, prepared, light)
@@ -132,7 +133,7 @@ class CoarseToFine(Chain):
         self, run: ChainRun, prepared: Prepared, light: Illumination
     ) -> OrientedPoints | None:
         """Return points where photographs contradict the coarse surface; None if they do not."""
-        known = prepared.frozen or prepared.mesh is not None
+        known = prepared.patches is not None or prepared.mesh is not None
         if known or prepared.scene.views.poses is not None:
             return None
         contours, mesh = prepared.contours, prepared.coarse.mesh

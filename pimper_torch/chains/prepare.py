@@ -15,6 +15,7 @@ from pimper_torch.records import (
     CoarseMesh,
     Failure,
     Mesh,
+    PatchSet,
     Record,
     Removal,
     Silhouettes,
@@ -49,8 +50,7 @@ class Prepared(Record):
         contours: In one photograph per pose; in all of ``scene`` if it has no poses.
         coarse: The coarse surface.
         mesh: The given mesh in the scene's frame; ``None`` if none was given.
-        frozen: Whether ``coarse`` stays as it is; otherwise the first pass may improve it by depth
-            from light.
+        patches: Templates for the last scale, the only one then; ``None`` to compute them.
         held_out: Photographs used only to estimate cameras; ``None`` without any.
         decisions: What was decided about cameras, points, poses and held-out photographs,
             and why, as texts; without entries where there was nothing to decide.
@@ -64,7 +64,7 @@ class Prepared(Record):
     contours: Contours
     coarse: CoarseMesh
     mesh: Mesh | None = None
-    frozen: bool = False
+    patches: PatchSet | None = None
     held_out: SparseScene | None = None
     decisions: dict[str, str] = field(default_factory=dict)
     reports: tuple[StageReport, ...] = ()

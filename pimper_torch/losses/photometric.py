@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pimper_torch.lighting.light_field import harmonics
 from pimper_torch.losses.visible import Visible, in_view, interpolated_at, well_visible
 from pimper_torch.records import SparseScene, Surface
 from pimper_torch.records.shapes import Scalar
@@ -41,8 +42,8 @@ class PhotometricLoss(nn.Module):
     def visible(self, surface: Surface, scene: SparseScene) -> Visible:
         """Return the vertices that each photograph shows, neither dark nor saturated."""
         visible = well_visible(surface, scene.cameras)
-        grey = torch.stack([_grey(surface, scene, view) for view in range(len(visible))])
-        return visible & (grey > self.darkest) & (grey < self.brightest)
+        gray = torch.stack([gray_at(surface, scene, view) for view in range(len(visible))])
+        return visible & (gray > self.darkest) & (gray < self.brightest)
 
     def forward(
         self, surface: Surface, scene: SparseScene, visible: Visible | None = None
@@ -74,14 +75,11 @@ class PhotometricLoss(nn.Module):
         views: Sequence[int] | None = None,
     ) -> list[Float[Tensor, " visible"]]:
         """Return the errors of photographs, all by default, at visible vertices over contrast."""
-        basis = torch.cat(
-            [torch.ones_like(surface.normals_world[:, :1]), surface.normals_world], dim=1
-        )
-        basis = basis * surface.albedo.mean(dim=1, keepdim=True)
+        basis = harmonics(surface.normals_world) * surface.albedo.mean(dim=1, keepdim=True)
         found = []
         for view in range(len(visible)) if views is None else views:
             shown = visible[view]
-            radiance, known = _grey(surface, scene, view)[shown], basis[shown]
+            radiance, known = gray_at(surface, scene, view)[shown], basis[shown]
             contrast = radiance.std()
             found.append((radiance - known @ self._light(known, radiance, contrast)) / contrast)
         return found
@@ -97,7 +95,7 @@ class PhotometricLoss(nn.Module):
         return light
 
 
-def _grey(surface: Surface, scene: SparseScene, view: int) -> Float[Tensor, " vertex"]:
+def gray_at(surface: Surface, scene: SparseScene, view: int) -> Float[Tensor, " vertex"]:
     """Return the mean of the channels of a photograph at all vertices."""
     pixels, _ = in_view(surface.vertices_world, scene.cameras, view)
     return interpolated_at(scene.views.images[view], pixels).mean(dim=1).to(pixels)

@@ -57,3 +57,15 @@ def test_a_small_mesh_is_returned_and_fewer_than_four_faces_rejected():
     assert reduced(mesh, 80) is mesh
     with pytest.raises(ConfigError, match="faces is 3; needed: 4 at least"):
         reduced(mesh, 3)
+
+
+def test_no_two_faces_are_back_to_back():
+    balls = [icosphere(3), *[icosphere(1)] * 4]
+    places = zip((1, 0.01, 0.02, 0.03, 0.05), (0, 3, 4, 5, 6), strict=True)
+    parts = [
+        size * v + v.new_tensor([x, 0, 0]) for (size, x), (v, _) in zip(places, balls, strict=True)
+    ]
+    starts = torch.tensor([0, *[len(part) for part in parts]]).cumsum(dim=0)
+    faces = [each + start for (_, each), start in zip(balls, starts, strict=False)]
+    found = reduced(Mesh(vertices_world=torch.cat(parts), faces=torch.cat(faces)), 100)
+    assert len(found.faces.sort(dim=1).values.unique(dim=0)) == len(found.faces)

@@ -86,8 +86,9 @@ def test_photographs_with_too_few_visible_vertices_do_not_count(scene, ball):
 
 
 @pytest.mark.parametrize("name", ["normals", "vertices", "images", "poses"])
-def test_gradients_of_the_photometric_loss_agree_with_finite_differences(scene, ball, name):
-    loss, generator = pt.losses.PhotometricLoss(), torch.Generator().manual_seed(1)
+@pytest.mark.parametrize("kind", [pt.losses.PhotometricLoss, pt.losses.ConsistencyLoss])
+def test_gradients_of_photometric_losses_agree_with_finite_differences(scene, ball, name, kind):
+    loss, generator = kind(), torch.Generator().manual_seed(1)
     noisy = ball.normals_world + 0.2 * torch.randn(
         ball.normals_world.shape, generator=generator, dtype=torch.float64
     )
