@@ -6,27 +6,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
-import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.data import Dataset
 
-from pimper_torch.geometry.local_frame import NO_OFFSET
 from pimper_torch.io.cameras.existing import existing_model
-from pimper_torch.io.cameras.layout import DataSetPath
 from pimper_torch.io.cameras.read_cameras import FORMATS
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photographs import load_views
-from pimper_torch.priors.from_maps import depth_from, normals_from, padded
+from pimper_torch.priors.from_maps import depth_from, normals_from
+from pimper_torch.priors.prior_files.folder import read_maps
 from pimper_torch.radiometry import FROM_FILES, Encoding
 from pimper_torch.records import DepthPrior, Mesh, NormalPrior, Record, SparseScene, Views
 from pimper_torch.runtime.errors import InputError, PimperError, some
-from pimper_torch.runtime.numpy_files import read_npz
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 
 _PHOTOGRAPHS = ("photos", "images", "image")
-_MAPS = ("normals_world", "depth")
-
 Item = TypeVar("Item")
 
 
@@ -54,69 +48,56 @@ class Capture(Record):
 def read_capture(
     folder: Path | str, *, encoding: Encoding = FROM_FILES, max_size_px: int = 0
 ) -> Capture:
-    """Read the capture in a folder, such as one of ``pimper render``.
-
-    Photographs are in ``photos``, ``images``, ``image`` or the folder itself; masks in ``masks`` or
-    ``mask``; cameras in ``truth/sparse`` or ``sparse`` (COLMAP models), or in a camera file of a
-    usual name, see :data:`~pimper_torch.io.cameras.read_cameras.FORMATS`. The truth is
-    ``truth/mesh.ply`` and, if there are cameras, ``truth/maps``, whose size stays.
+    """Read a capture, such as one of ``pimper render``; the manual lists the names of its files.
 
     Args:
-        encoding: Like ``max_size_px``, of :func:`~pimper_torch.io.photographs.load_views`.
+        encoding: Like ``max_size_px``, of :func:`~pimper_torch.io.photographs.load_views`. True
+            maps keep their size.
 
     Raises:
         PimperError: A file is missing or damaged, or files do not belong to each other.
     """
     folder = Path(folder)
-    photographs, masks = _first(folder, *_PHOTOGRAPHS) or folder, _first(folder, "masks", "mask")
+
+    def first(*names: str) -> Path | None:
+        return next((folder / name for name in names if (folder / name).exists()), None)
+
+    photographs, masks = first(*_PHOTOGRAPHS) or folder, first("masks", "mask")
     views = load_views(photographs, masks=masks, encoding=encoding, max_size_px=max_size_px)
-    cameras = _first(folder, "truth/sparse", "sparse", *(each.name for each in FORMATS))
-    scene = None if cameras is None else assemble_scene(views, existing_model(views, cameras))
-    mesh, maps = _first(folder, "truth/mesh.ply"), _first(folder, "truth/maps")
-    normals, depth = (None, None) if maps is None or scene is None else _true_maps(maps, scene)
-    return Capture(
-        name=folder.name,
-        views=views,
-        scene=scene,
-        mesh=None if mesh is None else _true_mesh(mesh, scene),
-        normals=normals,
-        depth=depth,
-    )
-
-
-def _first(folder: Path, *names: str) -> Path | None:
-    return next((folder / name for name in names if (folder / name).exists()), None)
-
-
-def _true_mesh(path: Path, scene: SparseScene | None) -> Mesh:
-    mesh = read_mesh(path)
-    offset = mesh.vertices_world.new_tensor(NO_OFFSET if scene is None else scene.offset_world)
-    return mesh.replace(vertices_world=mesh.vertices_world - offset).to(torch.float32)
+    capture = Capture(name=folder.name, views=views)
+    if cameras := first("truth/sparse", "sparse", *(each.name for each in FORMATS)):
+        scene = assemble_scene(views, existing_model(views, cameras))
+        capture = capture.replace(scene=scene)
+        if maps := first("truth/maps"):
+            normals, depth = _true_maps(maps, scene)
+            capture = capture.replace(normals=normals, depth=depth)
+    if path := first("truth/mesh.ply"):
+        mesh = read_mesh(path)
+        if capture.scene is not None:
+            offset = mesh.vertices_world.new_tensor(capture.scene.offset_world)
+            mesh = mesh.replace(vertices_world=mesh.vertices_world - offset)
+        capture = capture.replace(mesh=mesh.to(torch.float32))
+    return capture
 
 
 def _true_maps(folder: Path, scene: SparseScene) -> tuple[NormalPrior, DepthPrior]:
-    def stacked(path: Path) -> Tensor:
-        arrays = read_npz(path, _MAPS.__contains__)
-        return torch.from_numpy(np.dstack([arrays[name] for name in _MAPS]).astype(np.float32))
-
-    layers: dict[str, tuple[Tensor, None]] = {}
-    for name in scene.views.names:
-        file = DataSetPath((folder / name).with_suffix(".npz"), "the truth of `pimper render`")
-        layers[name] = file.read(stacked, "maps"), None
-    maps = padded(layers, undistorted=True)
-    normals = maps.values[..., :3] @ scene.cameras.cam_from_world[:, None, :3, :3].mT
+    normals, depth = (
+        read_maps(folder, scene.views, (kind,), lambda _, layer: layer.values, undistorted=True)
+        for kind in ("normal", "depth")
+    )
+    poses = scene.cameras.cam_from_world[[scene.views.names.index(name) for name in normals.names]]
+    local = normals._replace(values=normals.values @ poses[:, None, :3, :3].mT)
+    # Rounding: normals in half precision, depth in single precision.
     return (
-        # The files have normals in half precision, and depth in single precision.
-        normals_from(maps._replace(values=normals), "opencv", error_deg=0.03),
-        depth_from(maps._replace(values=maps.values[..., 3:]), False, gauge="scene", error=1e-6),
+        normals_from(local, "opencv", error_deg=0.03),
+        depth_from(depth, False, gauge="scene", error=1e-6),
     )
 
 
 class Captures(Dataset[Item]):
     """The captures in a folder, each of which is read when it is asked for.
 
-    For the items of a loader as they are: ``DataLoader(captures, batch_size=None)``; for lists of
-    them: ``collate_fn=list``.
+    ``DataLoader(captures, batch_size=None)`` returns them as they are, ``collate_fn=list`` lists.
 
     >>> captures = Captures("captures/", max_size_px=800)  # doctest: +SKIP
     >>> captures[0].scene  # doctest: +SKIP
@@ -135,12 +116,11 @@ class Captures(Dataset[Item]):
     @overload
     def __init__(self: "Captures[Capture]", folder: Path | str, **kwargs: object) -> None: ...
     def __init__(self, folder: Path | str, read: Any = read_capture, **kwargs: object) -> None:
-        root = Path(folder)
-        inner = sorted(root.iterdir()) if root.is_dir() else []
-        self.folders = [path for path in inner if path.is_dir() and not path.name.startswith(".")]
+        inner = sorted(Path(folder).iterdir()) if Path(folder).is_dir() else []
+        self.folders = [path for path in inner if path.is_dir() and path.name[0] != "."]
         if not self.folders or any(path.name in _PHOTOGRAPHS for path in self.folders):
             found = some([path.name for path in inner]) or "nothing"
-            raise InputError(f"{root}: found {found}; needed: a folder with one for each capture.")
+            raise InputError(f"{folder}: found {found}; needed: a folder in it for each capture.")
         self._read = partial(read, **kwargs)
 
     def __len__(self) -> int:

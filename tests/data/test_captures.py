@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -87,6 +88,24 @@ def test_normals_without_a_negative_component_are_not_taken_for_colours(root, tm
     assert_close(capture.normals.normals[:, 20, 30], expected, atol=1e-3, rtol=0)
 
 
+def test_photographs_without_a_true_map_have_no_truth(root, tmp_path):
+    folder = shutil.copytree(root / "balls", tmp_path / "balls")
+    (folder / "truth" / "maps" / "view_001.npz").unlink()
+    whole, capture = pt.data.read_capture(root / "balls"), pt.data.read_capture(folder)
+    assert capture.normals.names == capture.depth.names == ("view_000.png", "view_002.png")
+    assert torch.equal(capture.normals.normals, whole.normals.normals[[0, 2]])
+
+
+def test_photographs_of_one_place_under_several_lights_have_a_true_map_each(tmp_path):
+    config = replace(SMALL, num_views=6, lights_per_pose=2)
+    render_scene("balls", tmp_path / "balls", config, processes=1)
+    with pytest.warns(pt.PimperWarning, match="3 camera poses"):
+        (capture,) = pt.data.Captures(tmp_path)
+    assert capture.views.poses.tolist() == [0, 0, 1, 1, 2, 2]
+    assert capture.normals.names == capture.views.names
+    assert torch.equal(capture.depth.depth[0], capture.depth.depth[1])
+
+
 def test_losses_take_the_truth_of_a_capture(root):
     capture = pt.data.read_capture(root / "balls")
     mesh = capture.mesh
@@ -134,8 +153,7 @@ def test_other_readers_read_captures(root):
     [
         ("photos/view_001.png", b"\x89PNG", r"view_001\.png"),
         ("masks/view_001.png", None, r"masks: no mask for view_001\.png"),
-        ("truth/maps/view_001.npz", None, r"Needed: a file view_001\.npz"),
-        ("truth/maps/view_001.npz", b"PK", r"view_001\.npz: cannot be read as maps"),
+        ("truth/maps/view_001.npz", b"PK", r"view_001\.npz: cannot be read"),
         ("truth/sparse/images.bin", b"1", "sparse cannot be read"),
         ("truth/mesh.ply", b"ply\n", r"mesh\.ply: cannot be read as a mesh"),
     ],
@@ -154,5 +172,5 @@ def test_folders_without_captures_are_refused(root, tmp_path):
         (root / "balls", "masks, photos, truth"),
         (root / "plain", r"view_00\.png"),
     ):
-        with pytest.raises(pt.InputError, match=rf"found .*{found}.*needed: a folder with one for"):
+        with pytest.raises(pt.InputError, match=rf"found .*{found}.*needed: a folder in it"):
             pt.data.Captures(folder)
