@@ -5,8 +5,9 @@ from pathlib import Path
 
 from pimper_bench.scenes.random_captures import RandomCapture, render_random
 from pimper_bench.scenes.ray_tracing import MAP_NAMES, RenderedFrame
-from pimper_bench.scenes.scene_files import make_folders, write_frame, write_json, write_report
+from pimper_bench.scenes.scene_files import make_folders, write_frame, write_report
 from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_torch.export.reports import write_json
 from pimper_torch.geometry.lens_models import pinhole_lenses
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.runtime.errors import ConfigError, some
@@ -40,7 +41,7 @@ def write_random(config: SceneConfig, folder: Path) -> None:
     write_ply(capture.surroundings, truth / "surroundings.ply")
     _write_sparse(capture, truth / "sparse")
     lights = {"names": list(names), "harmonics_world": capture.lights_world.tolist()}
-    write_json(lights, truth / "lights.json")
+    write_json(lights, truth / "lights.json", indent=1)
     write_report(RANDOM, names, config, truth)
 
 

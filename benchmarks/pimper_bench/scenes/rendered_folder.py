@@ -24,10 +24,11 @@ import torch
 from pimper_bench.scenes.procedural_meshes import join
 from pimper_bench.scenes.random_folder import RANDOM, write_random
 from pimper_bench.scenes.ray_tracing import TracedObjects, render_frame
-from pimper_bench.scenes.scene_files import make_folders, write_frame, write_json, write_report
+from pimper_bench.scenes.scene_files import make_folders, write_frame, write_report
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.scenes.true_clouds import true_model
 from pimper_bench.scenes.whole_scene import Scene, build_scene
+from pimper_torch.export.reports import write_json
 from pimper_torch.export.result_folder.folders import require_apart, written_whole
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.radiometry import to_bytes
@@ -101,7 +102,7 @@ def _write_truth(scene: Scene, folder: Path) -> None:
     blockers = surface if around is None else join(surface, around)
     model, albedo = true_model(surface, blockers, scene.cameras, scene.names, generator)
     write_binary(model, to_bytes(albedo), folder / "sparse")
-    write_json(_lights_report(scene), folder / "lights.json")
+    write_json(_lights_report(scene), folder / "lights.json", indent=1)
     write_report(scene.name, scene.names, scene.config, folder)
 
 

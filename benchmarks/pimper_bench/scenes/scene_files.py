@@ -1,6 +1,5 @@
 """Files of a rendered scene."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from torch.nn.functional import normalize
 
 from pimper_bench.scenes.ray_tracing import RenderedFrame
 from pimper_bench.scenes.scene_settings import SceneConfig
+from pimper_torch.export.reports import write_json
 from pimper_torch.io.decode import write_deep_png
 from pimper_torch.io.version import installed_version
 from pimper_torch.radiometry import srgb_from_linear
@@ -96,10 +96,4 @@ def write_report(scene: str, names: Sequence[str], config: SceneConfig, truth: P
         "names": list(names),
         "settings": to_mapping(config),
     }
-    write_json(report, truth / "scene.json")
-
-
-def write_json(report: Mapping[str, object], path: Path) -> None:
-    """Write a report, its names in Unicode."""
-    text = json.dumps(report, indent=1, allow_nan=False, ensure_ascii=False)
-    path.write_text(text + "\n", encoding="utf-8")
+    write_json(report, truth / "scene.json", indent=1)
