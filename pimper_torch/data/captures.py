@@ -33,7 +33,7 @@ class Capture(Record):
         views: All photographs, with their masks.
         scene: Those that have cameras, undistorted, with the cameras and the cloud.
         mesh: The true surface, in the frame of ``scene``; float32.
-        normals: The true normals of the scene's views, in camera axes.
+        normals: The true normals of the scene's views, in camera axes, at the files' size.
         depth: Their true depth, in scene units.
     """
 
@@ -51,8 +51,7 @@ def read_capture(
     """Read a capture, such as one of ``pimper render``; the manual lists the names of its files.
 
     Args:
-        encoding: Like ``max_size_px``, of :func:`~pimper_torch.io.photographs.load_views`. True
-            maps keep their size.
+        encoding: Like ``max_size_px``, of :func:`~pimper_torch.io.photographs.load_views`.
 
     Raises:
         PimperError: A file is missing or damaged, or files do not belong to each other.
@@ -98,9 +97,6 @@ class Captures(Dataset[Item]):
     """The captures in a folder, each of which is read when it is asked for.
 
     ``DataLoader(captures, batch_size=None)`` returns them as they are, ``collate_fn=list`` lists.
-
-    >>> captures = Captures("captures/", max_size_px=800)  # doctest: +SKIP
-    >>> captures[0].scene  # doctest: +SKIP
 
     Args:
         folder: With a folder for each capture, in the order of their names.
