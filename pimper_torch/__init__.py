@@ -10,7 +10,7 @@
 - ``records``: inputs and outputs of stages and chains, such as ``pt.records.Mesh``
 - ``stages``: the stages of chains with their settings, to replace or to call alone
 - ``priors``, ``prior_files``: estimates of networks, in memory and in folders
-- ``losses``: losses of a surface for training
+- ``data``, ``losses``: captures in a folder as a data set; losses of a surface for training
 - ``scale``, ``viz``: real size from markers or lengths; figures
 - ``export``, ``radiometry``, ``store``: folders of results; response curves; kept records of stages
 - ``batches``, ``single_view``: many objects; one viewpoint under many lights
@@ -35,7 +35,7 @@ former_modules.install()
 _NESTED = {"batches": "cli", "errors": "runtime", "prior_files": "priors"}
 
 __all__ = [
-    *("batches", "errors", "export", "losses", "prior_files", "priors", "radiometry"),
+    *("batches", "data", "errors", "export", "losses", "prior_files", "priors", "radiometry"),
     *("records", "single_view", "scale", "stages", "store", "viz"),
     *("load_views", "scene_of", "read_mesh", "load_chain", "load_config", "find_scale", "show"),
     *("write_result", "read_result", "PimperError", "__version__"),

@@ -1,5 +1,6 @@
 # Public names, imported on first use (`__init__.py`).
 __all__: list[str]
+from . import data as data
 from . import export as export
 from . import losses as losses
 from . import priors as priors
@@ -18,6 +19,8 @@ from .cli import batches as batches
 from .cli.batches.many_objects import batch as batch
 from .cli.batches.objects import Object as Object
 from .cli.batches.task import Outcome as Outcome
+from .data.captures import Capture as Capture
+from .data.captures import Captures as Captures
 from .export.result import Result as Result
 from .export.result import read_result as read_result
 from .export.results import write_result as write_result

@@ -24,7 +24,7 @@ FOLDERS = [
     *("runtime", "records", "store", "radiometry", "kernels", "geometry", "linalg", "lighting"),
     "losses",
     *("scale", "io", "priors", "stages", "chains", "paper", "presets", "single_view", "viz"),
-    *("export", "viewer", "cli"),
+    *("export", "data", "viewer", "cli"),
 ]
 
 SOLE_IMPORTERS = {

@@ -18,7 +18,13 @@ from torch.testing import assert_close
 
 import pimper_bench
 import pimper_torch
-from pimper_bench.scenes import RenderedScene, render_shape, sparse_scene
+from pimper_bench.scenes import (
+    RenderedScene,
+    SceneConfig,
+    render_scene,
+    render_shape,
+    sparse_scene,
+)
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_bench.scenes.render_in_memory import Sphere
 from pimper_bench.scenes.scene_cameras import arc_cameras
@@ -258,6 +264,14 @@ def photographs_and_maps(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     return {"pt": pimper_torch}
 
 
+def two_captures(_: pytest.MonkeyPatch) -> dict[str, object]:
+    scene, _ = photographed()
+    save_photographs(scene.views, Path("captures") / "plain")
+    config = SceneConfig(num_views=3, width=56, height=42, supersample=1)
+    render_scene("balls", Path("captures") / "balls", config)
+    return {"__name__": "__main__"}
+
+
 def two_objects(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     scene, _ = photographed()
     for name in ("cup", "jar"):
@@ -277,6 +291,7 @@ GIVEN_TO: dict[tuple[str, int], Callable[[pytest.MonkeyPatch], dict[str, object]
     ("docs/parts.md", 0): a_matrix_and_patches,
     ("docs/parts.md", 1): photographs_of_one_viewpoint,
     ("docs/parts.md", 2): a_normal_map,
+    ("docs/data.md", 0): two_captures,
     ("docs/result.md", 0): a_result,
     ("docs/many.md", 0): two_objects,
     ("docs/conventions.md", 0): no_names,

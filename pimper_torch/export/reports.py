@@ -32,8 +32,6 @@ def lights_report(result: Reconstruction) -> Report:
     patch without samples in the view. The common light of a view excludes such patches, and
     those with too little variation of the light for a factorization; see :func:`common_lights`.
     """
-    facets, lights_world, determined = world_lights(result)
-    lit = (lights_world != 0).any(dim=-1)
     common, counts = (values.tolist() for values in common_lights(result))
     views = result.scene.views.names
     return {
@@ -51,14 +49,10 @@ def lights_report(result: Reconstruction) -> Report:
             {
                 "facet": facet,
                 "determined": is_determined,
-                "lights": [
-                    _rounded(light) if is_lit else None
-                    for light, is_lit in zip(lights, lit_views, strict=True)
-                ],
+                "lights": [_rounded(light) if any(light) else None for light in lights],
             }
-            for facet, is_determined, lights, lit_views in zip(
-                *(values.tolist() for values in (facets, determined, lights_world, lit)),
-                strict=True,
+            for facet, lights, is_determined in zip(
+                *(values.tolist() for values in world_lights(result)), strict=True
             )
         ],
     }

@@ -34,16 +34,12 @@ def read_estimate(path: Path | str) -> Estimate:
             f"{path}: contains no mesh.ply; needed: a folder written by `pimper reconstruct`, or "
             "the path of a mesh file."
         )
-    mesh = read_mesh(path / "mesh.ply")
-    names: tuple[str, ...] = ()
-    cameras = None
-    if (path / "sparse").is_dir():
-        model = read_model(path / "sparse")
-        names, cameras = model.names, pinholes_of(model)
+    model = read_model(path / "sparse") if (path / "sparse").is_dir() else None
+    names = () if model is None else model.names
     return Estimate(
-        mesh=mesh,
+        mesh=read_mesh(path / "mesh.ply"),
         names=names,
-        cameras=cameras,
+        cameras=None if model is None else pinholes_of(model),
         lights_world=read_lights(path / "lights.json", names),
         reference=read_reference(path / "depth.npz"),
     )

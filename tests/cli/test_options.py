@@ -62,6 +62,7 @@ RUNS = {
         "--no-fixed-table --constant-light",
         "{ball} -o {out} {tiny} --no-constant-light --turned-over --table patterned",
         "{ball} -o {out} {tiny} --no-turned-over --lights-per-pose 2",
+        "{ball} -o {out} {tiny} --seeds 3:4",
     ],
     "export": [
         "{result} --out {out} --format colmap nerfstudio alicevision maps rti --axes lub "

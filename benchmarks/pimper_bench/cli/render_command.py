@@ -7,10 +7,13 @@ from typing import Annotated
 
 import tyro
 
+from pimper_bench.scenes.many_scenes import render_scenes
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
+from pimper_torch.cli.stopping import Stopped
+from pimper_torch.runtime.config import require
 from pimper_torch.runtime.reporting import stage
 
 _DEFAULT = SceneConfig()
@@ -28,8 +31,11 @@ class _Job:
     """Render photographs of a scene under a point light, and write the ground truth.
 
     Attributes:
-        scene: One of mug, jar, balls, potatoes, pair, or the path of a mesh file.
+        scene: One of mug, jar, balls, potatoes, pair; random, where the seed draws everything but
+            number and size of photographs; or the path of a mesh file.
         out: Folder for photos, masks and truth; new or empty.
+        seeds: A scene for each seed, such as 0:100 without 100, in OUT/SCENE_000000 and so on; with
+            scenes that are there from an earlier call, which are not rendered again.
         processes: Number of concurrent renderings.
         overwrite: Replace an existing rendering in OUT.
         config: Settings of the photographs.
@@ -37,6 +43,7 @@ class _Job:
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT")]
+    seeds: Annotated[str | None, tyro.conf.arg(metavar="FIRST:END")] = None
     processes: int = 2
     overwrite: Flag = False
     config: Annotated[SceneConfig, tyro.conf.arg(name="")] = _DEFAULT
@@ -44,6 +51,10 @@ class _Job:
 
 def run(job: _Job, output: Output) -> None:
     """Run ``render``."""
+    seeds = _seeds(job)
+    if seeds is not None:
+        _render_seeds(job, seeds, output)
+        return
     with output.observer(), stage("render") as figures:
         render_scene(
             job.scene, job.out, job.config, processes=job.processes, overwrite=job.overwrite
@@ -57,6 +68,42 @@ def run(job: _Job, output: Output) -> None:
     output.result({name: job.out / name for name in ("photos", "masks", "truth")})
 
 
+def _render_seeds(job: _Job, seeds: range, output: Output) -> None:
+    with output.observer(), stage("render") as figures:
+        try:
+            rendered = render_scenes(
+                job.scene,
+                job.out,
+                seeds,
+                job.config,
+                processes=job.processes,
+                overwrite=job.overwrite,
+            )
+        except Stopped as error:
+            error.left = "finished scenes stay, and the same command renders the others."
+            raise
+        figures["scenes"] = sum(rendered.values())
+    output.remark(
+        f"{job.out} contains {len(seeds)} scenes of {job.config.num_views} photographs; "
+        f"{figures['scenes']} were rendered now. In Python: pt.data.Captures({str(job.out)!r})"
+    )
+    output.result({"scenes": job.out}, rendered=figures["scenes"], scenes=len(seeds))
+
+
+def _seeds(job: _Job) -> range | None:
+    """Return the seeds of ``--seeds``; ``None`` without it."""
+    if job.seeds is None:
+        return None
+    first, _, end = job.seeds.partition(":")
+    seeds = range(int(first), int(end)) if first.isdecimal() and end.isdecimal() else range(0)
+    needed = "FIRST:END, such as 0:100 for 0 to 99"
+    require(len(seeds) > 0 and seeds.stop <= 2**32, "--seeds", job.seeds, needed)
+    require(job.config.seed == 0, "--seed", job.config.seed, "--seeds or --seed, not both")
+    return seeds
+
+
 def checked(command: str, arguments: Sequence[str]) -> _Job:
     """Read the arguments of ``render``."""
-    return read_arguments(_Job, command, arguments, rare=_RARE)
+    job = read_arguments(_Job, command, arguments, rare=_RARE)
+    _seeds(job)
+    return job

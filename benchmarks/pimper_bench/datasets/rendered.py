@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pimper_bench.datasets.raster import read_photographs
 from pimper_bench.scenes.ray_tracing import MAP_NAMES
-from pimper_bench.scenes.rendered_folder import FORMAT, FORMAT_VERSION, unpack_maps
+from pimper_bench.scenes.scene_files import FORMAT, FORMAT_VERSION, unpack_maps
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_bench.truth import Capture, Truth
 from pimper_torch.geometry.lens_models import pinholes_of

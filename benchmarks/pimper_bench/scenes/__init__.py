@@ -2,9 +2,11 @@
 
 :func:`render_scene` renders one into a folder, frame by frame; :func:`build_scene` and
 :func:`render_frame` are its parts. :func:`render_objects` and :func:`render_shape` keep a small
-scene in memory, and :func:`render_random` a random one.
+scene in memory, and :func:`render_random` a random one. :func:`render_scenes` renders one for each
+seed, in processes.
 """
 
+from pimper_bench.scenes.many_scenes import render_scenes
 from pimper_bench.scenes.random_captures import RandomCapture, render_random
 from pimper_bench.scenes.ray_tracing import RenderedFrame, TracedObjects, render_frame
 from pimper_bench.scenes.render_in_memory import (
@@ -38,6 +40,7 @@ __all__ = [
     "render_objects",
     "render_random",
     "render_scene",
+    "render_scenes",
     "render_shape",
     "sparse_scene",
 ]

@@ -41,10 +41,16 @@ class RandomCapture(Record):
         views: Linear radiance as read from 8-bit sRGB files, without masks.
         cameras: Exact, float64; with a turntable, in the frame of the object.
         depth: Along the camera's z, of any surface; infinite for nothing.
+        normals_world: Unit, outward; zero for nothing.
+        albedo: Linear; zero for nothing.
         surface: 0 on the object, 1 on the table, 2 on the room, -1 on nothing.
         foreground: True on the object, at the pixels' centres.
+        lit: True where the lamp is visible from the object or its table.
+        highlight: As of :class:`.RenderedFrame`, before exposure.
+        lights_world: First-order light at the object; radiance is albedo * l . (1, n).
         scene: The photographs with a cloud as of structure from motion; float32.
         mesh: The object.
+        surroundings: Its table.
         family: Of the object's shape: see :class:`.Body`.
         turning: True for a turntable: the room turns relative to the object.
     """
@@ -52,10 +58,16 @@ class RandomCapture(Record):
     views: Views
     cameras: Cameras
     depth: Float[Tensor, "view height width"]
+    normals_world: Float[Tensor, "view height width 3"]
+    albedo: Float[Tensor, "view height width channel"]
     surface: Int[Tensor, "view height width"]
     foreground: Bool[Tensor, "view height width"]
+    lit: Bool[Tensor, "view height width"]
+    highlight: Bool[Tensor, "view height width"]
+    lights_world: Float[Tensor, "view 4"]
     scene: SparseScene
     mesh: Mesh
+    surroundings: Mesh
     family: str
     turning: bool
 
@@ -84,7 +96,8 @@ def render_random(
     mesh = join(*body.meshes)
     points = mesh.vertices_world
     path = random_cameras(Draws(seed, "cameras"), points, num_views, width, height)
-    cameras, stage = path.cameras, TracedObjects(_dressed(seed, body, turning=path.turning))
+    objects = _dressed(seed, body, turning=path.turning)
+    cameras, stage = path.cameras, TracedObjects(objects)
     centre = (points.amin(dim=0) + points.amax(dim=0)) / 2
     lights = random_lights(Draws(seed, "lights"), cameras, centre, _RADIUS)
     reach = float((cameras.centers_world - centre).norm(dim=1).amax())
@@ -93,8 +106,11 @@ def render_random(
         render_view(stage, room, path.world_from_room[view], cameras, view, lights[view])
         for view in range(num_views)
     ]
-    depth = torch.stack([item.depth for item in seen])
-    surface = torch.stack([item.surface for item in seen])
+    maps = {
+        name: torch.stack([getattr(item, name) for item in seen])
+        for name in ("depth", "albedo", "surface", "lit", "highlight")
+    }
+    depth, surface = maps["depth"], maps["surface"]
     draws = Draws(seed, "sensor")
     sensor = random_sensor(draws)
     exposures = draws.vector(0.6, 1.4, num_views).float()
@@ -112,11 +128,13 @@ def render_random(
     return RandomCapture(
         views=views,
         cameras=cameras,
-        depth=depth,
-        surface=surface,
+        **maps,
+        normals_world=torch.stack([item.normals for item in seen]),
         foreground=surface == OBJECT,
+        lights_world=exposures[:, None] * torch.stack([light.harmonics() for light in lights]),
         scene=textured_cloud(views, cameras, static, torch.stack(chance), Draws(seed, "cloud")),
         mesh=mesh,
+        surroundings=objects[-1].mesh,
         family=body.family,
         turning=path.turning,
     )

@@ -1,7 +1,7 @@
 """Photographs of a random scene, as a camera stores them, and their maps."""
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch.nn.functional import conv2d, pad
 
 from pimper_bench.scenes.random_draws import Draws
 from pimper_bench.scenes.random_rooms import Room
-from pimper_bench.scenes.ray_tracing import TracedObjects, steepness
+from pimper_bench.scenes.ray_tracing import TracedObjects, noticeable, steepness
 from pimper_bench.scenes.scene_lights import PointLight
 from pimper_bench.scenes.scene_settings import SensorConfig, expose
 from pimper_torch.geometry.pixels import pixel_centers
@@ -33,13 +33,19 @@ class Seen(Record):
 
     Attributes:
         depth: In lengths of the rays; infinite for nothing.
+        normals: Unit, outward; zero for nothing.
         surface: ``OBJECT``, ``TABLE``, ``ROOM`` or ``NOTHING``.
+        lit: True where the lamp is visible from the object or its table.
+        highlight: As of :class:`.RenderedFrame`, before exposure.
     """
 
     radiance: Float[Tensor, "*batch channel"]
     albedo: Float[Tensor, "*batch channel"]
     depth: Float[Tensor, "*batch"]
+    normals: Float[Tensor, "*batch 3"]
     surface: Int[Tensor, "*batch"]
+    lit: Bool[Tensor, "*batch"]
+    highlight: Bool[Tensor, "*batch"]
 
 
 def render_view(
@@ -69,12 +75,9 @@ def render_view(
     offsets = torch.tensor([[-0.25, -0.25], [-0.25, 0.25], [0.25, -0.25], [0.25, 0.25]])
     fine = torch.cat([centers[uneven] + offset for offset in offsets.to(centers)])
     mean = seen_at(fine).radiance.reshape(4, -1, 3).mean(dim=0)
-    return Seen(
-        radiance=seen.radiance.index_copy(0, uneven, mean).reshape(height, width, 3),
-        albedo=seen.albedo.reshape(height, width, 3),
-        depth=seen.depth.reshape(height, width),
-        surface=seen.surface.reshape(height, width),
-    )
+    flat = seen.replace(radiance=seen.radiance.index_copy(0, uneven, mean))
+    rasters = {each.name: getattr(flat, each.name) for each in fields(flat)}
+    return Seen(**{name: v.reshape(height, width, *v.shape[1:]) for name, v in rasters.items()})
 
 
 def _seen(
@@ -93,21 +96,31 @@ def _seen(
     albedo, depth = spots.albedo.clone(), spots.hits.distance.clone()
     surface = torch.full_like(spots.object_index, NOTHING)
     surface[rows] = stage.outside[spots.object_index[rows]].long()
+    normals, lit, highlight = spots.normals.clone(), torch.zeros_like(met), torch.zeros_like(met)
+    lit[rows] = shaded.lit
+    highlight[rows] = noticeable(shaded.mirrored.mean(dim=-1), shaded.matte.mean(dim=-1))
     (free,) = torch.nonzero(~met, as_tuple=True)
     if room is not None and len(free):
         room_from_world = invert_rigid(world_from_room)
         start, along = transform(room_from_world, eye[None])[0], rotate(room_from_world, rays[free])
-        distance, normals = room.seen(start, along)
+        distance, inward = room.seen(start, along)
         points = start + distance[:, None] * along
-        received = _received(
-            light, transform(world_from_room, points), rotate(world_from_room, normals)
-        )
+        normals[free] = rotate(world_from_room, inward)
+        received = _received(light, transform(world_from_room, points), normals[free])
         if room.glow is not None:
             received = torch.full_like(received, room.glow)
         albedo[free] = room.texture(points).expand(-1, 3)
         radiance[free] = albedo[free] * received
         depth[free], surface[free] = distance, ROOM
-    return Seen(radiance=radiance, albedo=albedo, depth=depth, surface=surface)
+    return Seen(
+        radiance=radiance,
+        albedo=albedo,
+        depth=depth,
+        normals=normals,
+        surface=surface,
+        lit=lit,
+        highlight=highlight,
+    )
 
 
 def _received(

@@ -223,8 +223,15 @@ def render_frame(
         albedo=raster(item.albedo for item in spots),
         foreground=(object_index >= 0) & ~stage.outside[object_index],
         lit=raster(item.lit for item in shaded),
-        highlight=(mirrored > _NOTICEABLE) & (mirrored > _NOTICEABLE_FRACTION * matte),
+        highlight=noticeable(mirrored, matte),
     )
+
+
+def noticeable(
+    mirrored: Float[Tensor, "*batch"], matte: Float[Tensor, "*batch"]
+) -> Bool[Tensor, "*batch"]:
+    """Return where a highlight is noticeable; see :class:`RenderedFrame`."""
+    return (mirrored > _NOTICEABLE) & (mirrored > _NOTICEABLE_FRACTION * matte)
 
 
 def steepness(radiance: Float[Tensor, "height width channel"]) -> Float[Tensor, " pixel"]:

@@ -28,6 +28,17 @@ class PointLight(Record):
         strength = self.window.norm()
         return (strength + normals @ self.window) ** 2 / (4 * strength)
 
+    def harmonics(self) -> Float[Tensor, " 4"]:
+        """Return the first-order light at the target; see :meth:`Lights.harmonics_world`."""
+        alone = Lights(
+            positions_world=self.position[None],
+            irradiance=self.position.new_tensor([self.irradiance]),
+            ambient=self.position.new_tensor([self.ambient]),
+            target_world=self.target,
+            window=self.window,
+        )
+        return alone.harmonics_world()[0]
+
     def arriving(
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:

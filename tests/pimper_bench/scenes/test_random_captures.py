@@ -2,6 +2,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_bench.datasets import read_rendered
+from pimper_bench.scenes import SceneConfig, render_scene
 from pimper_bench.scenes.random_bodies import FAMILIES, SIZE, random_body
 from pimper_bench.scenes.random_captures import render_random
 from pimper_bench.scenes.random_clouds import detectability, local_contrast, whole_windows
@@ -165,3 +167,46 @@ def test_a_stored_photograph_is_rounded_noisy_or_compressed_as_stated():
     assert_close(float(noisy.std()), 0.0149, atol=0.001, rtol=0)
     packed = stored(image, Sensor(noise=0.02, blur_px=0, quality=70), generator)
     assert 0 < packed.std() < noisy.std()
+
+
+def test_a_random_scene_is_read_from_its_folder_like_others(tmp_path):
+    size = {"num_views": 4, "width": 96, "height": 72}
+    render_scene("random", tmp_path / "scene", SceneConfig(seed=3, **size))
+    found, said = read_rendered(tmp_path / "scene"), render_random(3, **size)
+    assert found.views.names == said.views.names
+    assert_close(found.views.images, said.views.images, atol=1e-6, rtol=0)
+    assert torch.equal(found.views.masks, said.foreground)
+    for name in ("cam_from_world", "intrinsics"):  # rotations are stored as quaternions
+        there, here = getattr(found.cameras, name), getattr(said.cameras, name)
+        assert_close(there, here, atol=1e-9, rtol=0)
+    for name in ("depth", "foreground", "lit", "highlight"):
+        assert torch.equal(getattr(found.truth, name), getattr(said, name))
+    for name in ("normals_world", "albedo"):  # in half precision
+        assert_close(getattr(found.truth, name), getattr(said, name), atol=1e-3, rtol=0)
+    assert_close(found.truth.lights_world.float(), said.lights_world.float())
+    assert_close(found.truth.mesh.vertices_world.float(), said.mesh.vertices_world.float())
+    assert found.truth.surroundings.vertices_world[:, 2].max() < 1e-6  # the table
+
+
+def test_first_order_light_predicts_the_photographs_of_matte_lit_surfaces():
+    capture = small(0, width=96, height=72)
+    light = capture.lights_world.float()
+    directed = torch.einsum("vhwc,vc->vhw", capture.normals_world, light[:, 1:])
+    predicted = capture.albedo * (light[:, :1, None] + directed)[..., None]
+    counted = capture.foreground & capture.lit & ~capture.highlight & (directed > 0)
+    for view in range(4):
+        ratio = (capture.views.images[view].movedim(0, -1) / predicted[view])[counted[view]]
+        assert 0.95 < ratio.median() < 1.05  # the light is near, so only its mean is exact
+
+
+def test_random_normals_face_the_camera_and_are_unit_on_every_surface(capture):
+    cameras = capture.cameras
+    pixels = pixel_centers(96, 72, like=cameras.intrinsics).reshape(-1, 2)
+    for view in range(4):
+        rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
+        normals = capture.normals_world[view].reshape(-1, 3)
+        known = (capture.surface[view] >= 0).reshape(-1)
+        assert_close(normals[known].norm(dim=1), torch.ones(int(known.sum())), atol=1e-5, rtol=0)
+        assert (normals[~known] == 0).all()
+        facing = (normals[known] * rays[known].float()).sum(dim=1) < 0.05
+        assert facing.float().mean() > 0.98  # vertex normals bend over the outline

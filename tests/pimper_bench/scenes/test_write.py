@@ -8,7 +8,8 @@ from scenes import write_ball
 from torch.testing import assert_close
 
 from pimper_bench.datasets.rendered import read_rendered
-from pimper_bench.scenes.rendered_folder import render_scene, unpack_maps
+from pimper_bench.scenes.rendered_folder import render_scene
+from pimper_bench.scenes.scene_files import unpack_maps
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.geometry.projection import project
 from pimper_torch.io.cameras.model_files import read_model
