@@ -1,6 +1,7 @@
 """Priors from a network that predicts maps of photographs."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -41,7 +42,7 @@ def priors_of(
     Args:
         network: A module, or any function, from an image to a map ``1 channel height width`` of
             the complete image at any size; or to a pair of the map and its variance. Or an ONNX
-            file: its first output is the map, and an output ``variance`` is the variance.
+            file, for :func:`from_onnx`.
         views: Photographs, or a scene with undistorted photographs.
         kind: Kind of the maps. ``inliers`` and ``silhouettes`` are probabilities.
         size_px: Width and height to which images are resized; by default they are not.
@@ -62,7 +63,7 @@ def priors_of(
     means, deviations = (
         photographs.images.new_tensor(list(values))[:, None, None] for values in (mean, std)
     )
-    run = network if callable(network) else _loaded(Path(network))
+    run = from_onnx(network) if isinstance(network, Path | str) else network
 
     def predict(view: int) -> tuple[Tensor, Tensor | None]:
         width, height = photographs.sizes_px[view].tolist()
@@ -73,7 +74,8 @@ def priors_of(
         return _map(run((picture - means) / deviations), kind)
 
     indices = range(photographs.num_views)
-    maps = map(predict, indices) if callable(network) else side_by_side(predict, indices)
+    from_file = isinstance(run, OnnxNetwork)
+    maps = side_by_side(predict, indices) if from_file else map(predict, indices)
     maps_by_name = dict(zip(photographs.names, maps, strict=True))
     return _prior(from_maps.padded(maps_by_name, photographs is not views), kind, meaning)
 
@@ -143,13 +145,30 @@ def onnx_session(path: Path) -> Any:  # noqa: ANN401 - onnxruntime's
         raise InputError(f"{path}: cannot be opened by onnxruntime ({error}).") from error
 
 
-def _loaded(path: Path) -> Network:
-    session = onnx_session(path)
-    (into, *_), outputs = session.get_inputs(), [output.name for output in session.get_outputs()]
-    names = [outputs[0], *(name for name in outputs[1:] if name == "variance")]
+@dataclass(frozen=True, slots=True)
+class OnnxNetwork:
+    """A network of an ONNX file, which may run for several photographs at once."""
 
-    def run(picture: Picture) -> list[Tensor]:
-        arrays = session.run(names, {into.name: picture.detach().float().cpu().numpy()})
+    session: Any
+    into: str
+    outputs: list[str]
+
+    def __call__(self, picture: Picture) -> list[Tensor]:
+        """Return the map, and its variance if the network has this output; without gradients."""
+        arrays = self.session.run(self.outputs, {self.into: picture.detach().float().cpu().numpy()})
         return [torch.from_numpy(array).to(picture) for array in arrays]
 
-    return run
+
+def from_onnx(path: Path | str) -> OnnxNetwork:
+    """Load a network from an ONNX file, for :func:`priors_of`; needs the extra ``onnx``.
+
+    Its first output is the map, and an output ``variance`` is the variance.
+
+    Raises:
+        InputError: The file is not ONNX.
+        ConfigError: onnxruntime is not installed.
+    """
+    session = onnx_session(Path(path))
+    first, *others = [output.name for output in session.get_outputs()]
+    names = [first, *(name for name in others if name == "variance")]
+    return OnnxNetwork(session=session, into=session.get_inputs()[0].name, outputs=names)
