@@ -1,6 +1,6 @@
 """The contact sheet of a run: photographs, silhouettes, facets, normals, albedo, height."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from pimper_torch.radiometry import srgb_from_linear, to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh, Reconstruction, Silhouettes
 from pimper_torch.records.scene import SparseScene
-from pimper_torch.records.shapes import Mask, Pixels, Points, Vertices
+from pimper_torch.records.shapes import Mask, Points, Vertices
 from pimper_torch.records.views import Cameras, Views
 from pimper_torch.runtime.mapped import drop_pages
 from pimper_torch.stages.sfm.sparse_scene import point_colors
@@ -32,86 +32,64 @@ _THUMBNAILS_ACROSS, _THUMBNAILS_DOWN = 8, 8
 def draw_overview(
     result: Reconstruction, path: Path | str | BytesIO, panel_px: int = _PANEL_PX
 ) -> None:
-    """Draw the contact sheet of a run as PNG; see :func:`plotted`."""
-    plotted(result, panel_px).save(path, "PNG", compress_level=3)
-
-
-def plotted(result: Reconstruction, panel_px: int = _PANEL_PX) -> Image.Image:
-    """Draw the contact sheet of a run; ``result.plot()`` is the same.
+    """Draw the contact sheet of a run as PNG.
 
     The sheet has, in the reference view, cropped to the object: the photograph, the facets over it
     and shaded, the mesh's normals and albedo, its shape shaded, and also from 40 degrees to the
     left and to the right. Known silhouettes are drawn over the photograph, and below over small
     photographs of all views, at most 64, in red if a view is unreliable.
     """
-    views, silhouettes = result.scene.views, result.silhouettes
-    return contact_sheet(panels_of(result, panel_px), views, silhouettes, headline(result))
-
-
-def contact_sheet(
-    panels: Sequence[tiles.Tile], views: Views, silhouettes: Silhouettes, headline: str = ""
-) -> Image.Image:
-    """Arrange images in rows, over the photographs with their silhouettes, if these are known."""
-    panel_px = max(tile.picture.shape[1] for tile in panels if tile.picture is not None)
+    panels = panels_of(result, panel_px)
     rows = [panels[first : first + _ACROSS] for first in range(0, len(panels), _ACROSS)]
-    if silhouettes.source != "everything":
-        rows.append([_all_views(views, silhouettes, _ACROSS * panel_px)])
-    return tiles.sheet(rows, panel_px, headline)
+    if result.silhouettes.source != "everything":
+        rows.append([_all_views(result, _ACROSS * panel_px)])
+    tiles.sheet(rows, panel_px, headline(result)).save(path, "PNG", compress_level=3)
 
 
 def panels_of(result: Reconstruction, panel_px: int) -> list[tiles.Tile]:
-    """Draw the images of the contact sheet of a run."""
-    reference, coarse = result.coarse.reference, result.coarse.mesh
-    return panels(result.mesh, result.scene, result.silhouettes, reference, panel_px, coarse)
-
-
-def panels(
-    mesh: Mesh,
-    scene: SparseScene,
-    silhouettes: Silhouettes,
-    reference: int,
-    panel_px: int = _PANEL_PX,
-    coarse: Mesh | None = None,
-) -> list[tiles.Tile]:
-    """Draw the images of a contact sheet; without a coarse surface, none of its facets."""
-    full = scene.cameras.take([reference])
-    shape = reduced(mesh, 200_000)  # more faces than a panel's pixels can show
-    vertices = mesh.vertices_world
-    camera = framed(full, vertices, panel_px)
-    name = scene.views.names[reference]
-    photograph, outlined, corner_of = _photograph(vertices, scene, silhouettes, reference, panel_px)
-    maps = view_maps(mesh, camera, 0)
+    """Draw the images of the contact sheet."""
+    reference = result.coarse.reference
+    full = result.cameras.take([reference])
+    shape = reduced(result.mesh, 200_000)  # more faces than a panel's pixels can show
+    vertices = result.mesh.vertices_world
+    camera = _framed(full, vertices, panel_px)
+    name = result.scene.views.names[reference]
+    photograph, outlined, corners = _photograph(result, full, panel_px)
+    maps = view_maps(result.mesh, camera, 0)
     center = vertices.mean(dim=0)
-    sides = [framed(orbit(full, center, angle), vertices, panel_px) for angle in (-40.0, 40.0)]
-    images = {f"photograph {name}": outlined}
-    if coarse is not None:
-        title = f"{len(coarse.faces)} facets on {len(coarse.vertices_world)} points"
-        corners = corner_of(coarse.vertices_world)[coarse.faces]
-        images[title] = tiles.with_triangles(0.45 * photograph, corners, _FACETS)
-        images["facets, shaded"] = tiles.array(shade(coarse, camera, flat=True))
-    images |= {
+    sides = [_framed(orbit(full, center, angle), vertices, panel_px) for angle in (-40.0, 40.0)]
+    coarse = result.coarse.mesh
+    images = {
+        f"photograph {name}": outlined,
+        f"{len(coarse.faces)} facets on {len(coarse.vertices_world)} points": tiles.with_triangles(
+            0.45 * photograph, corners, _FACETS
+        ),
+        "facets, shaded": tiles.array(shade(coarse, camera, flat=True)),
         "surface, shaded": tiles.array(shade(shape, camera)),
         "normals": tiles.array(normal_colors(maps.normals_cam)),
-        "albedo": tiles.encoded(albedo_scale(mesh) * maps.albedo),
+        "albedo": tiles.encoded(albedo_scale(result.mesh) * maps.albedo),
         "surface from 40° left": tiles.array(shade(shape, sides[0])),
         "surface from 40° right": tiles.array(shade(shape, sides[1])),
     }
     return [tiles.Tile(title=title, picture=picture) for title, picture in images.items()]
 
 
-def _all_views(views: Views, silhouettes: Silhouettes, width_px: int) -> tiles.Tile:
+def _all_views(result: Reconstruction, width_px: int) -> tiles.Tile:
     """Draw photographs with their silhouettes: all, or a selection with the unreliable ones."""
-    shown = selected(silhouettes.reliable.cpu())
-    small = thumbnail_sheet(views, silhouettes, shown, width_px=width_px)
+    silhouettes = result.silhouettes
+    views = _selected(silhouettes.reliable.cpu())
+    small = thumbnail_sheet(
+        result.scene.views, silhouettes, views, width_px=width_px, across=_THUMBNAILS_ACROSS
+    )
     origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
     count = len(silhouettes.reliable)
     title = f"{origin}, {int(silhouettes.reliable.sum())} of {count} views trusted"
-    if len(shown) < count:
-        title += f", {len(shown)} shown"
+    if len(views) < count:
+        title += f", {len(views)} shown"
     return tiles.Tile(title=title, picture=tiles.array(small), wide=True)
 
 
-def selected(reliable: Bool[Tensor, " view"]) -> list[int]:
+def _selected(reliable: Bool[Tensor, " view"]) -> list[int]:
     """Return the drawn views, in order: unreliable ones, and an even selection of the others."""
     most = _THUMBNAILS_ACROSS * _THUMBNAILS_DOWN
     unreliable = (~reliable).nonzero()[:most, 0]
@@ -121,7 +99,7 @@ def selected(reliable: Bool[Tensor, " view"]) -> list[int]:
     return torch.cat([unreliable, trusted[even]]).sort().values.tolist()
 
 
-def framed(camera: Cameras, vertices: Vertices, width_px: int) -> Cameras:
+def _framed(camera: Cameras, vertices: Vertices, width_px: int) -> Cameras:
     """Crop a camera's image to the object, at the size of its panel on the sheet."""
     low, high = image_bounds(camera, vertices, 0.05)
     width, height = (high - low).tolist()
@@ -142,40 +120,33 @@ def headline(result: Reconstruction) -> str:
 
 
 def _photograph(
-    vertices: Vertices, scene: SparseScene, silhouettes: Silhouettes, reference: int, panel_px: int
-) -> tuple[tiles.Picture, tiles.Picture, Callable[[Vertices], Pixels]]:
-    """Return the cropped reference photograph, the same with its silhouette, and a projection."""
-    camera = scene.cameras.take([reference])
+    result: Reconstruction, camera: Cameras, panel_px: int
+) -> tuple[tiles.Picture, tiles.Picture, Float[Tensor, "facet 3 2"]]:
+    """Return the cropped reference photograph, the same with its silhouette, and facet corners."""
+    reference = result.coarse.reference
     width, height = (int(side) for side in camera.sizes_px[0])
-    low, high = image_bounds(camera, vertices, 0.05)
+    low, high = image_bounds(camera, result.mesh.vertices_world, 0.05)
     left, top = (max(0, int(corner)) for corner in low.floor())
     right, bottom = (int(corner) for corner in high.ceil())
     box = slice(top, min(bottom, height)), slice(left, min(right, width))
-    image = tiles.encoded(scene.views.images[reference][:, *box].movedim(0, -1))
+    image = tiles.encoded(result.scene.views.images[reference][:, *box].movedim(0, -1))
     photograph = outlined = tiles.fitted(image, panel_px)
-    if silhouettes.source != "everything":
-        inside = tiles.array(silhouettes.inside[reference][box])[..., None]
+    if result.silhouettes.source != "everything":
+        inside = tiles.array(result.silhouettes.inside[reference][box])[..., None]
         drawn = torch.from_numpy(tiles.fitted(inside.repeat(3, axis=-1), panel_px)[..., 0] > 0.5)
         outlined = photograph.copy()
         outlined[border(drawn).numpy()] = RELIABLE
-
-    def projected(points: Vertices) -> Pixels:
-        pixels, _ = project(points, camera.cam_from_world[0], camera.intrinsics[0])
-        return (pixels - pixels.new_tensor([left, top])) * (photograph.shape[1] / image.shape[1])
-
-    return photograph, outlined, projected
+    coarse = result.coarse.mesh
+    pixels, _ = project(coarse.vertices_world, camera.cam_from_world[0], camera.intrinsics[0])
+    corners = (pixels - pixels.new_tensor([left, top]))[coarse.faces]
+    return photograph, outlined, corners * (photograph.shape[1] / image.shape[1])
 
 
 RELIABLE, UNRELIABLE = (1.0, 0.82, 0.29), (1.0, 0.2, 0.2)
 
 
 def thumbnail_sheet(
-    views: Views,
-    silhouettes: Silhouettes,
-    shown: Sequence[int],
-    *,
-    width_px: int,
-    across: int = _THUMBNAILS_ACROSS,
+    views: Views, silhouettes: Silhouettes, shown: Sequence[int], *, width_px: int, across: int
 ) -> Float[Tensor, "height width 3"]:
     """Tile small photographs of some views, each with its silhouette's outline, one pixel wide.
 
@@ -210,6 +181,7 @@ def border(mask: Mask) -> Mask:
     return mask & adjacent
 
 
+@torch.no_grad()
 def draw_preview(
     scene: SparseScene,
     mesh: Mesh | None,
@@ -217,22 +189,15 @@ def draw_preview(
     path: Path | str,
     panel_px: int = 360,
 ) -> None:
-    """Draw the image of :func:`preview` as PNG; a file is replaced when the new one is complete."""
-    path = Path(path)
-    fresh = path.with_name(f"{path.name}.new")
-    preview(scene, mesh, reference, panel_px).save(fresh, format="PNG")
-    fresh.replace(path)
-
-
-@torch.no_grad()
-def preview(scene: SparseScene, mesh: Mesh | None, reference: int, panel_px: int) -> Image.Image:
-    """Draw a photograph and three views of the surface.
+    """Draw a photograph and three views of the surface as PNG.
 
     Args:
         mesh: None draws the sparse points, except the outermost ones.
         reference: View of the photograph.
+        path: An existing file is replaced when the new one is complete.
         panel_px: Longer side of an image of the surface, and height of the photograph.
     """
+    path = Path(path)
     camera = scene.cameras.take([reference]).to("cpu")
     width, height = camera.sizes_px[0].tolist()
     image = scene.views.images[reference, :, :height, :width].cpu()[None]
@@ -256,7 +221,9 @@ def preview(scene: SparseScene, mesh: Mesh | None, reference: int, panel_px: int
         above = (panel_px - len(drawn)) // 2
         below = panel_px - len(drawn) - above
         panels.append(pad(drawn, (0, 0, 0, 0, above, below), value=255))
-    return Image.fromarray(torch.cat(panels, dim=1).numpy())
+    fresh = path.with_name(f"{path.name}.new")
+    Image.fromarray(torch.cat(panels, dim=1).numpy()).save(fresh, format="PNG")
+    fresh.replace(path)
 
 
 def _dots(
