@@ -123,7 +123,7 @@ def test_only_methods_that_users_call_reach_later_folders_by_name():
         ("records/scene.py", "io.meshes.write_mesh"),
         ("records/scene.py", "io.meshes.trimesh_of"),
         ("records/record.py", "viz.cells.cell"),
-        ("records/reconstruction.py", "viz.overview.plotted"),
+        ("records/reconstruction.py", "viz.overview.overview"),
     }
     assert all(callable(later(name)) for _, name in reached)
     by_name = {named(path) for path, _ in calls_of("import_module")}

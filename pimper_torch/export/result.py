@@ -26,7 +26,7 @@ from pimper_torch.runtime.config import build, read_mapping
 from pimper_torch.runtime.errors import InputError, PimperWarning, caution, some
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 from pimper_torch.viz.cells import lit_cell
-from pimper_torch.viz.overview import contact_sheet, panels
+from pimper_torch.viz.overview import preview
 
 _KIND = "a result of `pimper reconstruct`"
 _UNRELIABLE = ("silhouettes.unreliable", "silhouettes.empty")  # guards of `left_out`
@@ -83,14 +83,11 @@ class Result(WrittenResult):
         return views.replace(masks=self.silhouettes.masks)
 
     def plot(self) -> Image:
-        """Draw a contact sheet like that of a run, without facets."""
-        reference = self.scene.views.names.index(self.reference)
-        drawn = panels(self.mesh, self.scene, self.silhouettes, reference)
-        return contact_sheet(drawn, self.scene.views, self.silhouettes)
+        """Draw a photograph and three views of the surface."""
+        return preview(self.scene, self.mesh, self.scene.views.names.index(self.reference))
 
     def _repr_html_(self) -> str:
-        reference = self.scene.views.names.index(self.reference)
-        return lit_cell(self, self.mesh, self.scene, reference)
+        return lit_cell(self, self.mesh, self.scene, self.scene.views.names.index(self.reference))
 
 
 def read_written(folder: Path | str) -> WrittenResult:

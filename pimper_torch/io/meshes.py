@@ -43,23 +43,19 @@ _KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's na
 
 
 def write_mesh(mesh: Mesh, path: Path | str) -> None:
-    """Write a mesh as it is, in the format of the path's suffix; ``mesh.save(path)`` is the same.
-
-    PLY has all values of the vertices, GLB and OBJ have normals and colours, and STL has only the
-    faces, in single precision. Lengths and axes are those of the mesh.
+    """Write a mesh as it is, in its unit and axes; ``mesh.save(path)`` is the same.
 
     Args:
-        path: With the suffix ``.ply``, ``.glb``, ``.obj`` or ``.stl``. An existing file is
-            replaced. Folders are created.
+        path: The suffix selects the format: ``.ply`` with all values of the vertices, ``.glb`` and
+            ``.obj`` with normals and colours, ``.stl`` with faces alone. Folders are created.
 
     Raises:
         InputError: The suffix is a different one, or the mesh is invalid.
         OutputError: The file cannot be written.
     """
     path = Path(path)
-    writers: dict[str, Callable[[Mesh, Path], None]] = {
-        **{".ply": write_ply, ".glb": write_glb, ".obj": write_obj, ".stl": write_stl}
-    }
+    usual = {".ply": write_ply, ".glb": write_glb, ".obj": write_obj}
+    writers: dict[str, Callable[[Mesh, Path], None]] = {**usual, ".stl": write_stl}
     if (write := writers.get(path.suffix.lower())) is None:
         raise InputError(
             f"{path}: cannot be written as a mesh, its suffix is {path.suffix!r}; needed: one of "

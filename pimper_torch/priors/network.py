@@ -1,7 +1,6 @@
 """Priors from a network that predicts maps of photographs."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -63,7 +62,7 @@ def priors_of(
     means, deviations = (
         photographs.images.new_tensor(list(values))[:, None, None] for values in (mean, std)
     )
-    run = from_onnx(network) if isinstance(network, Path | str) else network
+    run = network if callable(network) else from_onnx(network)
 
     def predict(view: int) -> tuple[Tensor, Tensor | None]:
         width, height = photographs.sizes_px[view].tolist()
@@ -74,8 +73,7 @@ def priors_of(
         return _map(run((picture - means) / deviations), kind)
 
     indices = range(photographs.num_views)
-    from_file = isinstance(run, OnnxNetwork)
-    maps = side_by_side(predict, indices) if from_file else map(predict, indices)
+    maps = map(predict, indices) if callable(network) else side_by_side(predict, indices)
     maps_by_name = dict(zip(photographs.names, maps, strict=True))
     return _prior(from_maps.padded(maps_by_name, photographs is not views), kind, meaning)
 
@@ -145,30 +143,22 @@ def onnx_session(path: Path) -> Any:  # noqa: ANN401 - onnxruntime's
         raise InputError(f"{path}: cannot be opened by onnxruntime ({error}).") from error
 
 
-@dataclass(frozen=True, slots=True)
-class OnnxNetwork:
-    """A network of an ONNX file, which may run for several photographs at once."""
-
-    session: Any
-    into: str
-    outputs: list[str]
-
-    def __call__(self, picture: Picture) -> list[Tensor]:
-        """Return the map, and its variance if the network has this output; without gradients."""
-        arrays = self.session.run(self.outputs, {self.into: picture.detach().float().cpu().numpy()})
-        return [torch.from_numpy(array).to(picture) for array in arrays]
-
-
-def from_onnx(path: Path | str) -> OnnxNetwork:
+def from_onnx(path: Path | str) -> Network:
     """Load a network from an ONNX file, for :func:`priors_of`; needs the extra ``onnx``.
 
-    Its first output is the map, and an output ``variance`` is the variance.
+    Its first output is the map, and an output ``variance`` is the variance; without gradients.
+    :func:`priors_of` runs it for several photographs at once if it gets the path instead.
 
     Raises:
         InputError: The file is not ONNX.
         ConfigError: onnxruntime is not installed.
     """
     session = onnx_session(Path(path))
-    first, *others = [output.name for output in session.get_outputs()]
-    names = [first, *(name for name in others if name == "variance")]
-    return OnnxNetwork(session=session, into=session.get_inputs()[0].name, outputs=names)
+    (into, *_), outputs = session.get_inputs(), [output.name for output in session.get_outputs()]
+    names = [outputs[0], *(name for name in outputs[1:] if name == "variance")]
+
+    def run(picture: Picture) -> list[Tensor]:
+        arrays = session.run(names, {into.name: picture.detach().float().cpu().numpy()})
+        return [torch.from_numpy(array).to(picture) for array in arrays]
+
+    return run

@@ -56,8 +56,8 @@ class Reconstruction(Record):
         return self.scene.cameras
 
     def plot(self) -> "Image":
-        """Draw the contact sheet of a run; see :func:`~pimper_torch.viz.overview.plotted`."""
-        image: Image = later("viz.overview.plotted")(self)
+        """Draw the contact sheet of a run; see :func:`~pimper_torch.viz.overview.overview`."""
+        image: Image = later("viz.overview.overview")(self)
         return image
 
 

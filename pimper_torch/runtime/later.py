@@ -1,4 +1,4 @@
-"""Functions of later folders that methods of records are short for."""
+"""Functions of later folders that methods of records are short for, such as ``mesh.save``."""
 
 from collections.abc import Callable
 from importlib import import_module
@@ -6,11 +6,7 @@ from typing import Any
 
 
 def later(name: str) -> Callable[..., Any]:
-    """Return a function by its module and name within the package, imported when it is called.
-
-    A folder imports only folders before it. Records and steps have a few methods for users, such
-    as ``mesh.save``, whose functions are in later folders.
-    """
+    """Return a function by its module and name in the package, imported when it is called."""
     module, _, function = name.rpartition(".")
     found: Callable[..., Any] = getattr(import_module(f"pimper_torch.{module}"), function)
     return found

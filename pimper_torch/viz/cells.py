@@ -39,8 +39,8 @@ def lit_cell(record: Record, mesh: Mesh, scene: SparseScene, reference: int) -> 
 
     Pixels are lit by their normals and albedo, without shadows.
     """
-    camera = framed(scene.cameras.take([reference]), mesh.vertices_world, _WIDTH_PX // 2)
-    maps = view_maps(mesh.detach(), camera, 0)
+    camera, mesh = scene.cameras.take([reference]).detach().to("cpu"), mesh.detach().to("cpu")
+    maps = view_maps(mesh, framed(camera, mesh.vertices_world, _WIDTH_PX // 2), 0)
     normals = tiles.image_of(tiles.array(normal_colors(maps.normals_cam)))
     albedo = tiles.image_of(tiles.encoded(albedo_scale(mesh) * maps.albedo))
     page = Path(__file__).with_name("lit.html").read_text(encoding="utf-8").replace("{lamp}", LAMP)

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from pimper_torch.chains.chain import Step
 from pimper_torch.geometry.rigid import rotate
 from pimper_torch.records import Verdict
-from pimper_torch.viz.overview import framed, plotted
+from pimper_torch.viz.overview import framed, overview
 
 IMAGE = re.compile(r"data:image/(?:png|jpeg);base64,([A-Za-z0-9+/=]+)")
 
@@ -105,4 +105,16 @@ def test_a_step_shows_its_surface(reconstruction):
 
 
 def test_plot_is_the_contact_sheet(reconstruction):
-    assert reconstruction.plot().tobytes() == plotted(reconstruction).tobytes()
+    assert reconstruction.plot().tobytes() == overview(reconstruction).tobytes()
+
+
+def test_records_with_gradients_are_drawn(reconstruction):
+    mesh, scene = reconstruction.mesh, reconstruction.scene
+    for tensor in (mesh.vertices_world, mesh.albedo, scene.cameras.cam_from_world):
+        tensor.requires_grad_()
+    scene.views.images.requires_grad_()
+    fields = {"heights": reconstruction.patches, "surface": reconstruction}
+    step = Step(scale=0.5, last=False, prepared=reconstruction, **fields)
+    for record in (reconstruction, step, scene, scene.views):
+        assert images(unescape(record._repr_html_()))
+    assert reconstruction.plot().width > 500
