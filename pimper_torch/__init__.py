@@ -37,9 +37,12 @@ _NESTED = {"batches": "cli", "errors": "runtime", "prior_files": "priors"}
 __all__ = [
     *("batches", "data", "errors", "export", "losses", "prior_files", "priors", "radiometry"),
     *("records", "single_view", "scale", "stages", "store", "viz"),
-    *("load_views", "scene_of", "read_mesh", "load_chain", "load_config", "find_scale", "show"),
-    *("write_result", "read_result", "PimperError", "__version__"),
+    *("load_views", "scene_of", "load_chain", "load_config", "find_scale", "show"),
+    *("write_result", "read_result", "write_mesh", "read_mesh", "load_record"),
+    *("PimperError", "__version__"),
 ]
+# Also completed, but not printed by `help`, which would be longer than a screen.
+_COMPLETED = ("Encoding", "Given", "priors_of", "save_record")
 
 
 def __getattr__(name: str) -> object:
@@ -53,4 +56,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, *_COMPLETED])

@@ -27,6 +27,7 @@ from .export.results import write_result as write_result
 from .geometry.contours import Contours as Contours
 from .io.assets.mesh_files import MeshFiles as MeshFiles
 from .io.meshes import read_mesh as read_mesh
+from .io.meshes import write_mesh as write_mesh
 from .io.photographs import load_views as load_views
 from .io.tensors import scene_of as scene_of
 from .paper.chain import Published as Published
@@ -37,6 +38,7 @@ from .presets.load_chain import make_chain as make_chain
 from .presets.load_config import load_config as load_config
 from .priors import prior_files as prior_files
 from .priors.conventions import resolve_prior_conventions as resolve_prior_conventions
+from .priors.network import from_onnx as from_onnx
 from .priors.network import priors_of as priors_of
 from .priors.prior_files.read_maps import read_depth as read_depth
 from .priors.prior_files.read_maps import read_normals as read_normals

@@ -14,6 +14,7 @@ import pytest
 import pimper_bench
 import pimper_torch
 from pimper_torch.cli.main import OF_BENCH
+from pimper_torch.runtime.later import later
 
 PACKAGE = Path(pimper_torch.__file__).parent
 BENCH = Path(pimper_bench.__file__).parent
@@ -107,6 +108,29 @@ def test_folders_import_only_folders_before_them(path):
             assert head in allowed, module
             if (folder, head) == ("stages", "stages") and path.name != "__init__.py":
                 assert inside in {inner, "stage"}, module
+
+
+def calls_of(function: str) -> Iterator[tuple[Path, str]]:
+    for path in files():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(function):
+                yield path, ast.unparse(node.args[0])
+
+
+def test_only_methods_that_users_call_reach_later_folders_by_name():
+    reached = {(named(path), ast.literal_eval(name)) for path, name in calls_of("later")}
+    assert reached == {
+        ("records/scene.py", "io.meshes.write_mesh"),
+        ("records/scene.py", "io.meshes.trimesh_of"),
+        ("records/record.py", "viz.cells.cell"),
+        ("records/reconstruction.py", "viz.overview.overview"),
+    }
+    assert all(callable(later(name)) for _, name in reached)
+    by_name = {named(path) for path, _ in calls_of("import_module")}
+    assert by_name == {
+        *("runtime/later.py", "runtime/former_modules.py", "kernels/compile.py"),
+        *("io/extras.py", "cli/main.py"),
+    }
 
 
 # Functions that every command has, and entry points.

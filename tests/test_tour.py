@@ -10,7 +10,7 @@ import pimper_torch as pt
 
 
 def test_the_tour_is_one_screen():
-    assert dir(pt) == sorted(pt.__all__)
+    assert dir(pt) == sorted([*pt.__all__, "Encoding", "Given", "priors_of", "save_record"])
     assert len(pt.__all__) < 30
     assert len(pydoc.plain(pydoc.render_doc(pt))) < 20_000
 
@@ -35,6 +35,9 @@ def test_a_public_name_is_in_the_package_or_a_listed_subpackage():
         ('pt.CoarseToFine()(pt.load_views("photos/")).mesh.', {"vertices_world", "albedo"}),
         ('next(pt.Published().steps(pt.load_views("photos/"))).', {"photometric", "surface"}),
         ("pt.stages.", {"Warp", "Factorize", "Stage"}),
+        ("pt.", {"load_record", "Encoding", "priors_of", "Given", "write_mesh"}),
+        ("pt.priors.", {"from_onnx", "priors_of", "segment"}),
+        ('pt.load_chain("paper").config.', {"triangulate", "align"}),
     ],
 )
 def test_completion_offers_existing_names(code, offered, tmp_path, monkeypatch):

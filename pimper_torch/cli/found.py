@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pimper_torch.chains.chain import Step
 from pimper_torch.cli.output import Output
 from pimper_torch.records import CoarseMesh, Mesh, SparseScene
-from pimper_torch.viz.overview import draw_preview
+from pimper_torch.viz.overview import preview
 
 if TYPE_CHECKING:
     from pimper_torch.viewer.viewer import Viewer
@@ -59,7 +59,9 @@ class Found:
 
     def _draw(self, scene: SparseScene, mesh: Mesh | None, reference: int, shows: str) -> None:
         with suppress(OSError):  # a full disk does not end the run
-            draw_preview(scene, mesh, reference, self.path)
+            fresh = self.path.with_name(f"{self.path.name}.new")
+            preview(scene, mesh, reference).save(fresh, format="PNG")
+            fresh.replace(self.path)  # readers find a complete file
             self.output.event("preview", path=self.path, shows=shows)
             if not self.shown:
                 self.output.remark(

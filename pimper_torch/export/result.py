@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
+from PIL.Image import Image
 from torch import Tensor
 
 from pimper_torch.geometry.local_frame import Offset, local_origin, to_local
@@ -24,6 +25,8 @@ from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.config import build, read_mapping
 from pimper_torch.runtime.errors import InputError, PimperWarning, caution, some
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene
+from pimper_torch.viz.cells import lit_cell
+from pimper_torch.viz.overview import preview
 
 _KIND = "a result of `pimper reconstruct`"
 _UNRELIABLE = ("silhouettes.unreliable", "silhouettes.empty")  # guards of `left_out`
@@ -78,6 +81,13 @@ class Result(WrittenResult):
         if self.silhouettes.source == "everything":
             return views
         return views.replace(masks=self.silhouettes.masks)
+
+    def plot(self) -> Image:
+        """Draw a photograph and three views of the surface."""
+        return preview(self.scene, self.mesh, self.scene.views.names.index(self.reference))
+
+    def _repr_html_(self) -> str:
+        return lit_cell(self, self.mesh, self.scene, self.scene.views.names.index(self.reference))
 
 
 def read_written(folder: Path | str) -> WrittenResult:

@@ -3,11 +3,11 @@
 import json
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import lazy_loader
 import numpy as np
@@ -26,7 +26,10 @@ from pimper_torch.radiometry.base_color import base_color
 from pimper_torch.records import Mesh
 from pimper_torch.records.shapes import FaceMask, Vertices
 from pimper_torch.records.value_checks import not_finite, out_of_range
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 trimesh = lazy_loader.load("trimesh")  # takes a second
 # Scalars per vertex, written and read under the names of the record's fields.
@@ -37,6 +40,51 @@ _NEEDED = "PLY, OBJ, STL, OFF or GLB"
 # edge of a fine mesh. A choice.
 _MAX_ROUNDING = 1e-6
 _KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's names
+
+
+def write_mesh(mesh: Mesh, path: Path | str) -> None:
+    """Write a mesh as it is, in its unit and axes; ``mesh.save(path)`` is the same.
+
+    Args:
+        path: The suffix selects the format: ``.ply`` with all values of the vertices, ``.glb`` and
+            ``.obj`` with normals and colours, ``.stl`` with faces alone. Folders are created.
+
+    Raises:
+        InputError: The suffix is a different one, or the mesh is invalid.
+        OutputError: The file cannot be written.
+    """
+    path = Path(path)
+    usual = {".ply": write_ply, ".glb": write_glb, ".obj": write_obj}
+    writers: dict[str, Callable[[Mesh, Path], None]] = {**usual, ".stl": write_stl}
+    if (write := writers.get(path.suffix.lower())) is None:
+        raise InputError(
+            f"{path}: cannot be written as a mesh, its suffix is {path.suffix!r}; needed: one of "
+            f"{', '.join(writers)}."
+        )
+    mesh.check(str(path))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(mesh, path)
+    except OSError as error:
+        raise OutputError(f"{path}: writing failed ({error}). Write elsewhere.") from error
+
+
+def trimesh_of(mesh: Mesh) -> "Trimesh":
+    """Return a mesh as one of trimesh; ``mesh.to_trimesh()`` is the same.
+
+    Vertices keep their order. Albedo is in its vertex colours as sRGB, and confidence and expected
+    error are in its ``vertex_attributes``.
+    """
+    mesh = mesh.detach().to("cpu")
+    errors = {name: getattr(mesh, name) for name in _ERRORS}
+    return trimesh.Trimesh(
+        mesh.vertices_world.numpy(),
+        mesh.faces.numpy(),
+        vertex_normals=carried_normals(mesh).numpy(),
+        vertex_colors=None if mesh.albedo is None else to_bytes(base_color(mesh).expand(-1, 3)),
+        vertex_attributes={name: x.numpy() for name, x in errors.items() if x is not None},
+        process=False,
+    )
 
 
 def write_ply(
@@ -175,20 +223,24 @@ def write_glb(
     Path(path).write_bytes(data)
 
 
-def write_stl(mesh: Mesh, path: Path | str, placement: Placement) -> None:
-    """Write a binary STL for printing: z up, standing on the middle of the bed, in millimetres.
+def write_stl(mesh: Mesh, path: Path | str, placement: Placement | None = None) -> None:
+    """Write a binary STL, with a placement for printing; without one, the vertices as they are.
 
-    The front is towards -y. Without a known unit, the longest side of the asset is 100 mm.
+    For printing, z is up, and the mesh stands on the middle of the bed, in millimetres. The front
+    is towards -y. Without a known unit, the longest side of the asset is 100 mm.
     """
-    x, up, front = placement.placed(mesh.vertices_world, mesh.vertices_world)[0].unbind(dim=1)
-    points = (1000 if placement.metric else 100) * torch.stack([x, -front, up], dim=1)
-    low, high = points.aminmax(dim=0)
-    middle = torch.cat([(low + high)[:2] / 2, low[2:]])
+    mesh, unit = mesh.detach().to("cpu"), b""
+    points = mesh.vertices_world
+    if placement is not None:
+        x, up, front = placement.placed(points, points)[0].unbind(dim=1)
+        points = (1000 if placement.metric else 100) * torch.stack([x, -front, up], dim=1)
+        low, high = points.aminmax(dim=0)
+        points, unit = points - torch.cat([(low + high)[:2] / 2, low[2:]]), b", millimetres"
     fields = [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
     rows = np.zeros(len(mesh.faces), fields)
-    rows["corners"] = (points - middle)[mesh.faces].numpy()
+    rows["corners"] = points[mesh.faces].numpy()
     rows["normal"] = unit_face_normals(points, mesh.faces).numpy()
-    header = b"pimper_torch, millimetres".ljust(80)
+    header = (b"pimper_torch" + unit).ljust(80)
     Path(path).write_bytes(header + struct.pack("<I", len(rows)) + rows.tobytes())
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal, overload
 
 from torch import nn
 
@@ -19,21 +20,36 @@ def make_chain(
     cache: Store | Path | str | None = None,
     **stages: nn.Module,
 ) -> CoarseToFine | Published:
-    """Return the chain for these settings.
-
-    Args:
-        observer: Receives reports of a run.
-        cache: Folder in which the record of every stage is kept; without it, none is.
-        stages: Modules that replace the chain's stages, by the names of its attributes.
-
-    Raises:
-        ConfigError: The chain has no stage of a given name.
-    """
+    """Return the chain for these settings; see :func:`load_chain`."""
     if isinstance(config, PublishedConfig):
         return Published(config, observer, cache, **stages)
     return CoarseToFine(config, observer, cache, **stages)
 
 
+@overload
+def load_chain(
+    name_or_path: Literal["default", "fast", "training"] = "default",
+    changes: Mapping[str, object] | None = None,
+    observer: Observer | None = None,
+    cache: Store | Path | str | None = None,
+    **stages: nn.Module,
+) -> CoarseToFine: ...
+@overload
+def load_chain(
+    name_or_path: Literal["paper"],
+    changes: Mapping[str, object] | None = None,
+    observer: Observer | None = None,
+    cache: Store | Path | str | None = None,
+    **stages: nn.Module,
+) -> Published: ...
+@overload
+def load_chain(
+    name_or_path: str | Path,
+    changes: Mapping[str, object] | None = None,
+    observer: Observer | None = None,
+    cache: Store | Path | str | None = None,
+    **stages: nn.Module,
+) -> CoarseToFine | Published: ...
 def load_chain(
     name_or_path: str | Path = "default",
     changes: Mapping[str, object] | None = None,
@@ -41,5 +57,17 @@ def load_chain(
     cache: Store | Path | str | None = None,
     **stages: nn.Module,
 ) -> CoarseToFine | Published:
-    """Return the chain of a preset or file; see :func:`load_config` and :func:`make_chain`."""
+    """Return the chain of a preset or of a file of settings.
+
+    Args:
+        name_or_path: ``"default"``, ``"fast"``, ``"training"``, ``"paper"``, or a YAML file.
+        changes: Override its settings, nested by stage: ``{"factorize": {"loss": "huber"}}``.
+        observer: Receives reports of a run.
+        cache: Folder in which the record of every stage is kept; without it, none is.
+        stages: Modules that replace the chain's stages, by the names of its attributes.
+
+    Raises:
+        ConfigError: Names the file or `changes`, section and key, and the nearest valid one; or
+            the chain has no stage of a given name.
+    """
     return make_chain(load_config(name_or_path, changes), observer, cache, **stages)

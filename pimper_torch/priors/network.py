@@ -41,7 +41,7 @@ def priors_of(
     Args:
         network: A module, or any function, from an image to a map ``1 channel height width`` of
             the complete image at any size; or to a pair of the map and its variance. Or an ONNX
-            file: its first output is the map, and an output ``variance`` is the variance.
+            file, for :func:`from_onnx`.
         views: Photographs, or a scene with undistorted photographs.
         kind: Kind of the maps. ``inliers`` and ``silhouettes`` are probabilities.
         size_px: Width and height to which images are resized; by default they are not.
@@ -62,7 +62,7 @@ def priors_of(
     means, deviations = (
         photographs.images.new_tensor(list(values))[:, None, None] for values in (mean, std)
     )
-    run = network if callable(network) else _loaded(Path(network))
+    run = network if callable(network) else from_onnx(network)
 
     def predict(view: int) -> tuple[Tensor, Tensor | None]:
         width, height = photographs.sizes_px[view].tolist()
@@ -143,8 +143,17 @@ def onnx_session(path: Path) -> Any:  # noqa: ANN401 - onnxruntime's
         raise InputError(f"{path}: cannot be opened by onnxruntime ({error}).") from error
 
 
-def _loaded(path: Path) -> Network:
-    session = onnx_session(path)
+def from_onnx(path: Path | str) -> Network:
+    """Load a network from an ONNX file, for :func:`priors_of`; needs the extra ``onnx``.
+
+    Its first output is the map, and an output ``variance`` is the variance; without gradients.
+    :func:`priors_of` runs it for several photographs at once if it gets the path instead.
+
+    Raises:
+        InputError: The file is not ONNX.
+        ConfigError: onnxruntime is not installed.
+    """
+    session = onnx_session(Path(path))
     (into, *_), outputs = session.get_inputs(), [output.name for output in session.get_outputs()]
     names = [outputs[0], *(name for name in outputs[1:] if name == "variance")]
 

@@ -6,7 +6,7 @@ Camera axes are x right, y down, z forward: a surface facing the camera has norm
 :func:`~pimper_torch.priors.conventions.resolve_prior_conventions` finds axes that are not given.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from jaxtyping import Float, Int
@@ -49,8 +49,10 @@ class MapPrior(Record):
     undistorted: bool = False
 
     def faults(self) -> Faults:
-        """List invalid names and variances."""
+        """List invalid names, variances and probabilities."""
         yield from faults_of_names(self.names, len(self.sizes_px), "maps")
+        for name in {"probability", "inside"} & {field.name for field in fields(self)}:
+            yield from faults_in(name, "probabilities", outside, getattr(self, name), 1.0)
         variance = getattr(self, "variance", None)
         if variance is not None:  # that of probabilities follows from them
             yield from faults_in("variance", _VARIANCE, not_above_zero, variance)
@@ -131,11 +133,6 @@ class InlierPrior(MapPrior):
 
     probability: Float[Tensor, "map height width"]
 
-    def faults(self) -> Faults:
-        """List invalid names and probabilities."""
-        yield from super(InlierPrior, self).faults()
-        yield from faults_in("probability", "probabilities", outside, self.probability, 1.0)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SilhouettePrior(MapPrior):
@@ -146,11 +143,6 @@ class SilhouettePrior(MapPrior):
     """
 
     inside: Float[Tensor, "map height width"]
-
-    def faults(self) -> Faults:
-        """List invalid names and probabilities."""
-        yield from super(SilhouettePrior, self).faults()
-        yield from faults_in("inside", "probabilities", outside, self.inside, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -1,6 +1,7 @@
 """The complete result of a run, and estimates of other methods for comparison."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,6 +13,10 @@ from pimper_torch.records.scene import CoarseMesh, Mesh, SparseScene
 from pimper_torch.records.silhouettes import Silhouettes
 from pimper_torch.records.views import Cameras
 from pimper_torch.runtime.events import Failure, Removal, StageReport
+from pimper_torch.runtime.later import later
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -49,6 +54,11 @@ class Reconstruction(Record):
     def cameras(self) -> Cameras:
         """Pinhole cameras of the registered views."""
         return self.scene.cameras
+
+    def plot(self) -> "Image":
+        """Draw the contact sheet of a run; see :func:`~pimper_torch.viz.overview.overview`."""
+        image: Image = later("viz.overview.overview")(self)
+        return image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

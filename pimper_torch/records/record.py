@@ -16,6 +16,7 @@ from torch.utils import _pytree as pytree
 from pimper_torch.records.value_checks import Faults
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.events import Event
+from pimper_torch.runtime.later import later
 from pimper_torch.runtime.mapped import take_rows
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
@@ -44,6 +45,7 @@ class Record:
                 serialized_type_name=f"{cls.__module__}.{cls.__qualname__}",
                 flatten_with_keys_fn=_flatten_with_keys,
             )
+            torch.serialization.add_safe_globals([cls])  # only data, also for `weights_only`
 
     def __post_init__(self) -> None:
         with jaxtyped("context"):
@@ -163,6 +165,10 @@ class Record:
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:  # noqa: ANN401 - IPython's
         printer.text("..." if cycle else str(self))
+
+    def _repr_html_(self) -> str | None:
+        html: str | None = later("viz.cells.cell")(self)
+        return html
 
     def lengths(self) -> dict[str, int]:
         """Return the length of every named axis; tensors of the record precede nested records.

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +13,10 @@ from pimper_torch.records.record import Record
 from pimper_torch.records.shapes import Faces, PerVertex, Points, VertexMask, Vertices
 from pimper_torch.records.value_checks import Faults, faults_in, mean, not_finite, out_of_range
 from pimper_torch.records.views import Cameras, Views
+from pimper_torch.runtime.later import later
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -209,6 +214,15 @@ class Mesh(Record):
     def figures(self) -> dict[str, int | float]:
         """Return counts and fractions for the report of the stage."""
         return {"vertices": len(self.vertices_world), "faces": len(self.faces)}
+
+    def save(self, path: Path | str) -> None:
+        """Write it as PLY, GLB, OBJ or STL; see :func:`~pimper_torch.io.meshes.write_mesh`."""
+        later("io.meshes.write_mesh")(self, path)
+
+    def to_trimesh(self) -> "Trimesh":
+        """Return it as a mesh of trimesh; see :func:`~pimper_torch.io.meshes.trimesh_of`."""
+        mesh: Trimesh = later("io.meshes.trimesh_of")(self)
+        return mesh
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -4,6 +4,9 @@ The JSON is an entry of the header's metadata, under a key that contains the for
 record is ``{"record": class, "fields": {name: value}}``, a tensor ``{"tensor": name}``, and a tuple
 a list; other values are plain JSON. Classes are found by the annotations of the fields: a file can
 name no others, and contains no code.
+
+Files of ``torch.save`` are read by ``torch.load`` with ``weights_only=True`` once the classes of
+their records are imported, without checks of shapes.
 """
 
 import dataclasses
@@ -25,13 +28,15 @@ from torch.utils import _pytree as pytree
 
 from pimper_torch.records.record import AnyRecord, Record, choices
 from pimper_torch.runtime.errors import InputError, OutputError
-from pimper_torch.runtime.events import Event
+from pimper_torch.runtime.events import Event, Failure, Removal, StageReport
 
 _KEY = "pimper_torch record 2"
 # A choice: a run's last record has less than 1 MB of structure, and a malicious file must not make
 # the parser fill the memory.
 _MAX_STRUCTURE = 2**25
 _AGAIN = "Save the record again with `save_record`."
+# They contain only data; every class of records declares itself.
+torch.serialization.add_safe_globals([Record, Failure, Removal, StageReport])
 
 
 def save_record(record: Record, path: str | Path, about: Mapping[str, str] | None = None) -> None:

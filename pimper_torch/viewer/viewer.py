@@ -5,7 +5,6 @@ import threading
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, redirect_stdout
 from io import StringIO
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.mapped import each
 from pimper_torch.viewer.layers import LAYERS, color_bar, layers_of, painted, pane
 from pimper_torch.viewer.server import HOST, PORT, open_server
+from pimper_torch.viz.cells import LAMP
 from pimper_torch.viz.report.predictions import shrunk_to
 
 NO_PHOTOGRAPH = "none"
@@ -71,7 +71,7 @@ class Viewer(AbstractContextManager["Viewer", None]):
         self._chosen = gui.add_dropdown("photograph", (NO_PHOTOGRAPH,))
         self._fade = gui.add_slider("photograph opacity", 0.0, 1.0, 0.05, 0.0, visible=False)
         self._light = gui.add_text("light", "-0.45 0.55")  # the disc hides and sets it
-        gui.add_html(Path(__file__).with_name("lamp.html").read_text(encoding="utf-8"))
+        gui.add_html(LAMP)
         self._about = gui.add_markdown("No surface yet.")
         self._see_whole(torch.cat([torch.eye(3), -torch.eye(3)]))
         self._layer.on_update(lambda _: self._paint())

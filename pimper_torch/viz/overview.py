@@ -26,24 +26,30 @@ from pimper_torch.viz.render import crop, crop_to, image_bounds, orbit, shade
 
 _ACROSS, _PANEL_PX = 4, 390
 _FACETS = "#ffd24a"
-_THUMBNAILS_ACROSS, _THUMBNAILS_DOWN = 8, 8
+_MOST_THUMBNAILS = 64
 
 
 def draw_overview(
     result: Reconstruction, path: Path | str | BytesIO, panel_px: int = _PANEL_PX
 ) -> None:
-    """Draw the contact sheet of a run as PNG.
+    """Draw the contact sheet of a run as PNG; see :func:`overview`."""
+    overview(result, panel_px).save(path, "PNG", compress_level=3)
+
+
+def overview(result: Reconstruction, panel_px: int = _PANEL_PX) -> Image.Image:
+    """Draw the contact sheet of a run; ``result.plot()`` is the same.
 
     The sheet has, in the reference view, cropped to the object: the photograph, the facets over it
     and shaded, the mesh's normals and albedo, its shape shaded, and also from 40 degrees to the
     left and to the right. Known silhouettes are drawn over the photograph, and below over small
     photographs of all views, at most 64, in red if a view is unreliable.
     """
+    result = result.detach().to("cpu")
     panels = panels_of(result, panel_px)
     rows = [panels[first : first + _ACROSS] for first in range(0, len(panels), _ACROSS)]
     if result.silhouettes.source != "everything":
         rows.append([_all_views(result, _ACROSS * panel_px)])
-    tiles.sheet(rows, panel_px, headline(result)).save(path, "PNG", compress_level=3)
+    return tiles.sheet(rows, panel_px, headline(result))
 
 
 def panels_of(result: Reconstruction, panel_px: int) -> list[tiles.Tile]:
@@ -52,12 +58,12 @@ def panels_of(result: Reconstruction, panel_px: int) -> list[tiles.Tile]:
     full = result.cameras.take([reference])
     shape = reduced(result.mesh, 200_000)  # more faces than a panel's pixels can show
     vertices = result.mesh.vertices_world
-    camera = _framed(full, vertices, panel_px)
+    camera = framed(full, vertices, panel_px)
     name = result.scene.views.names[reference]
     photograph, outlined, corners = _photograph(result, full, panel_px)
     maps = view_maps(result.mesh, camera, 0)
     center = vertices.mean(dim=0)
-    sides = [_framed(orbit(full, center, angle), vertices, panel_px) for angle in (-40.0, 40.0)]
+    sides = [framed(orbit(full, center, angle), vertices, panel_px) for angle in (-40.0, 40.0)]
     coarse = result.coarse.mesh
     images = {
         f"photograph {name}": outlined,
@@ -77,10 +83,8 @@ def panels_of(result: Reconstruction, panel_px: int) -> list[tiles.Tile]:
 def _all_views(result: Reconstruction, width_px: int) -> tiles.Tile:
     """Draw photographs with their silhouettes: all, or a selection with the unreliable ones."""
     silhouettes = result.silhouettes
-    views = _selected(silhouettes.reliable.cpu())
-    small = thumbnail_sheet(
-        result.scene.views, silhouettes, views, width_px=width_px, across=_THUMBNAILS_ACROSS
-    )
+    views = selected(silhouettes.reliable.cpu())
+    small = thumbnail_sheet(result.scene.views, silhouettes, views, width_px=width_px)
     origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
     count = len(silhouettes.reliable)
     title = f"{origin}, {int(silhouettes.reliable.sum())} of {count} views trusted"
@@ -89,17 +93,16 @@ def _all_views(result: Reconstruction, width_px: int) -> tiles.Tile:
     return tiles.Tile(title=title, picture=tiles.array(small), wide=True)
 
 
-def _selected(reliable: Bool[Tensor, " view"]) -> list[int]:
+def selected(reliable: Bool[Tensor, " view"]) -> list[int]:
     """Return the drawn views, in order: unreliable ones, and an even selection of the others."""
-    most = _THUMBNAILS_ACROSS * _THUMBNAILS_DOWN
-    unreliable = (~reliable).nonzero()[:most, 0]
+    unreliable = (~reliable).nonzero()[:_MOST_THUMBNAILS, 0]
     trusted = reliable.nonzero()[:, 0]
-    count = min(len(trusted), most - len(unreliable))
+    count = min(len(trusted), _MOST_THUMBNAILS - len(unreliable))
     even = torch.linspace(0, max(0, len(trusted) - 1), count).round().long()
     return torch.cat([unreliable, trusted[even]]).sort().values.tolist()
 
 
-def _framed(camera: Cameras, vertices: Vertices, width_px: int) -> Cameras:
+def framed(camera: Cameras, vertices: Vertices, width_px: int) -> Cameras:
     """Crop a camera's image to the object, at the size of its panel on the sheet."""
     low, high = image_bounds(camera, vertices, 0.05)
     width, height = (high - low).tolist()
@@ -146,7 +149,7 @@ RELIABLE, UNRELIABLE = (1.0, 0.82, 0.29), (1.0, 0.2, 0.2)
 
 
 def thumbnail_sheet(
-    views: Views, silhouettes: Silhouettes, shown: Sequence[int], *, width_px: int, across: int
+    views: Views, silhouettes: Silhouettes, shown: Sequence[int], *, width_px: int, across: int = 8
 ) -> Float[Tensor, "height width 3"]:
     """Tile small photographs of some views, each with its silhouette's outline, one pixel wide.
 
@@ -182,34 +185,28 @@ def border(mask: Mask) -> Mask:
 
 
 @torch.no_grad()
-def draw_preview(
-    scene: SparseScene,
-    mesh: Mesh | None,
-    reference: int,
-    path: Path | str,
-    panel_px: int = 360,
-) -> None:
-    """Draw a photograph and three views of the surface as PNG.
+def preview(
+    scene: SparseScene, mesh: Mesh | None, reference: int, panel_px: int = 360
+) -> Image.Image:
+    """Draw a photograph and three views of the surface.
 
     Args:
         mesh: None draws the sparse points, except the outermost ones.
         reference: View of the photograph.
-        path: An existing file is replaced when the new one is complete.
         panel_px: Longer side of an image of the surface, and height of the photograph.
     """
-    path = Path(path)
-    camera = scene.cameras.take([reference]).to("cpu")
+    camera = scene.cameras.take([reference]).detach().to("cpu")
     width, height = camera.sizes_px[0].tolist()
     image = scene.views.images[reference, :, :height, :width].cpu()[None]
     size = (panel_px, max(1, round(panel_px * width / height)))
     photograph = interpolate(image, size=size, mode="area")[0].movedim(0, -1)
     if mesh is None:
-        points, colors = scene.points_world.cpu(), point_colors(scene).cpu()
+        points, colors = scene.points_world.detach().cpu(), point_colors(scene).cpu()
         low, high = points.quantile(points.new_tensor([0.05, 0.95]), dim=0)
         inner = ((low <= points) & (points <= high)).all(dim=1)
         points, colors = points[inner], colors[inner]
     else:
-        mesh = mesh.to("cpu")
+        mesh = mesh.detach().to("cpu")
         points = mesh.vertices_world
     panels = [to_bytes(photograph.expand(*size, 3))]
     for angle in (0.0, -40.0, 40.0):
@@ -221,9 +218,7 @@ def draw_preview(
         above = (panel_px - len(drawn)) // 2
         below = panel_px - len(drawn) - above
         panels.append(pad(drawn, (0, 0, 0, 0, above, below), value=255))
-    fresh = path.with_name(f"{path.name}.new")
-    Image.fromarray(torch.cat(panels, dim=1).numpy()).save(fresh, format="PNG")
-    fresh.replace(path)
+    return Image.fromarray(torch.cat(panels, dim=1).numpy())
 
 
 def _dots(

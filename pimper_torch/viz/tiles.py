@@ -1,8 +1,11 @@
 """Sheets of images: rows of tiles with titles, on white."""
 
+import base64
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -45,7 +48,7 @@ def sheet(rows: Sequence[Sequence[Tile]], tile_px: int, headline: str = "") -> I
         space = width - 2 * _GAP_PX if row[0].wide else tile_px
         top += _TITLE_PX if any(tile.title for tile in row) else 0
         images = [
-            None if tile.picture is None else _image(fitted(tile.picture, space)) for tile in row
+            None if tile.picture is None else image_of(fitted(tile.picture, space)) for tile in row
         ]
         placed.append((top, space, row, images))
         top += max([image.height for image in images if image is not None], default=tile_px)
@@ -75,12 +78,12 @@ def fitted(picture: Picture, width_px: int) -> Picture:
     size = (max(1, round(wide)), max(1, round(wide * height / width)))
     if size == (width, height):
         return picture
-    return _picture(_image(picture).resize(size, Image.Resampling.LANCZOS))
+    return _picture(image_of(picture).resize(size, Image.Resampling.LANCZOS))
 
 
 def with_triangles(picture: Picture, corners: Float[Tensor, "face 3 2"], color: str) -> Picture:
     """Draw the edges of triangles over an image."""
-    large = _image(picture)
+    large = image_of(picture)
     large = large.resize((2 * large.width, 2 * large.height))  # for smooth lines
     draw = ImageDraw.Draw(large)
     for triangle in (2 * corners).tolist():
@@ -98,8 +101,16 @@ def array(values: Scalars) -> Picture:
     return values.detach().cpu().float().numpy()
 
 
-def _image(picture: Picture) -> Image.Image:
+def image_of(picture: Picture) -> Image.Image:
+    """Return a picture with 8 bits."""
     return Image.fromarray((255 * picture.clip(0, 1)).round().astype(np.uint8))
+
+
+def data_url(image: Image.Image, kind: Literal["JPEG", "PNG"] = "JPEG") -> str:
+    """Return an image as the URL of its file, for HTML."""
+    file = BytesIO()
+    image.save(file, kind, quality=80)  # of JPEG
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
 
 
 def _picture(image: Image.Image) -> Picture:

@@ -37,6 +37,8 @@ def test_a_result_folder_is_read_back_as_in_the_run(folder, run):
     assert found.silhouettes.source == "found"
     assert found.reference == "b.png"
     assert found.summary["registered"] == 3
+    assert f"{len(found.mesh.faces):,}" in found._repr_html_()
+    assert found.plot().height == 360
     assert found.summary["verdict"]["score"] == min(found.summary["verdict"]["scores"].values())
     assert found.mesh.vertices_world.dtype == torch.float32
     lights = estimate_of(run).lights_world.double()

@@ -11,10 +11,11 @@ from scenes import ball
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from pimper_torch.io.meshes import read_mesh, write_glb, write_ply
+from pimper_torch.io.meshes import read_mesh, write_glb, write_mesh, write_ply
+from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh
-from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.errors import InputError, OutputError
 
 
 @pytest.fixture
@@ -262,3 +263,36 @@ def test_the_node_of_a_glb_has_the_offset_if_there_is_one(tmp_path):
         # Around the origin, as viewers require; float32.
         assert max(map(abs, positions["max"])) <= 1 + 1e-6
         assert tree["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".OBJ", ".stl"])
+def test_a_mesh_is_saved_as_it_is_in_the_format_of_its_suffix(mesh, suffix, tmp_path):
+    path = tmp_path / "new" / f"mesh{suffix}"
+    mesh.replace(vertices_world=mesh.vertices_world.requires_grad_()).save(path)
+    read = read_mesh(path)
+    corners = mesh.vertices_world.detach()[mesh.faces]
+    assert_close(read.vertices_world[read.faces], corners, rtol=0, atol=1e-7)  # float32 files
+    assert (read.albedo is None) == (suffix == ".stl")
+
+
+def test_unwritable_meshes_and_files_are_refused(mesh, tmp_path):
+    with pytest.raises(InputError, match=r"its suffix is '.xyz'; needed: one of .ply, .glb"):
+        write_mesh(mesh, tmp_path / "mesh.xyz")
+    wrong = mesh.replace(faces=mesh.faces + 3)
+    with pytest.raises(InputError, match=r"mesh\.ply: Mesh.faces .*needed: indices of 5 vertices"):
+        wrong.save(tmp_path / "mesh.ply")
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(OutputError, match="writing failed"):
+        mesh.save(tmp_path / "file" / "mesh.ply")
+
+
+def test_trimesh_gets_geometry_colours_and_errors(mesh):
+    found = mesh.to_trimesh()
+    assert (found.vertices == mesh.vertices_world.numpy()).all()
+    assert (found.faces == mesh.faces.numpy()).all()
+    assert_close(torch.tensor(found.vertex_normals), mesh.normals_world)
+    colors = srgb_from_linear((mesh.albedo * albedo_scale(mesh)).clamp(0, 1))
+    assert np.abs(found.visual.vertex_colors[:, :3] / 255 - colors.numpy()).max() <= 0.51 / 255
+    assert (found.vertex_attributes["confidence"] == mesh.confidence.numpy()).all()
+    bare = mesh.replace(albedo=None, confidence=None, expected_error=None).to_trimesh()
+    assert not bare.vertex_attributes

@@ -142,6 +142,8 @@ def test_an_onnx_file_gives_the_output_of_its_nodes(views, tmp_path):
     again = pt.priors_of(str(path), views, "albedo", linear=True, error=0.5)
     torch.set_num_threads(1)
     assert torch.equal(again.albedo, found.albedo)
+    loaded = pt.priors_of(pt.priors.from_onnx(path), views, "albedo", linear=True, error=0.5)
+    assert torch.equal(loaded.albedo, found.albedo)
     with pytest.raises(
         InputError, match=r"returns \(1, 3, 20, 30\); needed for depth: a map \(1, 1"
     ):

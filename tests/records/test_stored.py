@@ -126,6 +126,15 @@ def test_every_record_survives_a_round_trip_bit_for_bit(cls, full, generator, tm
     assert_same(pt.load_record(cls, tmp_path / "new" / "one.safetensors"), record)
 
 
+@pytest.mark.parametrize("full", [True, False])
+@pytest.mark.parametrize("cls", [*every_record(), Step])
+def test_every_record_is_data_for_torch(cls, full, generator, tmp_path):
+    """`weights_only` refuses all classes that are not declared to contain no code."""
+    record = example(cls, generator, full)
+    torch.save({"record": record}, tmp_path / "one.pt")
+    assert_same(torch.load(tmp_path / "one.pt", weights_only=True)["record"], record)
+
+
 def test_every_type_of_field_survives_a_round_trip_bit_for_bit(odds, path):
     kinds = [torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64]
     kinds += [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.complex64]

@@ -19,6 +19,7 @@ Source: Basri, Jacobs & Kemelmacher, IJCV 72(3), 2007; Ramamoorthi & Hanrahan, 2
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -156,8 +157,8 @@ class RestartResult(Record):
 
 
 def factorize_from_many(
-    matrix: Matrix,
-    weight: Matrix,
+    matrix: Matrix | np.ndarray,
+    weight: Matrix | np.ndarray,
     rank: int,
     generator: torch.Generator,
     *,
@@ -167,6 +168,8 @@ def factorize_from_many(
     """Factorize a matrix with missing entries from random starts until the best repeats.
 
     Args:
+        matrix: Rows as views, columns as samples.
+        weight: Of each entry; 0 for missing ones.
         repeats: Number of starts that must end in the best minimum.
 
     Raises:
@@ -176,6 +179,10 @@ def factorize_from_many(
         raise InputError(
             f"repeats is {repeats} and max_starts {max_starts}; needed: 1 <= repeats <= max_starts."
         )
+    matrix, weight = torch.as_tensor(matrix), torch.as_tensor(weight)
+    if matrix.ndim != 2 or weight.shape != matrix.shape:
+        found = f"matrix is {tuple(matrix.shape)}, weight {tuple(weight.shape)}"
+        raise InputError(f"{found}; needed: two matrices of one size, rows as views.")
     best: Factors | None = None
     residuals: list[float] = []
     seen = weight > 0

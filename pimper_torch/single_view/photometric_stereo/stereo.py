@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -68,15 +69,16 @@ class PhotometricStereo(Record):
     free: str = "nothing"
 
 
+@torch.no_grad()
 def photometric_stereo(
-    images: Images,
-    mask: Bool[Tensor, "rows columns"],
+    images: Float[Tensor, "..."] | np.ndarray,
+    mask: Bool[Tensor, "rows columns"] | np.ndarray,
     *,
     method: str,
     resolve: str | None = None,
-    lights: Float[Tensor, "light 3"] | None = None,
-    intrinsics: Matrix3 | None = None,
-    weight: Float[Tensor, "..."] | None = None,
+    lights: Float[Tensor, "light 3"] | np.ndarray | None = None,
+    intrinsics: Matrix3 | np.ndarray | None = None,
+    weight: Float[Tensor, "..."] | np.ndarray | None = None,
     robust: bool = True,
 ) -> PhotometricStereo:
     """Return normals and albedo from photographs of one viewpoint under changing light.
@@ -94,7 +96,7 @@ def photometric_stereo(
     or ``rounded`` (a convention: upright on average, as deep as a ball).
 
     Args:
-        images: Linear radiance from one distant viewpoint. NaN inside the mask is missing.
+        images: Linear radiance, ``view channel height width``. NaN inside the mask is missing.
         mask: True on the object.
         lights: For ``calibrated``: direction to the point light times its irradiance, camera frame.
         intrinsics: ``K``, for ``perspective``; the other methods are orthographic.
@@ -103,30 +105,31 @@ def photometric_stereo(
 
     >>> lights = torch.tensor([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8]])
     >>> images = torch.tensor([1.0, 0.8, 0.8]).reshape(3, 1, 1, 1)
-    >>> result = photometric_stereo(
-    ...     images, torch.ones(1, 1) > 0, method="calibrated", lights=lights
-    ... )
+    >>> mask = torch.ones(1, 1, dtype=torch.bool)
+    >>> result = photometric_stereo(images, mask, method="calibrated", lights=lights)
     >>> result.normals[0, 0].round(decimals=3) + 0
     tensor([ 0.,  0., -1.])
     """
     if method not in METHODS:
         raise InputError(f"method is {method!r}; needed: one of {', '.join(METHODS)}.")
-    weight = images.new_ones(len(images), *mask.shape) if weight is None else weight
+    images, mask = torch.as_tensor(images), torch.as_tensor(mask)
+    equal = images.new_ones(len(images), *mask.shape)
+    weight = equal if weight is None else torch.as_tensor(weight)
+    lights, intrinsics = (x if x is None else torch.as_tensor(x) for x in (lights, intrinsics))
     _refuse(images, mask, method, resolve, lights, intrinsics, weight)
-    with torch.no_grad():
-        radiance, weights, used = _inside(images, mask, weight, method)
-        applied, free = None, "nothing"
-        if lights is not None:
-            solution = calibrated_stereo(radiance, weights, _spanning(lights[used]), robust=robust)
-        elif intrinsics is not None:
-            factors = _perspective(radiance, weights, mask, intrinsics.double())
-            solution, free = _lambertian(radiance, factors), _FACTOR
-        else:
-            factors, applied = _integrable(radiance, weights, mask, resolve, robust)
-            solution = _lambertian(radiance, factors)
-            free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
-        result = _as_rasters(solution, weights, mask, used, like=images)
-        return result.replace(applied=applied, free=free)
+    radiance, weights, used = _inside(images, mask, weight, method)
+    applied, free = None, "nothing"
+    if lights is not None:
+        solution = calibrated_stereo(radiance, weights, _spanning(lights[used]), robust=robust)
+    elif intrinsics is not None:
+        factors = _perspective(radiance, weights, mask, intrinsics.double())
+        solution, free = _lambertian(radiance, factors), _FACTOR
+    else:
+        factors, applied = _integrable(radiance, weights, mask, resolve, robust)
+        solution = _lambertian(radiance, factors)
+        free = f"bas-relief, {_FACTOR}" if resolve == "rounded" else _FACTOR
+    result = _as_rasters(solution, weights, mask, used, like=images)
+    return result.replace(applied=applied, free=free)
 
 
 def _inside(
@@ -241,9 +244,14 @@ def _refuse(
         if not valid:
             raise InputError(f"photometric stereo, {method}: {found}; needed: {needed}.")
 
-    size, image_size, weight_size = map(tuple, (mask.shape, images.shape[2:], weight.shape))
-    found = f"images are {image_size}, the mask {size}"
-    require(image_size == size, found, "one size; resize the mask")
+    size, shape, weight_size = map(tuple, (mask.shape, images.shape, weight.shape))
+    if shape[2:] != size:
+        layout = f"(view, channel, {', '.join(map(str, size))}), the mask's size"
+        need = f"{layout}: `images.movedim(-1, 1)`"
+        require(len(shape) != 4 or shape[1:3] != size, f"images are {shape}, channels last", need)
+        need = f"{layout}: `images[:, None]`"
+        require(shape[1:] != size, f"images are {shape}, without channels", need)
+        require(False, f"images are {shape[2:]}, the mask {size}", "one size; resize the mask")
     require(bool(mask.any()), "the mask is empty", "pixels of the object; is it inverted?")
     count, num_lights = len(images), 0 if lights is None else len(lights)
     found = f"{num_lights} lights for {count} photographs"

@@ -1,10 +1,8 @@
 """Photographs and their predictions from the surface, small enough for a page."""
 
-import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import BytesIO
 
 import torch
 from jaxtyping import Float
@@ -21,6 +19,7 @@ from pimper_torch.runtime.mapped import drop_pages
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.stages.relighting.held_out import predict
 from pimper_torch.stages.relighting.lit_surface import LitSurface
+from pimper_torch.viz.tiles import data_url
 
 # The demo's 24 photographs and their predictions take 1.1 MB of its page; more photographs share
 # this size. Fewer pixels than the minimum are not informative.
@@ -43,9 +42,7 @@ def shrunk_to(
 def jpeg(radiance: Float[Tensor, "channel height width"]) -> str:
     """Return an image of linear radiance, clipped at 1, as a data URL of a JPEG."""
     colors = to_bytes(radiance.detach().cpu().clamp(0, 1).movedim(0, -1)).expand(-1, -1, 3)
-    file = BytesIO()
-    Image.fromarray(colors.numpy()).save(file, "JPEG", quality=80)
-    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+    return data_url(Image.fromarray(colors.numpy()))
 
 
 def outline(inside: Map, scale: float) -> str:

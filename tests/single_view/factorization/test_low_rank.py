@@ -138,6 +138,17 @@ def test_impossible_matrices_are_rejected(product, generator, change, found):
         factorize_from_many(X[0], weight[0], 3, generator, repeats=3, max_starts=2)
 
 
+def test_an_array_is_taken_like_a_tensor(product):
+    X, weight, _ = product(batch=1)
+    found, same = (
+        factorize_from_many(*given, 3, torch.Generator().manual_seed(1))
+        for given in ((X[0], weight[0]), (X[0].numpy(), weight[0].numpy()))
+    )
+    assert torch.equal(found.best.lights, same.best.lights)
+    with pytest.raises(InputError, match="needed: two matrices of one size"):
+        factorize_from_many(X, weight, 3, torch.Generator())
+
+
 MANIFOLDS = pytest.mark.parametrize("manifold", [FreeManifold(), Cone()])
 
 

@@ -128,3 +128,25 @@ def test_impossible_requests_are_rejected(settings, needed):
     given.pop("dark", None)
     with pytest.raises(InputError, match=needed):
         photometric_stereo(images, **given)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "needed"),
+    [
+        (lambda images: images.movedim(1, -1), r"channels last; .*`images\.movedim\(-1, 1\)`"),
+        (lambda images: images[:, 0], r"without channels; .*`images\[:, None\]`"),
+        (lambda images: images[..., 1:], r"images are \(56, 55\), the mask \(56, 56\)"),
+    ],
+)
+def test_a_wrong_layout_of_images_is_named_with_its_remedy(wrong, needed):
+    images, _ = photographed(BUMPY, SIX)
+    with pytest.raises(InputError, match=needed):
+        photometric_stereo(wrong(images), BUMPY.mask, method="calibrated", lights=SIX)
+
+
+def test_arrays_are_taken_like_tensors():
+    images, _ = photographed(BUMPY, SIX)
+    found = photometric_stereo(images, BUMPY.mask, method="calibrated", lights=SIX)
+    arrays = images.numpy(), BUMPY.mask.numpy()
+    same = photometric_stereo(*arrays, method="calibrated", lights=SIX.numpy())
+    assert torch.equal(found.normals, same.normals)
