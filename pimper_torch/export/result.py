@@ -23,6 +23,7 @@ from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
 from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.config import build, read_mapping
 from pimper_torch.runtime.errors import InputError, PimperWarning, caution, some
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 
 _KIND = "a result of `pimper reconstruct`"
@@ -80,6 +81,7 @@ class Result(WrittenResult):
         return views.replace(masks=self.silhouettes.masks)
 
 
+@isolated
 def read_written(folder: Path | str) -> WrittenResult:
     """Read a result folder without its photographs, which may be missing.
 
@@ -96,6 +98,7 @@ def read_written(folder: Path | str) -> WrittenResult:
     return _read(Path(folder))[0]
 
 
+@isolated
 def read_result(folder: Path | str, photographs: Path | str | None = None) -> Result:
     """Read a result folder, and its photographs with the settings of the run.
 
