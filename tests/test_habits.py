@@ -109,13 +109,7 @@ def test_a_copy_of_a_chain_gives_the_same_bits(copied):
     assert torch.equal(found.albedo, mesh().albedo)
 
 
-# Inductor takes minutes for dozens of graphs of a few operations; Dynamo alone finds them.
-COMPILED = pytest.param(
-    functools.partial(torch.compile, backend="eager"), marks=pytest.mark.slow, id="compile"
-)
-
-
-@pytest.mark.parametrize("wrapped", [COMPILED, nn.DataParallel])
+@pytest.mark.parametrize("wrapped", [torch.compile, nn.DataParallel])
 def test_a_compiled_or_replicated_warp_gives_the_same_result(wrapped):
     scene, coarse = given()
     patches = pt.Decompose()(coarse, scene.cameras)

@@ -51,6 +51,15 @@ def test_workers_inherit_the_callers_context_and_grad_mode(two_threads):
     assert all(side_by_side(lambda _: torch.is_grad_enabled(), range(3)))
 
 
+@pytest.mark.parametrize("inference", [True, False])
+def test_workers_inherit_inference_mode_and_write_into_its_tensors(two_threads, inference):
+    with torch.inference_mode(inference):
+        rows = torch.zeros(3, 2)
+        done = side_by_side(lambda row: rows[row].fill_(row).requires_grad, range(3))
+        assert not any(done)
+    assert rows[:, 0].tolist() == [0, 1, 2]
+
+
 def test_nested_work_stays_in_its_worker(two_threads):
     def outer(item):
         here = threading.get_ident()

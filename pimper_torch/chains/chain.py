@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,6 +43,7 @@ from pimper_torch.runtime.failures import failures_of, skipping, warn_of
 from pimper_torch.runtime.file_names import view_named
 from pimper_torch.runtime.ledger import left_out_of
 from pimper_torch.runtime.reporting import Observer, SilentObserver, observed, stage, table_of
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.stages.coarse.depth_points import DepthPoints
 from pimper_torch.stages.meshing.finish import Simplify
 from pimper_torch.stages.patches.transfer import transfer
@@ -192,6 +194,7 @@ class Chain(Stage):
             with stage("preview"):
                 self.preview(scene, coarse)
 
+    @isolated
     def prepare(
         self,
         views: Views | SparseScene,
@@ -244,11 +247,12 @@ class Chain(Stage):
                 "needed: give them to `prepare`."
             )
         passes = self.passes(self.running(), prepared)
+        next_pass: Callable[[], Step | None] = isolated(partial(next, passes, None))
         entries: list[Event] = [*prepared.failures, *prepared.left_out]
         before = prepared.reports
         while True:
             with skipping(self.on_failure, entries), observed(self.observer) as table:
-                step = next(passes, None)
+                step = next_pass()
                 if step is not None:
                     self.notify(step)
             if step is None:
@@ -308,6 +312,7 @@ class Chain(Stage):
             left_out=(*step.left_out, *left_out_of(entries)),
         )
 
+    @isolated
     def finish(self, result: Reconstruction, files: MeshFiles | None = None) -> Reconstruction:
         """Prepare a result for export, on the CPU.
 

@@ -24,6 +24,7 @@ from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
 from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.config import build, read_mapping
 from pimper_torch.runtime.errors import InputError, PimperWarning, caution, some
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 from pimper_torch.viz.cells import lit_cell
 from pimper_torch.viz.overview import preview
@@ -90,6 +91,7 @@ class Result(WrittenResult):
         return lit_cell(self, self.mesh, self.scene, self.scene.views.names.index(self.reference))
 
 
+@isolated
 def read_written(folder: Path | str) -> WrittenResult:
     """Read a result folder without its photographs, which may be missing.
 
@@ -106,6 +108,7 @@ def read_written(folder: Path | str) -> WrittenResult:
     return _read(Path(folder))[0]
 
 
+@isolated
 def read_result(folder: Path | str, photographs: Path | str | None = None) -> Result:
     """Read a result folder, and its photographs with the settings of the run.
 

@@ -31,6 +31,7 @@ from pimper_torch.runtime.config import read_mapping, to_yaml
 from pimper_torch.runtime.mapped import drop_pages
 from pimper_torch.runtime.progress import part
 from pimper_torch.runtime.reporting import stage_report
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.scale.given import MILLIMETRES
 from pimper_torch.stages.sfm.sparse_scene import write_model
 from pimper_torch.viz.maps import normal_colors, view_maps
@@ -64,6 +65,7 @@ RESULT_NAMES = (
 _PARTS = 5  # of the progress bar: images, meshes, asset, others, page
 
 
+@isolated
 def write_result(
     result: Reconstruction,
     config: object,

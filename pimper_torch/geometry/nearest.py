@@ -68,7 +68,7 @@ class NearestSurface:
             hits = fcpw.interaction_3D_list()
             unlimited = np.full(len(queries), np.inf, dtype=np.float32)
             self._scene.find_closest_points(self._columns(queries), unlimited, hits)
-            face = torch.tensor([hit.primitive_index for hit in hits], dtype=torch.long)
+            face = torch.from_numpy(np.array([hit.primitive_index for hit in hits], dtype=np.int64))
             nearest = closest_on_triangles(queries, self._vertices[self._faces[face]])
         else:
             face = torch.from_numpy(np.asarray(self._tree.query(queries.numpy())[1])).long()

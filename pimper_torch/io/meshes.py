@@ -27,6 +27,7 @@ from pimper_torch.records import Mesh
 from pimper_torch.records.shapes import FaceMask, Vertices
 from pimper_torch.records.value_checks import not_finite, out_of_range
 from pimper_torch.runtime.errors import InputError, OutputError
+from pimper_torch.runtime.torch_settings import isolated
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -143,6 +144,7 @@ def _positions(mesh: Mesh, offset_world: Offset) -> Vertices:
     return shifted if bool(rounded) else single
 
 
+@isolated
 def read_mesh(path: Path | str) -> Mesh:
     """Read a triangle mesh or a point cloud: PLY, OBJ, STL, OFF or GLB.
 

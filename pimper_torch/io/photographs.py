@@ -27,12 +27,14 @@ from pimper_torch.records.shapes import Images, Map, Mask, Masks, PerView
 from pimper_torch.runtime.errors import InputError, caution, some
 from pimper_torch.runtime.file_names import match_poses
 from pimper_torch.runtime.mapped import drop_pages, each, parts, zeros
+from pimper_torch.runtime.torch_settings import isolated
 
 _LIT_FRACTION = 1e-3  # more than hot pixels
 # Suffixes that programs append to the name of a mask.
 _MASK = re.compile(r"[ _.-]?mask((\.[A-Za-z]+)+)$", re.IGNORECASE)
 
 
+@isolated
 def load_views(
     folder: Path | str,
     *,

@@ -32,7 +32,8 @@ from pimper_torch.runtime.errors import InputError
 # Choices: profiles of printers have 2 MB and about 20 tags.
 _MAX_BYTES, _MAX_TAGS = 2**22, 100
 _HEADER, _ENTRY = 128, 12
-_LEVELS = torch.linspace(0, 1, 4097, dtype=torch.float64)  # at which formulas are sampled
+# At which formulas are sampled.
+_LEVELS = torch.linspace(0, 1, 4097, dtype=torch.float64, device="cpu")
 # Number of parameters of each function of a `para` curve.
 _PARAMETERS = (1, 3, 4, 5, 7)
 # Choices: largest fall of a curve, as rounding makes two pieces meet inexactly; least rise of a

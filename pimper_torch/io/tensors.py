@@ -15,6 +15,7 @@ from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import Cameras, SparseScene, Views
 from pimper_torch.records.shapes import Images, Points
 from pimper_torch.runtime.errors import InputError, caution
+from pimper_torch.runtime.torch_settings import isolated
 
 _DECODED = (
     " Bytes are usually sRGB: `radiometry.linear_from_srgb(images / 255)` decodes them, "
@@ -23,6 +24,7 @@ _DECODED = (
 Array = Tensor | np.ndarray | Sequence[object]
 
 
+@isolated
 def scene_of(
     images: Array,
     intrinsics: Array,
@@ -150,7 +152,7 @@ def _check_radiance(images: Tensor) -> None:
 
 
 def _floats(values: Array, name: str, what: str) -> Tensor:
-    tensor = torch.as_tensor(values)
+    tensor = values if isinstance(values, Tensor) else torch.as_tensor(values)
     if not tensor.is_floating_point():
         raise InputError(
             f"{name} is {str(tensor.dtype).removeprefix('torch.')}; needed: {what}, in floating "

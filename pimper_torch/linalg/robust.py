@@ -76,7 +76,10 @@ class Squares(Loss):
 
 @dataclass(frozen=True, slots=True)
 class Cauchy(Loss):
-    r"""Cauchy's loss, :math:`\rho = \log(1 + u)`: outliers keep a small influence."""
+    r"""Cauchy's loss, :math:`\rho = \log(1 + u)`: outliers keep a small influence.
+
+    Source: Holland & Welsch, Communications in Statistics 6(9), 1977.
+    """
 
     code: ClassVar[int | None] = twin_constants.CAUCHY
     scale: Scale = CAUCHY_TUNING
@@ -219,18 +222,11 @@ def _fractions(square: Items, scale: Float[Tensor, "*batch one"]) -> Items:
     return ratio / (1 + ratio)
 
 
-def cauchy_weights(residual: Scalars, scale: Float[Tensor, "*#batch"]) -> Scalars:
-    """Return the weights ``1 / (1 + (r / scale)^2)``; 1 where the scale is 0.
-
-    Iteratively reweighted least squares with them minimizes the sum of
-    ``scale^2 / 2 * log(1 + (r / scale)^2)``.
-
-    Source: Holland & Welsch, Communications in Statistics 6(9), 1977.
-    """
-    return 1 / (1 + _relative_square(residual, scale))
-
-
 def _relative_square(residual: Scalars, scale: Float[Tensor, "*#batch"]) -> Scalars:
     """Return squared residuals in units of the squared scale; 0 where the scale is 0."""
     relative = torch.where(scale > 0, residual / torch.where(scale > 0, scale, 1), 0)
     return relative * relative
+
+
+# Weights ``1 / (1 + (r / scale)^2)`` of residuals ``r``; 1 where the scale is 0.
+cauchy_weights = Cauchy(scale=1.0).weights

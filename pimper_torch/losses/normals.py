@@ -8,6 +8,7 @@ from pimper_torch.records import NormalPrior, SparseScene, Surface
 from pimper_torch.records.shapes import Scalar
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.runtime.file_names import view_named
+from pimper_torch.runtime.torch_settings import isolated
 
 
 class NormalLoss(nn.Module):
@@ -30,6 +31,7 @@ class NormalLoss(nn.Module):
             )
         self.truth = truth
 
+    @isolated
     def forward(
         self, surface: Surface, scene: SparseScene, visible: Visible | None = None
     ) -> Scalar:

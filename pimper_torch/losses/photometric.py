@@ -11,6 +11,7 @@ from pimper_torch.losses.visible import Visible, in_view, interpolated_at, well_
 from pimper_torch.records import SparseScene, Surface
 from pimper_torch.records.shapes import Scalar
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.torch_settings import isolated
 
 _UNKNOWNS = 4  # of the light of a photograph
 _ROUNDS = 60  # of reweighting: with 12, gradients are off by up to 0.8 %
@@ -38,6 +39,7 @@ class PhotometricLoss(nn.Module):
         super().__init__()
         self.scale, self.darkest, self.brightest = scale, darkest, brightest
 
+    @isolated
     @torch.no_grad()
     def visible(self, surface: Surface, scene: SparseScene) -> Visible:
         """Return the vertices that each photograph shows, neither dark nor saturated."""
@@ -45,6 +47,7 @@ class PhotometricLoss(nn.Module):
         gray = torch.stack([gray_at(surface, scene, view) for view in range(len(visible))])
         return visible & (gray > self.darkest) & (gray < self.brightest)
 
+    @isolated
     def forward(
         self, surface: Surface, scene: SparseScene, visible: Visible | None = None
     ) -> Scalar:

@@ -9,12 +9,14 @@ from pimper_torch.geometry.projection import project
 from pimper_torch.geometry.visibility import visible_vertices
 from pimper_torch.records import Cameras, Surface
 from pimper_torch.records.shapes import Points
+from pimper_torch.runtime.torch_settings import isolated
 
 Visible = Bool[Tensor, "view vertex"]
 
 _MIN_COSINE = 0.4  # vertices at more than 66 degrees are foreshortened: a choice
 
 
+@isolated
 def well_visible(surface: Surface, cameras: Cameras) -> Visible:
     """Return the vertices that the photographs determine, and each camera sees not too obliquely.
 
@@ -23,6 +25,7 @@ def well_visible(surface: Surface, cameras: Cameras) -> Visible:
     return visible_vertices(surface.mesh, cameras, _MIN_COSINE) & surface.supported
 
 
+@isolated
 def in_view(
     points_world: Points, cameras: Cameras, view: int
 ) -> tuple[Float[Tensor, "point 2"], Float[Tensor, " point"]]:

@@ -4,8 +4,10 @@ from pimper_torch.priors.depth import resolve_depth_conventions
 from pimper_torch.priors.normals import resolve_normal_conventions
 from pimper_torch.priors.undistort import with_undistorted_priors
 from pimper_torch.records import DepthPrior, NormalPrior, Prior, Silhouettes, SparseScene
+from pimper_torch.runtime.torch_settings import isolated
 
 
+@isolated
 def resolve_prior_conventions(
     scene: SparseScene, silhouettes: Silhouettes | None = None
 ) -> SparseScene:

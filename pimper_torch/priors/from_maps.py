@@ -55,10 +55,12 @@ def padded(maps: Mapping[str, tuple[Tensor, Tensor | None]], undistorted: bool =
     Args:
         maps: Values ``height width channel`` and variance, if any, by photograph.
     """
-    sizes = torch.tensor([[layer.shape[1], layer.shape[0]] for layer, _ in maps.values()])
+    sizes = torch.tensor([layer.shape[1::-1] for layer, _ in maps.values()], device="cpu")
     max_width, max_height = sizes.amax(dim=0).tolist()
     first = next(iter(maps.values()))[0]
-    values = first.new_full((len(maps), max_height, max_width, first.shape[2]), torch.nan)
+    shape = len(maps), max_height, max_width, first.shape[2]
+    dtype = torch.promote_types(first.dtype, torch.float32)  # from half precision, as by autocast
+    values = first.new_full(shape, torch.nan, dtype=dtype)
     variance = values[..., 0].clone()
     for index, (layer, layer_variance) in enumerate(maps.values()):
         height, width = layer.shape[:2]

@@ -108,7 +108,7 @@ def _by_file(path: Path) -> Callable[[Picture], Saliency]:
     session = onnx_session(path)
     size = _input_size(path, session)
     mean, std = (
-        torch.tensor(values)[:, None, None]
+        torch.tensor(values, dtype=torch.float32, device="cpu")[:, None, None]
         for values in (_ISNET if size == (1024, 1024) else _IMAGENET)
     )
     into, out = session.get_inputs()[0].name, session.get_outputs()[0].name

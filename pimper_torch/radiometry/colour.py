@@ -9,7 +9,7 @@ from torch import Tensor
 from pimper_torch.radiometry.response import Curve, Gamma, Linear, Response, Srgb
 from pimper_torch.records.shapes import Matrix3
 
-_LEVELS = torch.linspace(0, 1, 1025, dtype=torch.float64)
+_LEVELS = torch.linspace(0, 1, 1025, dtype=torch.float64, device="cpu")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

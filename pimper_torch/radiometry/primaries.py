@@ -17,13 +17,15 @@ _SRGB_D50 = torch.tensor(
         [0.0139322, 0.0971045, 0.7141733],
     ],
     dtype=torch.float64,
+    device="cpu",
 )
 # Cone responses of Bradford's adaptation, from ICC.1 annex E.
 _BRADFORD = torch.tensor(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]],
     dtype=torch.float64,
+    device="cpu",
 )
-_D50 = torch.tensor([0.9642, 1.0, 0.8249], dtype=torch.float64)
+_D50 = torch.tensor([0.9642, 1.0, 0.8249], dtype=torch.float64, device="cpu")
 # Choices: maximum deviation of the rows' sums from 1, for primaries with a profile's rounded white;
 # minimum weight at which a saturated colour saturates others, and minimum determinant.
 _MAX_OFF_WHITE, _MIXED = 0.1, 0.01

@@ -494,7 +494,7 @@ def _given(
     valid = templates.inside & normals.isfinite().all(dim=-1) & (length > 0) & (normals[..., 2] < 0)
     if views is not None:
         valid = valid & views.valid.any(dim=1)
-    facing = torch.tensor([0.0, 0.0, -1.0]).to(like)
+    facing = like.new_tensor([0.0, 0.0, -1.0])
     unit = torch.where(valid[..., None], normals / length[..., None], facing)
     lights = lights.to(like)
     if lights.ndim == 2:
@@ -507,7 +507,7 @@ def _given(
         albedo=torch.ones_like(like)[..., None] if albedo is None else albedo.to(like),
         lights_patch=lights,
         valid=valid,
-        information=torch.as_tensor(information).to(like) * valid,
+        information=torch.as_tensor(information, dtype=like.dtype, device=like.device) * valid,
         status=torch.where(determined, int(PatchStatus.DETERMINED), int(PatchStatus.UNSEEN)),
         convergence=Convergence(
             iterations=torch.zeros_like(templates.facet),

@@ -63,6 +63,12 @@ class Record:
         Raises:
             InputError: Names the field, the value found and the value needed.
         """
+        for path, leaf in pytree.tree_leaves_with_path(self):
+            if getattr(leaf, "dtype", None) in (torch.float16, torch.bfloat16):
+                raise InputError(
+                    f"{where}: {type(self).__name__}{pytree.keystr(path)} is {_brief(leaf)}; "
+                    "needed: float32 or float64, as from `.to(torch.float32)`."
+                )
         for name, found, needed in self.faults():
             raise InputError(f"{where}: {type(self).__name__}.{name} {found}; needed: {needed}.")
 
@@ -114,13 +120,14 @@ class Record:
         if not isinstance(index, Tensor | slice):
             if list(index) == list(range(count)):
                 return self
-            index = torch.tensor(index, dtype=torch.long)
+            index = torch.tensor(index, dtype=torch.long, device="cpu")
         changes: dict[str, object] = {}
         for name in fields:
             value = getattr(self, name)
             if isinstance(value, tuple):
-                kept = torch.arange(count)[index.cpu() if isinstance(index, Tensor) else index]
-                changes[name] = tuple(value[item] for item in kept.tolist())
+                order = torch.arange(count, device="cpu")
+                kept = order[index.cpu() if isinstance(index, Tensor) else index].tolist()
+                changes[name] = tuple(value[item] for item in kept)
             elif isinstance(value, Record):
                 changes[name] = value.take(index)
             elif value is not None:

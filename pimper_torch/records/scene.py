@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -37,14 +38,9 @@ class CameraModel(Record):
     height: int
 
 
-def no_maps() -> Float[Tensor, "0 3 3"]:
-    """Return an empty stack of maps."""
-    return torch.zeros(0, 3, 3)
-
-
-def no_sessions() -> Int[Tensor, "0"]:
-    """Return an empty tensor of session numbers."""
-    return torch.zeros(0, dtype=torch.long)
+# Empty defaults, on the CPU whatever torch's default device is.
+no_maps = partial(torch.zeros, 0, 3, 3, dtype=torch.float32, device="cpu")
+no_sessions = partial(torch.zeros, 0, dtype=torch.long, device="cpu")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

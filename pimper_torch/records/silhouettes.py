@@ -34,7 +34,9 @@ class Silhouettes(Record):
     inside: Float[Tensor, "view height width"]
     reliable: Bool[Tensor, " view"]
     source: Literal["masks", "found", "everything"]
-    planes_world: Float[Tensor, "plane 4"] = field(default_factory=lambda: torch.zeros(0, 4))
+    planes_world: Float[Tensor, "plane 4"] = field(
+        default_factory=lambda: torch.zeros(0, 4, dtype=torch.float32, device="cpu")
+    )
     hidden: Masks | None = None
     expected_overlap: PerView | None = None
 
@@ -47,7 +49,7 @@ class Silhouettes(Record):
         Args:
             planes_world: Anything below one of the planes is not the object.
         """
-        planes = torch.zeros(0, 4) if planes_world is None else planes_world
+        planes = views.images.new_zeros(0, 4) if planes_world is None else planes_world
         return cls(
             inside=by_view(Tensor.float, views.inside),
             reliable=torch.zeros(views.num_views, dtype=torch.bool, device=views.images.device),

@@ -30,11 +30,11 @@ class SparseModel(Record):
     names: tuple[str, ...]
     lenses: tuple[CameraModel, ...]
     cam_from_world: Float[Tensor, "view 4 4"]
-    points_world: Points = field(default_factory=lambda: torch.zeros(0, 3).double())
+    points_world: Points = field(default_factory=lambda: no_maps()[:, 0].double())
     observation_point: Int[Tensor, " observation"] = field(default_factory=no_sessions)
     observation_view: Int[Tensor, " observation"] = field(default_factory=no_sessions)
     observation_pixels: Float[Tensor, "observation 2"] = field(
-        default_factory=lambda: torch.zeros(0, 2).double()
+        default_factory=lambda: no_maps()[:, 0, :2].double()
     )
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
     sessions: Int[Tensor, " divided"] = field(default_factory=no_sessions)

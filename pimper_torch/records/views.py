@@ -17,6 +17,7 @@ from pimper_torch.records.value_checks import (
     not_rigid,
 )
 from pimper_torch.runtime.mapped import by_view
+from pimper_torch.runtime.torch_settings import isolated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -104,11 +105,13 @@ class Cameras(Record):
         yield from faults_in("cam_from_world", needed, not_rigid, self.cam_from_world)
 
     @property
+    @isolated
     def centers_world(self) -> Float[Tensor, "view 3"]:
         """Camera centres."""
         rotation, translation = self.cam_from_world[:, :3, :3], self.cam_from_world[:, :3, 3]
         return -(rotation.mT @ translation[..., None])[..., 0]
 
+    @isolated
     def retract(self, delta: Float[Tensor, "view 6"]) -> "Cameras":
         """Move the cameras by steps in SE(3): a step of an optimizer keeps rotations exact.
 

@@ -3,6 +3,8 @@
 Every message gives the location, the value, the requirement, and advice.
 """
 
+import sys
+import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,6 +12,9 @@ from typing import Literal
 
 from pimper_torch.runtime.events import Caution
 from pimper_torch.runtime.stream import collected, emit
+
+# Modules with the frames of :func:`~pimper_torch.runtime.torch_settings.isolated`.
+_AROUND = ("contextlib", "pimper_torch.runtime.torch_settings", "torch._dynamo.eval_frame")
 
 OnFailure = Literal["skip", "fail"]
 """Whether a failed patch, view or solver is skipped, or ends the run."""
@@ -51,10 +56,14 @@ def caution(message: str, stacklevel: int = 1) -> None:
     """Warn immediately or, inside :func:`held`, leave that to the owner of the block.
 
     Args:
-        stacklevel: As for :func:`warnings.warn`, counted from the caller.
+        stacklevel: As for :func:`warnings.warn`, counted from the caller; frames around a function
+            of the package are left out.
     """
     if not emit(Caution(message=message)):
-        warnings.warn(message, PimperWarning, stacklevel=stacklevel + 1)
+        stack = traceback.walk_stack(sys._getframe(1))
+        names = enumerate((frame.f_globals.get("__name__") for frame, _ in stack), start=2)
+        shown = [level for level, name in names if name not in _AROUND]
+        warnings.warn(message, PimperWarning, stacklevel=shown[min(stacklevel, len(shown)) - 1])
 
 
 @contextmanager

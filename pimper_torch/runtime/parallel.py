@@ -95,11 +95,11 @@ def _idle(workers: int) -> ThreadPoolExecutor:
 def _in_threads(
     work: Callable[[Item], Result], items: Sequence[Item], workers: int
 ) -> Iterator[Result]:
-    grad = torch.is_grad_enabled()
+    grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def in_worker(item: Item) -> Result:
         _is_worker.set(True)
-        with torch.set_grad_enabled(grad):
+        with torch.inference_mode(inference), torch.set_grad_enabled(grad):
             return work(item)
 
     waiting: deque[Future[Result]] = deque()

@@ -8,6 +8,7 @@ import torch
 from pimper_torch.records import Reconstruction
 from pimper_torch.records.shapes import Vector
 from pimper_torch.runtime.errors import caution
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.scale.given import CameraDistance, ScaleBar, Unit
 from pimper_torch.scale.marker_scale import Marker, scale_of_markers
 from pimper_torch.scale.marks import place_of, view_of
@@ -37,6 +38,7 @@ def _length(ends: Sequence[Vector], given: ScaleBar | CameraDistance) -> Length:
     return Length(measured=measured, true=given.length, label=f"{given.first} to {given.second}")
 
 
+@isolated
 def find_scale(
     result: Reconstruction,
     *,

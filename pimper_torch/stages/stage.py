@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from pimper_torch.records import Record, Views
 from pimper_torch.runtime.errors import InputError, caution, held
+from pimper_torch.runtime.torch_settings import isolated
 
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
@@ -51,6 +52,8 @@ class Stage(nn.Module):
             Raises:
                 InputError: An input has the wrong type, or is a record with unusable values.
             """
+
+    _call_impl = isolated(nn.Module._call_impl)
 
     def __init__(self) -> None:
         super().__init__()

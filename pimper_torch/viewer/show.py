@@ -9,6 +9,7 @@ from pimper_torch.io.cameras.model_files import read_model
 from pimper_torch.io.estimates import read_estimate
 from pimper_torch.records import Mesh, Reconstruction, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.viewer.server import HOST, PORT
 from pimper_torch.viewer.viewer import Viewer
 
@@ -66,6 +67,7 @@ def add_found(
         viewer.add_pass(RESULT, result.mesh)
 
 
+@isolated
 def show(
     result: Reconstruction | Result | Mesh | Path | str, *, host: str = HOST, port: int = PORT
 ) -> Viewer:

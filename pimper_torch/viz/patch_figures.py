@@ -155,7 +155,7 @@ def by_facet(patches: AnyPatch, name: str) -> Float[Tensor, " face"]:
         InputError: The buckets have no such field, or it does not have one value per patch.
     """
     templates = _templates(patches)
-    gathered = torch.full((len(templates.coarse.mesh.faces),), torch.nan)
+    gathered = torch.full_like(templates.coarse.mesh.faces[:, 0].cpu().float(), torch.nan)
     for template, bucket in zip(templates.buckets, patches.buckets, strict=True):
         value: object = bucket
         for part in name.split("."):

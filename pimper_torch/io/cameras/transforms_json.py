@@ -23,7 +23,7 @@ from pimper_torch.runtime.errors import InputError, caution
 
 trimesh = lazy_loader.load("trimesh")  # takes a second
 KIND = "a transforms.json set"
-FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64, device="cpu")
 """Converts OpenGL's camera axes, with y up and the view along -z."""
 
 _POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")

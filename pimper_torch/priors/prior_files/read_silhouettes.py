@@ -67,7 +67,8 @@ def object_at(marks: Sequence[Mark], views: Views) -> SilhouettePrior:
         require_inside(pointer, *full)
         scale = min(1.0, 512 / max(size))
         width, height = (max(1, round(scale * side)) for side in size)
-        inside = maps.setdefault(view, torch.full((height, width, 1), 0.5))
+        unknown = np.full((height, width, 1), 0.5, np.float32)
+        inside = maps.setdefault(view, torch.from_numpy(unknown))
         column = min(int(pointer.x * width / full[0]), width - 1)
         row = min(int(pointer.y * height / full[1]), height - 1)
         inside[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] = 1

@@ -27,6 +27,7 @@ from torch import Tensor
 from pimper_torch.records import Record
 from pimper_torch.records.shapes import Scalars
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.stages.photometry.bilinear import Bilinear, Factors
 from pimper_torch.stages.photometry.variable_projection import solve_variable_projection
 
@@ -156,6 +157,7 @@ class RestartResult(Record):
     repeated: bool
 
 
+@isolated
 def factorize_from_many(
     matrix: Matrix | np.ndarray,
     weight: Matrix | np.ndarray,

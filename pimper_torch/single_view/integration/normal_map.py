@@ -13,6 +13,7 @@ from pimper_torch.geometry.pixels import crop_intrinsics
 from pimper_torch.records import Record
 from pimper_torch.records.shapes import Map, Mask, Matrix3, VectorMap
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.single_view.integration.discontinuities import (
     ContinuousSteps,
     find_discontinuities,
@@ -49,6 +50,7 @@ class IntegratedMap(Record):
     continuity: ContinuousSteps | None = None
 
 
+@isolated
 def integrate_normal_map(
     normals: Raster,
     mask: Raster | None = None,
@@ -81,11 +83,11 @@ def integrate_normal_map(
     >>> float(integrate_normal_map(up).depth.abs().max())
     0.0
     """
-    normals = torch.as_tensor(normals)
+    normals = normals if isinstance(normals, Tensor) else torch.as_tensor(normals)
     mask, weight, known_depth = (
         torch.full(normals.shape[:2], value, device=normals.device)
         if raster is None
-        else torch.as_tensor(raster)
+        else torch.as_tensor(raster, device=normals.device)
         for raster, value in ((mask, True), (weight, 1.0), (known_depth, math.nan))
     )
     _refuse(normals, mask, weight, known_depth, spacing)

@@ -19,6 +19,7 @@ from pimper_torch.records.shapes import (
     ViewVectors,
 )
 from pimper_torch.runtime.errors import InputError
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.single_view.factorization import bas_relief
 from pimper_torch.single_view.photometric_stereo.albedo_entropy import (
     chromaticity_groups,
@@ -69,6 +70,7 @@ class PhotometricStereo(Record):
     free: str = "nothing"
 
 
+@isolated
 @torch.no_grad()
 def photometric_stereo(
     images: Float[Tensor, "..."] | np.ndarray,

@@ -23,6 +23,7 @@ from pimper_torch.records import (
 from pimper_torch.records.shapes import Faces, Vertices
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
+from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.stages.coarse.coarse_config import CoarseSurfaceConfig
 from pimper_torch.stages.coarse.fine_surface import fine_surface
 from pimper_torch.stages.coarse.given_mesh import oriented_outward, prepared
@@ -105,6 +106,7 @@ class CoarseSurface(Stage):
         return coarse.replace(support=support)
 
 
+@isolated
 @torch.no_grad()
 def facets_of(mesh: Mesh, scene: SparseScene, reference: str = "") -> CoarseMesh:
     """Return a coarse mesh with the faces of a mesh as facets, and the cloud's points on them.
