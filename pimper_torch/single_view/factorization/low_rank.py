@@ -157,8 +157,8 @@ class RestartResult(Record):
 
 
 def factorize_from_many(
-    matrix: Matrix | np.ndarray,
-    weight: Matrix | np.ndarray,
+    matrix: Float[Tensor, "..."] | np.ndarray,
+    weight: Float[Tensor, "..."] | np.ndarray,
     rank: int,
     generator: torch.Generator,
     *,
