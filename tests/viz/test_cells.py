@@ -96,9 +96,18 @@ def test_records_without_a_picture_keep_their_text(reconstruction):
     assert reconstruction.silhouettes._repr_html_() is None
 
 
+def step_of(reconstruction):
+    """A step with the parts of a result, unchecked."""
+    step = object.__new__(Step)
+    values = {"prepared": reconstruction, "surface": reconstruction, "scale": 0.5, "last": False}
+    values |= {"heights": reconstruction.patches, "reports": (), "failures": (), "left_out": ()}
+    for name, value in values.items():
+        object.__setattr__(step, name, value)
+    return step
+
+
 def test_a_step_shows_its_surface(reconstruction):
-    fields = {"heights": reconstruction.patches, "surface": reconstruction}
-    step = Step(scale=0.5, last=False, prepared=reconstruction, **fields)
+    step = step_of(reconstruction)
     (picture,) = images(html := step._repr_html_())
     assert picture.shape[0] == 180
     assert "<th>scale</th><td>0.5</td>" in small(html)
@@ -113,8 +122,7 @@ def test_records_with_gradients_are_drawn(reconstruction):
     for tensor in (mesh.vertices_world, mesh.albedo, scene.cameras.cam_from_world):
         tensor.requires_grad_()
     scene.views.images.requires_grad_()
-    fields = {"heights": reconstruction.patches, "surface": reconstruction}
-    step = Step(scale=0.5, last=False, prepared=reconstruction, **fields)
+    step = step_of(reconstruction)
     for record in (reconstruction, step, scene, scene.views):
         assert images(unescape(record._repr_html_()))
     assert reconstruction.plot().width > 500

@@ -159,8 +159,8 @@ class RestartResult(Record):
 
 @isolated
 def factorize_from_many(
-    matrix: Matrix | np.ndarray,
-    weight: Matrix | np.ndarray,
+    matrix: Float[Tensor, "..."] | np.ndarray,
+    weight: Float[Tensor, "..."] | np.ndarray,
     rank: int,
     generator: torch.Generator,
     *,

@@ -10,7 +10,6 @@ from torch.nn.functional import normalize
 
 from pimper_torch.records import Record
 from pimper_torch.records.shapes import (
-    Images,
     Mask,
     Masks,
     Matrix3,
@@ -135,7 +134,7 @@ def photometric_stereo(
 
 
 def _inside(
-    images: Images, mask: Mask, weight: Tensor, method: str
+    images: Float[Tensor, "all channel height width"], mask: Mask, weight: Tensor, method: str
 ) -> tuple[Colours, Samples, Bool[Tensor, " all"]]:
     """Return radiance and weights inside the mask of the photographs with samples, and which."""
     samples = images[:, :, mask]
