@@ -14,14 +14,15 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize, pad
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 import pimper_torch as pt
 from pimper_torch.chains.prepare import Prepared
 from pimper_torch.data import Capture, read_capture
 from pimper_torch.losses import well_visible
 
-Progress = Iterator[tuple[Tensor, str]]
-"""The loss of each step, and how far the parameters are from the truth."""
+Progress = Iterator[tuple[Tensor, str, torch.optim.Optimizer]]
+"""The loss of each step, the parameters in words, and what moves them after that."""
 
 
 def of_cameras(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress:
@@ -43,8 +44,7 @@ def of_cameras(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress:
         (step,) = chain.steps(moved(frozen))
         visible = loss.visible(step.surface, step.scene) if visible is None else visible
         value = loss(step.surface, step.scene, visible)
-        yield value, f"{float(offset.detach().norm(dim=1).mean()):.5f} units"
-        descend(optimizer, value)
+        yield value, f"{float(offset.detach().norm(dim=1).mean()):.5f} units", optimizer
 
 
 def of_response(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress:
@@ -64,8 +64,7 @@ def of_response(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress
         (step,) = chain.steps(frozen.replace(scene=decoded()))
         visible = loss.visible(step.surface, step.scene) if visible is None else visible
         value = loss(step.surface, step.scene, visible)
-        yield value, f"exponent {float(logarithm.detach().exp()):.3f}"
-        descend(optimizer, value)
+        yield value, f"exponent {float(logarithm.detach().exp()):.3f}", optimizer
 
 
 def of_normals(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress:
@@ -91,15 +90,7 @@ def of_normals(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress:
         own = scene.replace(views=scene.views.replace(normals=prior))
         (step,) = chain.steps(frozen.replace(scene=own))
         value = loss(step.surface, scene, visible)
-        yield value, f"{float((1 - value.detach()).arccos().rad2deg()):.2f} degrees"
-        descend(optimizer, value)
-
-
-def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-    """Take one step."""
-    optimizer.zero_grad()
-    loss.backward()  # type: ignore[no-untyped-call]
-    optimizer.step()
+        yield value, f"{float((1 - value.detach()).arccos().rad2deg()):.2f} degrees", optimizer
 
 
 TASKS = {"cameras": of_cameras, "response": of_response, "normals": of_normals}
@@ -119,16 +110,22 @@ def main() -> None:
     prepared = chain.prepare(truth.scene)
     print("| task | step | loss | parameters | CPU s |\n|---|--:|--:|--:|--:|")  # noqa: T201
     for name in options.tasks:
-        before: list[float] = []
-        began = time.process_time()
-        for number, (loss, found) in enumerate(TASKS[name](chain, prepared, truth)):
+        losses: list[float] = []
+        began, schedule = time.process_time(), None
+        for number, (loss, found, optimizer) in enumerate(TASKS[name](chain, prepared, truth)):
+            losses.append(loss.item())
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
             now = time.process_time()
-            cells = name, number, f"{loss.item():.5f}", found, f"{now - began:.1f}"
+            cells = name, number, f"{losses[-1]:.5f}", found, f"{now - began:.1f}"
             print("|", *(f"{cell} |" for cell in cells), flush=True)  # noqa: T201
-            before, began = [*before, loss.item()], now
+            began = now
             if number == options.steps:
                 break
-        falls = sum(after < earlier for earlier, after in pairwise(before))
+            optimizer.step()
+            schedule = schedule or CosineAnnealingLR(optimizer, options.steps)
+            schedule.step()
+        falls = sum(after < earlier for earlier, after in pairwise(losses))
         print(f"\n{name}: the loss falls in {falls} of {options.steps} steps\n")  # noqa: T201
 
 

@@ -44,6 +44,7 @@ RUNS = {
         "{out} --captures 2 --tests 1 --views 6 --size 160 120 --minutes 0.1",
         "| first | 1 | 0.",
     ),
+    "training": ("{scene} --tasks normals --steps 1", "| normals | 1 | "),
     "turntable": ("{scene} --masks none", "| scene | none | 8 of 8 | "),
     "walk": ("--num-views 8 --width 240 --height 180 --renderings {out}", "| 8 | "),
 }
