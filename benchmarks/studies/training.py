@@ -122,8 +122,8 @@ def main() -> None:
             began = now
             if number == options.steps:
                 break
-            optimizer.step()
             schedule = schedule or CosineAnnealingLR(optimizer, options.steps)
+            optimizer.step()
             schedule.step()
         falls = sum(after < earlier for earlier, after in pairwise(losses))
         print(f"\n{name}: the loss falls in {falls} of {options.steps} steps\n")  # noqa: T201
