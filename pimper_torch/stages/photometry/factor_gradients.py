@@ -152,7 +152,7 @@ class Hessian(Record):
         loss_curvature: Weighted second derivative of the loss at each entry.
         weighted_residual: Weight times residual of each entry.
         inverse: Inverse diagonal blocks of the samples.
-        schur: Schur complement for the lights.
+        inverse_schur: Inverse of the Schur complement for the lights.
     """
 
     lights: Lights
@@ -161,7 +161,7 @@ class Hessian(Record):
     loss_curvature: Entries
     weighted_residual: Entries
     inverse: Float[Tensor, "patch sample tangent tangent"]
-    schur: Float[Tensor, "patch unknown unknown"]
+    inverse_schur: Float[Tensor, "patch unknown unknown"]
 
 
 @torch.no_grad()
@@ -216,8 +216,7 @@ def _solved(hessian: Hessian, on_lights: Lights, on_samples: Tangential) -> Fact
     """Return the inverse Hessian times a gradient, samples eliminated."""
     inner = _apply(hessian.inverse, on_samples)
     slope = on_lights - _apply_mixed(hessian, inner)
-    flat = slope.reshape(len(slope), -1, 1)
-    lights = torch.linalg.solve(hessian.schur, flat).reshape(slope.shape)
+    lights = (hessian.inverse_schur @ slope.reshape(len(slope), -1, 1)).reshape(slope.shape)
     return FactorStep(
         lights=lights,
         along_tangents=inner - _apply(hessian.inverse, _apply_mixed_transpose(hessian, lights)),
@@ -255,21 +254,23 @@ def _hessian(problem: Bilinear, L: Lights, N: Shading) -> Hessian:
     slope, weighted_residual = -_ambient(problem, L, N, robust), robust * residual
     A, B = quadratics.unpacked(packed, N.shape[1]), torch.stack(columns, dim=-1).transpose(1, 2)
     block = B.mT @ A @ B + problem.manifold.curvature(N, slope)
-    diagonal = block.diagonal(dim1=2, dim2=3).abs().sum(dim=-1)
-    eye = torch.eye(block.shape[-1], dtype=block.dtype, device=block.device)
-    # A sample without data does not move.
-    moves = (diagonal > 0)[..., None, None]
-    inverse = torch.where(moves, torch.linalg.inv_ex(torch.where(moves, block, eye)).inverse, 0)
     hessian = Hessian(
         lights=L,
         shading=N,
         columns=columns,
         loss_curvature=loss_curvature,
         weighted_residual=weighted_residual,
-        inverse=inverse,
-        schur=L.new_zeros(len(L), 0, 0),
+        inverse=_inverse(block),
+        inverse_schur=L.new_zeros(len(L), 0, 0),
     )
-    return hessian.replace(schur=_schur(problem, hessian))
+    return hessian.replace(inverse_schur=_inverse(_schur(problem, hessian)))
+
+
+def _inverse(matrices: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
+    """Return inverses, zero for singular matrices: samples and patches without data do not move."""
+    inverse, info = torch.linalg.inv_ex(matrices)
+    regular = (info == 0) & inverse.isfinite().flatten(-2).all(dim=-1)
+    return torch.where(regular[..., None, None], inverse, 0)
 
 
 def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown unknown"]:
