@@ -139,6 +139,24 @@ def test_the_compiled_adjoint_matches_the_reference(noisy, generator, loss, stri
         assert_close(some * one, expected, rtol=0, atol=1e-8 * float(expected.abs().max()))
 
 
+@pytest.mark.parametrize("how", ["numba", "torch"])
+def test_a_patch_without_light_and_albedo_has_zero_gradients(noisy, how):
+    given = noisy(Cone(), Cauchy())
+    names = "radiance", "lights", "prior_mean", "shading", "regularization", "prior"
+    first = {name: getattr(given, name).clone() for name in names}
+    for values in first.values():
+        values[1] = 0
+    given = given.replace(**first)
+    radiance = given.radiance.clone().requires_grad_()
+    with using(how):
+        found = differentiable(given.replace(radiance=radiance), solved(given))
+    (slope,) = torch.autograd.grad(found.lights.sum() + found.shading.sum(), radiance)
+    assert found.lights.isfinite().all()
+    assert slope.isfinite().all()
+    assert (slope[0] != 0).any()
+    assert (slope[1] == 0).all()
+
+
 def test_an_unconverged_solution_is_refined_to_convergence(noisy):
     problem = noisy(Cone(), Cauchy(), patches=2, samples=20)
     early = solve_variable_projection(problem, 400, 1e-3, small_steps=1)

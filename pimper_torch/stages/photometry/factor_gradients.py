@@ -61,10 +61,11 @@ def differentiable(problem: Bilinear, factors: Factors) -> Factors:
         )
         convergence = factors.convergence.replace(residual=residual)
         return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)
-    factors = _newton_refined(problem, factors)
+    exact = problem.to(torch.float64)
+    factors = _newton_refined(exact, factors)
     L, N = factors.lights.detach().double(), factors.shading.detach().double()
-    hessian = _hessian(problem, L, N)
-    step = _newton_step(problem, hessian)
+    hessian = _hessian(exact, L, N)
+    step = _newton_step(exact, hessian)
     moved = quadratics.combination(hessian.columns, step.along_tangents)
     lights = factors.lights.detach() + (step.lights - step.lights.detach()).to(factors.lights)
     shading = factors.shading.detach() + (moved - moved.detach()).to(factors.shading)
@@ -85,7 +86,7 @@ class _Compiled(torch.autograd.Function):
         ctx: Any, problem: Bilinear, factors: Factors, *data: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return lights, shading, weights and residuals of the refined solution."""
-        from pimper_torch.stages.photometry.kernels import factor_adjoint
+        from pimper_torch.stages.photometry.kernels import factor_adjoint, packed_patches
 
         code, scale, stride = problem.loss.code, problem.loss.scale, problem.stride
         assert code is not None  # has_kernel
@@ -96,8 +97,8 @@ class _Compiled(torch.autograd.Function):
             torch.zeros_like(radiance, memory_format=torch.contiguous_format),
             radiance.new_zeros(len(radiance)),
         )
-        inputs = factor_adjoint.FactorData(*(as_array(tensor, torch.float64) for tensor in data))
-        solution = factor_adjoint.FactorSolution(*map(as_array, arrays))
+        inputs = packed_patches.FactorData(*(as_array(tensor, torch.float64) for tensor in data))
+        solution = packed_patches.FactorSolution(*map(as_array, arrays))
         factor_adjoint.refine(inputs, code, scale, stride, solution)
         ctx.loss = code, scale, stride
         ctx.save_for_backward(*arrays[:2], *data)
@@ -108,21 +109,21 @@ class _Compiled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         """Return gradients of the data."""
-        from pimper_torch.stages.photometry.kernels import factor_adjoint
+        from pimper_torch.stages.photometry.kernels import factor_adjoint, packed_patches
 
         lights, shading, *data = ctx.saved_tensors
         code, scale, stride = ctx.loss
         contiguous, exact = torch.contiguous_format, torch.float64
         gradients = [torch.zeros_like(x, dtype=exact, memory_format=contiguous) for x in data]
         factor_adjoint.pull_back(
-            factor_adjoint.FactorData(*(as_array(tensor, exact) for tensor in data)),
+            packed_patches.FactorData(*(as_array(tensor, exact) for tensor in data)),
             code,
             scale,
             stride,
             as_array(lights),
             as_array(shading),
-            factor_adjoint.FactorSolution(*(as_array(tensor, exact) for tensor in cotangents)),
-            factor_adjoint.FactorData(*map(as_array, gradients)),
+            packed_patches.FactorSolution(*(as_array(tensor, exact) for tensor in cotangents)),
+            packed_patches.FactorData(*map(as_array, gradients)),
         )
         return None, None, *(tensor.to(data[0]) for tensor in gradients)
 
@@ -151,7 +152,7 @@ class Hessian(Record):
         loss_curvature: Weighted second derivative of the loss at each entry.
         weighted_residual: Weight times residual of each entry.
         inverse: Inverse diagonal blocks of the samples.
-        schur: Schur complement for the lights.
+        inverse_schur: Inverse of the Schur complement for the lights.
     """
 
     lights: Lights
@@ -160,7 +161,7 @@ class Hessian(Record):
     loss_curvature: Entries
     weighted_residual: Entries
     inverse: Float[Tensor, "patch sample tangent tangent"]
-    schur: Float[Tensor, "patch unknown unknown"]
+    inverse_schur: Float[Tensor, "patch unknown unknown"]
 
 
 @torch.no_grad()
@@ -215,8 +216,7 @@ def _solved(hessian: Hessian, on_lights: Lights, on_samples: Tangential) -> Fact
     """Return the inverse Hessian times a gradient, samples eliminated."""
     inner = _apply(hessian.inverse, on_samples)
     slope = on_lights - _apply_mixed(hessian, inner)
-    flat = slope.reshape(len(slope), -1, 1)
-    lights = torch.linalg.solve(hessian.schur, flat).reshape(slope.shape)
+    lights = (hessian.inverse_schur @ slope.reshape(len(slope), -1, 1)).reshape(slope.shape)
     return FactorStep(
         lights=lights,
         along_tangents=inner - _apply(hessian.inverse, _apply_mixed_transpose(hessian, lights)),
@@ -225,7 +225,7 @@ def _solved(hessian: Hessian, on_lights: Lights, on_samples: Tangential) -> Fact
 
 def _by_deviation(problem: Bilinear, hessian: Hessian) -> tuple[Entries, tuple[Lights, Tangential]]:
     """Return derivatives of the deviation by residuals, and of the gradient by the deviation."""
-    residual = problem.radiance.double() - hessian.lights @ hessian.shading
+    residual = problem.radiance - hessian.lights @ hessian.shading
     deviation, deviation_slope = with_slope(partial(bilinear.residual_deviation, problem), residual)
     # w depends on r / d only, so d dw/dd = w - d(w r)/dr: the derivative of w is not needed.
     deviation = deviation[:, None, None].clamp_min(1e-300)
@@ -246,40 +246,38 @@ def _change_of(
 
 @torch.no_grad()
 def _hessian(problem: Bilinear, L: Lights, N: Shading) -> Hessian:
-    weight, radiance = problem.weight.double(), problem.radiance.double()
-    residual = radiance - L @ N
+    residual, robust = problem.radiance - L @ N, bilinear.robust_weights(problem, L, N)
     deviation = bilinear.residual_deviation(problem, residual)[:, None, None]
-    weighted_residual = weight * problem.loss.weights(residual, deviation) * residual
-    loss_curvature = weight * problem.loss.curvatures(residual, deviation)
+    loss_curvature = problem.weight * problem.loss.curvatures(residual, deviation)
     columns = tuple(problem.manifold.tangents(N))
-    packed, slope = quadratics.outer(L.mT) @ loss_curvature, -(L.mT @ weighted_residual)
-    if problem.prior is not None:
-        prior = problem.prior.double()
-        packed, slope = packed + prior, slope + quadratics.apply_packed(prior, N)
+    packed, _ = bilinear.equations_of_samples(problem, L, loss_curvature)
+    slope, weighted_residual = -_ambient(problem, L, N, robust), robust * residual
     A, B = quadratics.unpacked(packed, N.shape[1]), torch.stack(columns, dim=-1).transpose(1, 2)
     block = B.mT @ A @ B + problem.manifold.curvature(N, slope)
-    diagonal = block.diagonal(dim1=2, dim2=3).abs().sum(dim=-1)
-    eye = torch.eye(block.shape[-1], dtype=block.dtype, device=block.device)
-    # A sample without data does not move.
-    moves = (diagonal > 0)[..., None, None]
-    inverse = torch.where(moves, torch.linalg.inv_ex(torch.where(moves, block, eye)).inverse, 0)
     hessian = Hessian(
         lights=L,
         shading=N,
         columns=columns,
         loss_curvature=loss_curvature,
         weighted_residual=weighted_residual,
-        inverse=inverse,
-        schur=L.new_zeros(len(L), 0, 0),
+        inverse=_inverse(block),
+        inverse_schur=L.new_zeros(len(L), 0, 0),
     )
-    return hessian.replace(schur=_schur(problem, hessian))
+    return hessian.replace(inverse_schur=_inverse(_schur(problem, hessian)))
+
+
+def _inverse(matrices: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
+    """Return inverses, zero for singular matrices: samples and patches without data do not move."""
+    inverse, info = torch.linalg.inv_ex(matrices)
+    regular = (info == 0) & inverse.isfinite().flatten(-2).all(dim=-1)
+    return torch.where(regular[..., None, None], inverse, 0)
 
 
 def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown unknown"]:
     L, N = hessian.lights, hessian.shading
     batch, views, rank = L.shape
     total = bilinear.curvature_of_views(N, hessian.loss_curvature)
-    regularization = problem.regularization.double()[..., None].expand(-1, -1, rank).flatten(1)
+    regularization = problem.regularization[..., None].expand(-1, -1, rank).flatten(1)
     total = total + torch.diag_embed(regularization)
     mean = total.diagonal(dim1=1, dim2=2).mean(dim=1)
     size = max(1, 10_000_000 // (batch * views * rank * len(hessian.columns)))
@@ -294,9 +292,8 @@ def _schur(problem: Bilinear, hessian: Hessian) -> Float[Tensor, "patch unknown 
             ],
             dim=-1,
         ).flatten(1, 2)
-        total = total - mixed.flatten(2) @ (
-            (mixed[..., None, :] @ hessian.inverse[:, None, chunk])[..., 0, :].flatten(2).mT
-        )
+        inverse = hessian.inverse[:, chunk]
+        total = total - torch.einsum("pika,pkab,pjkb->pij", mixed, inverse, mixed)
     # Undetermined directions, such as Lorentz transformations of free lights, do not move.
     ridge = 1e-10 * mean.clamp_min(1e-300)
     return total + torch.diag_embed(ridge[:, None].expand(-1, views * rank))
@@ -306,16 +303,15 @@ def _gradient(
     problem: Bilinear, L: Lights, N: Shading, columns: Sequence[Shading]
 ) -> tuple[Lights, Tangential]:
     """Return minus half the gradient by lights and samples, differentiable in the data."""
-    residual = problem.radiance.double() - L @ N
-    deviation = bilinear.residual_deviation(problem, residual)[:, None, None]
-    robust = problem.loss.weights(residual, deviation)
-    weighted_residual = problem.weight.double() * robust * residual
-    difference = L - problem.prior_mean.double()
-    on_lights = weighted_residual @ N.mT - problem.regularization.double()[..., None] * difference
-    ambient = L.mT @ weighted_residual
-    if problem.prior is not None:
-        ambient = ambient - quadratics.apply_packed(problem.prior.double(), N)
-    return on_lights, quadratics.coordinates(columns, ambient)
+    robust = bilinear.robust_weights(problem, L, N)
+    _, on_lights = bilinear.evaluate(problem, L, N, robust)
+    return on_lights, quadratics.coordinates(columns, _ambient(problem, L, N, robust))
+
+
+def _ambient(problem: Bilinear, L: Lights, N: Shading, robust: Entries) -> Shading:
+    """Return minus half the gradient by shading vectors."""
+    ambient = L.mT @ (robust * (problem.radiance - L @ N))
+    return ambient if problem.prior is None else ambient - quadratics.apply_packed(problem.prior, N)
 
 
 def _apply_mixed(hessian: Hessian, along_tangents: Tangential) -> Lights:

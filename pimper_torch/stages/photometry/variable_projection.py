@@ -235,7 +235,7 @@ def _solve_by_kernel(
     small_steps: int,
     curvature_samples: int | None,
 ) -> Factors:
-    from pimper_torch.stages.photometry.kernels import factorization
+    from pimper_torch.stages.photometry.kernels import factorization, packed_patches
 
     J, code = problem.radiance, problem.loss.code
     assert code is not None  # has_kernel
@@ -247,14 +247,14 @@ def _solve_by_kernel(
     iterations = torch.zeros(len(J), dtype=torch.int64)
     cause = torch.zeros_like(iterations)
     data = J, problem.weight, problem.prior_mean, problem.regularization, problem.dense_prior
-    results = lights, shading, weight, iterations, residual, cause
+    results = lights, shading, weight, residual, iterations, cause
     factorization.solve_on_cone(
-        factorization.ConeProblem(*map(as_array, data)),
+        packed_patches.ConeProblem(*map(as_array, data)),
         code,
         problem.loss.scale,
         problem.stride,
         factorization.Limits(max_iterations, tolerance, small_steps, curvature_samples or 0),
-        factorization.ConeSolution(*(tensor.numpy() for tensor in results)),
+        packed_patches.ConeSolution(*(tensor.numpy() for tensor in results)),
     )
     convergence = Convergence(iterations=iterations, residual=residual, cause=cause)
     return Factors(lights=lights, shading=shading, weight=weight, convergence=convergence)

@@ -1,14 +1,12 @@
 """Derivatives of factorizations on the cone: twin of ``stages.photometry.factor_gradients``.
 
-One patch at a time is packed as by
-:mod:`~pimper_torch.stages.photometry.kernels.factorization`, in float64. Let ``G`` be minus half
+One patch at a time is packed, in float64. Let ``G`` be minus half
 the gradient of the objective, with a scale of the robust weights that depends on the residuals.
 Then ``dG = -(H - q p^T) dx`` plus the derivative by the data. ``H`` is the Hessian, ``q`` the
 derivative of ``G`` by the residuals' deviation, and ``p`` that of the deviation by the unknowns
 ``x``: lights, and coordinates of samples along their tangents.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,14 +14,22 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.dense_systems import eliminate
-from pimper_torch.kernels.robust_scale import robust_variance
-from pimper_torch.kernels.signatures import Doubles1, Doubles2, Doubles3
-from pimper_torch.kernels.twin_constants import CAUCHY, GEMAN_MCCLURE, MIN_DEVIATION, SQUARES
-from pimper_torch.stages.photometry.kernels.factorization import overwrite, samples_that_count
-from pimper_torch.stages.photometry.kernels.shading_steps import frame, project_to_cone
+from pimper_torch.kernels.signatures import Doubles3
+from pimper_torch.stages.photometry.kernels import residuals, shading_steps
+from pimper_torch.stages.photometry.kernels.packed_patches import (
+    FactorData,
+    FactorSolution,
+    Patch,
+    Selection,
+    copy_unseen,
+    gathered,
+    packed,
+    scattered,
+    selected,
+)
+from pimper_torch.stages.photometry.kernels.shading_steps import COLUMNS, ROWS
 
 Doubles = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Maximum number of Newton steps, minimum fraction of a step, and the step relative to the unknowns
 # that ends them: choices; few patches need more than five.
@@ -37,349 +43,105 @@ _RIDGE = 1e-10
 _MAX_ADJOINT = 1e25
 
 
-class FactorSolution(NamedTuple):
-    """Solutions of a batch, or derivatives by them: see ``Factors``."""
-
-    lights: Doubles3
-    shading: Doubles3
-    weight: Doubles3
-    residual: Doubles1
-
-
-class FactorData(NamedTuple):
-    """Data of a batch, or derivatives by them: see ``Bilinear``."""
-
-    radiance: Doubles3
-    weight: Doubles3
-    prior_mean: Doubles3
-    regularization: Doubles2
-    prior: Doubles3
-
-
-class Data(NamedTuple):
-    """A packed patch; the first ``num_scale`` samples estimate the residuals' deviation."""
-
-    radiance: Doubles
-    given: Doubles
-    prior_mean: Doubles
-    regularization: Doubles
-    prior: Doubles
-    num_scale: int
-    min_deviation: float
-    loss: int
-    scale: float
-
-
 class Point(NamedTuple):
-    """Derivatives at a point of lights and shading; entries are view by sample.
+    """Lights and shading, and derivatives there; entries are view by sample.
 
     Attributes:
-        weight: Robust weight.
-        slope: Derivative of the weight by the squared relative residual.
+        deviation: Of the residuals.
         weighted: Residual times all weights.
         bend: Second derivative of the loss.
         by_residual: Derivative of the deviation by each residual.
-        along: Product of light and each tangent: ``3 views`` by sample.
         basis: Tangents: row ``4 a + i`` is component ``i`` of tangent ``a``.
-        inverse: Inverse of every sample's block of the Hessian, nine rows.
-        mixed: Block of lights and samples: ``4 views`` by ``3 samples``.
-        solved: ``mixed`` times ``inverse``.
-        schur: Schur complement of the lights.
-        numbers: The deviation, the root mean square and the sum of the given weights.
     """
 
-    residual: Doubles
-    weight: Doubles
-    slope: Doubles
+    lights: Doubles
+    shading: Doubles
+    deviation: float
     weighted: Doubles
     bend: Doubles
     by_residual: Doubles
-    along: Doubles
     basis: Doubles
+
+
+class Hessian(NamedTuple):
+    """The Hessian of lights and of samples along their tangents.
+
+    Attributes:
+        inverse: Inverse of every sample's block, packed.
+        mixed: Block of lights and samples: ``4 views`` by ``3 samples``, ordered by tangent.
+        schur: Schur complement of the samples.
+    """
+
     inverse: Doubles
     mixed: Doubles
-    solved: Doubles
     schur: Doubles
-    numbers: Doubles
-
-
-@compiled()
-def _views_with_data(given: Doubles) -> Integers:
-    indices = np.empty(len(given), np.int64)
-    count = 0
-    for f in range(len(given)):
-        if np.any(given[f] > 0):
-            indices[count] = f
-            count += 1
-    return indices[:count]
-
-
-@compiled()
-def _data(
-    problem: FactorData,
-    p: int,
-    views: Integers,
-    samples: Integers,
-    num_scale: int,
-    loss: int,
-    scale: float,
-) -> Data:
-    shape = len(views), len(samples)
-    radiance, given = np.empty(shape), np.empty(shape)
-    prior_mean, regularization = np.empty((len(views), 4)), np.empty(len(views))
-    prior = np.empty((10, len(samples)))
-    size, count = 0.0, 0.0
-    for f in range(len(views)):
-        for k in range(len(samples)):
-            radiance[f, k] = problem.radiance[p, views[f], samples[k]]
-            given[f, k] = problem.weight[p, views[f], samples[k]]
-            size += abs(radiance[f, k])
-            count += given[f, k]
-        for i in range(4):
-            prior_mean[f, i] = problem.prior_mean[p, views[f], i]
-        regularization[f] = problem.regularization[p, views[f]]
-    for i in range(10):
-        for k in range(len(samples)):
-            prior[i, k] = problem.prior[p, i, samples[k]]
-    least = MIN_DEVIATION * size / max(count, 1.0)
-    return Data(radiance, given, prior_mean, regularization, prior, num_scale, least, loss, scale)
-
-
-@compiled()
-def _start(
-    lights: Doubles3, shading: Doubles3, p: int, views: Integers, samples: Integers
-) -> tuple[Doubles, Doubles]:
-    light, shade = np.empty((len(views), 4)), np.empty((4, len(samples)))
-    for i in range(4):
-        for f in range(len(views)):
-            light[f, i] = lights[p, views[f], i]
-        for k in range(len(samples)):
-            shade[i, k] = shading[p, i, samples[k]]
-    return light, shade
-
-
-@compiled()
-def _point(views: int, samples: int) -> Point:
-    shape = views, samples
-    return Point(
-        np.empty(shape),
-        np.empty(shape),
-        np.empty(shape),
-        np.empty(shape),
-        np.empty(shape),
-        np.empty(shape),
-        np.empty((3 * views, samples)),
-        np.empty((12, samples)),
-        np.empty((9, samples)),
-        np.empty((4 * views, 3 * samples)),
-        np.empty((4 * views, 3 * samples)),
-        np.empty((4 * views, 4 * views)),
-        np.zeros(3),
-    )
 
 
 @compiled(fast=True)
-def _evaluate(data: Data, lights: Doubles, shading: Doubles, point: Point) -> None:
-    """Compute residuals, weights and their derivatives, and the tangents."""
-    _residuals(data, lights, shading, point.residual)
-    total, count = 0.0, 0.0
-    for f in range(len(lights)):
-        for k in range(shading.shape[1]):
-            total += data.given[f, k] * point.residual[f, k] ** 2
-            count += data.given[f, k]
-    point.numbers[1] = math.sqrt(total / count) if count > 0 else 0.0
-    point.numbers[2] = count
-    point.by_residual[:] = 0
-    point.numbers[0] = _deviation(data, point) if data.loss != SQUARES else 0.0
-    width = data.scale * point.numbers[0]
+def _evaluate(patch: Patch, lights: Doubles, shading: Doubles) -> Point:
+    deviation, scale = residuals.update_weights(patch, lights, shading, 0.0, np.float64)
+    width = patch.scale * deviation
     inverse = 1 / width if width > 0 else 0.0
+    bend, by_residual = np.empty_like(patch.weight), np.zeros_like(patch.weight)
     for f in range(len(lights)):
         for k in range(shading.shape[1]):
-            relative = point.residual[f, k] * inverse
-            square = relative * relative
-            weight, slope = 1.0, 0.0
-            if data.loss == CAUCHY:
-                weight = 1 / (1 + square)
-                slope = -weight * weight
-            elif data.loss == GEMAN_MCCLURE:
-                root = 1 / (1 + square)
-                weight = root * root
-                slope = -2 * weight * root
-            elif data.loss != SQUARES and square > 1:
-                weight = 1 / abs(relative)
-                slope = -0.5 * weight / square
-            point.weight[f, k], point.slope[f, k] = weight, slope
-            point.weighted[f, k] = data.given[f, k] * weight * point.residual[f, k]
-            point.bend[f, k] = data.given[f, k] * (weight + 2 * square * slope)
+            square = (patch.residual[f, k] * inverse) ** 2
+            weight, slope = residuals.weighed(patch.loss, patch.given[f, k], square, 1.0)
+            bend[f, k] = weight + 2 * square * slope
+    if deviation > patch.min_deviation:
+        _deviation_slopes(patch, deviation, scale, by_residual)
+    basis = np.empty((12, shading.shape[1]))
     for k in range(shading.shape[1]):
-        n, first, second = frame((shading[0, k], shading[1, k], shading[2, k], shading[3, k]))
-        point.basis[0, k], point.basis[4, k], point.basis[8, k] = 1, 0, 0
-        for i in range(3):
-            point.basis[1 + i, k], point.basis[5 + i, k] = n[i], first[i]
-            point.basis[9 + i, k] = second[i]
+        axes = shading_steps.frame(shading_steps.vector_at(shading, k))
+        for a in range(3):
+            basis[4 * a, k] = 1.0 if a == 0 else 0.0
+            for i in range(3):
+                basis[4 * a + 1 + i, k] = axes[a][i]
+    weighted = patch.weight * patch.residual
+    return Point(lights, shading, deviation, weighted, bend, by_residual, basis)
 
 
 @compiled(fast=True)
-def _residuals(data: Data, lights: Doubles, shading: Doubles, residual: Doubles) -> None:
-    s, x, y, z = shading[0], shading[1], shading[2], shading[3]
-    for f in range(len(lights)):
-        a, b, c, d = lights[f, 0], lights[f, 1], lights[f, 2], lights[f, 3]
-        for k in range(len(s)):
-            predicted = a * s[k] + b * x[k] + c * y[k] + d * z[k]
-            residual[f, k] = data.radiance[f, k] - predicted
-
-
-@compiled(fast=True)
-def _deviation(data: Data, point: Point) -> float:
-    """Return the residuals' deviation, and write its derivatives unless it is at its bound."""
-    squares = np.empty(len(data.given) * data.num_scale)
-    count = 0
-    for f in range(len(data.given)):
-        for k in range(data.num_scale):
-            if data.given[f, k] > 0:
-                squares[count] = point.residual[f, k] ** 2
-                count += 1
-    variance, scale = robust_variance(squares[:count], 0.0, np.float64)
-    deviation = math.sqrt(variance)
-    if not deviation > data.min_deviation:
-        return data.min_deviation
+def _deviation_slopes(patch: Patch, deviation: float, scale: float, by_residual: Doubles) -> None:
+    """Write the derivatives of the deviation by the residuals, zero before."""
     total = 0.0
-    for f in range(len(data.given)):
-        for k in range(data.num_scale):
-            if data.given[f, k] > 0:
-                r = point.residual[f, k]
+    for f in range(len(by_residual)):
+        for k in range(patch.num_scale):
+            if patch.given[f, k] > 0:
+                r = patch.residual[f, k]
                 ratio = min(r * r / scale, 1e9)
                 fraction = ratio * ratio / (1 + ratio * ratio)
                 total += fraction * (1 - fraction)
-                point.by_residual[f, k] = ratio * r / scale / (1 + ratio * ratio) ** 2
-    for f in range(len(data.given)):
-        for k in range(data.num_scale):
-            point.by_residual[f, k] *= deviation / total if total > 0 else 0.0
-    return deviation
+                by_residual[f, k] = ratio * r / scale / (1 + ratio * ratio) ** 2
+    for f in range(len(by_residual)):
+        for k in range(patch.num_scale):
+            by_residual[f, k] *= deviation / total if total > 0 else 0.0
 
 
 @compiled(fast=True)
-def _pull(
-    field: Doubles,
-    lights: Doubles,
-    shading: Doubles,
-    point: Point,
-    on_lights: Doubles,
-    on_samples: Doubles,
-) -> None:
-    """Sum a field times shading over samples, and times light and tangents over views."""
-    for f in range(len(lights)):
+def _pull(point: Point, field: Doubles, ambient: Doubles) -> Doubles:
+    """Return derivatives by the unknowns: lights by view, then samples by tangent.
+
+    They are the sums over samples of shading times a field, and the sums over views of light times
+    the field, added to ``ambient``, in the tangents' coordinates.
+    """
+    num_views, num_samples = field.shape
+    result, basis = np.empty(4 * num_views + 3 * num_samples), point.basis
+    for f in range(num_views):
         for i in range(4):
-            total = 0.0
-            for k in range(field.shape[1]):
-                total += field[f, k] * shading[i, k]
-            on_lights[f, i] = total
-    ambient = np.zeros((4, field.shape[1]))
-    for i in range(4):
-        for f in range(len(lights)):
-            light = lights[f, i]
-            for k in range(field.shape[1]):
-                ambient[i, k] += light * field[f, k]
-    _coordinates(point, ambient, on_samples)
-
-
-@compiled(fast=True)
-def _coordinates(point: Point, ambient: Doubles, on_samples: Doubles) -> None:
-    for a in range(3):
-        for k in range(ambient.shape[1]):
-            on_samples[a, k] = (
-                point.basis[4 * a, k] * ambient[0, k]
-                + point.basis[4 * a + 1, k] * ambient[1, k]
-                + point.basis[4 * a + 2, k] * ambient[2, k]
-                + point.basis[4 * a + 3, k] * ambient[3, k]
-            )
-
-
-@compiled(fast=True)
-def _descent(
-    data: Data,
-    lights: Doubles,
-    shading: Doubles,
-    point: Point,
-    on_lights: Doubles,
-    on_samples: Doubles,
-) -> float:
-    """Write minus half the gradient, and return its squared norm."""
-    _pull(point.weighted, lights, shading, point, on_lights, on_samples)
-    image, coordinates = np.empty_like(shading), np.empty((3, shading.shape[1]))
-    _prior_image(data, shading, image)
-    _coordinates(point, image, coordinates)
-    on_samples -= coordinates
-    for f in range(len(lights)):
-        on_lights[f] -= data.regularization[f] * (lights[f] - data.prior_mean[f])
-    return np.sum(on_lights**2) + np.sum(on_samples**2)
-
-
-@compiled(fast=True)
-def _prior_image(data: Data, vectors: Doubles, image: Doubles) -> None:
-    """Write the product of each sample's prior with its vector to ``image``."""
-    overwrite(image, np.zeros_like(image))
-    entry = 0
-    for i in range(4):
-        for j in range(i, 4):
-            prior = data.prior[entry]
-            for k in range(vectors.shape[1]):
-                image[i, k] += prior[k] * vectors[j, k]
-                if i != j:
-                    image[j, k] += prior[k] * vectors[i, k]
-            entry += 1
-
-
-@compiled(fast=True)
-def _hessian(data: Data, lights: Doubles, shading: Doubles, point: Point) -> None:
-    """Compute the Hessian's blocks, and the Schur complement of the samples."""
-    num_views, num_samples = len(lights), shading.shape[1]
-    for a in range(3):
-        for f in range(num_views):
+            result[4 * f + i] = _product(field[f], point.shading[i])
             for k in range(num_samples):
-                point.along[a * num_views + f, k] = (
-                    lights[f, 0] * point.basis[4 * a, k]
-                    + lights[f, 1] * point.basis[4 * a + 1, k]
-                    + lights[f, 2] * point.basis[4 * a + 2, k]
-                    + lights[f, 3] * point.basis[4 * a + 3, k]
-                )
-    _inverses(data, lights, shading, point)
-    for f in range(num_views):
-        for i in range(4):
-            for a in range(3):
-                along, bend = point.along[a * num_views + f], point.bend[f]
-                weighted, basis, component = point.weighted[f], point.basis[4 * a + i], shading[i]
-                row = point.mixed[4 * f + i, a * num_samples : (a + 1) * num_samples]
-                for k in range(num_samples):
-                    row[k] = bend[k] * along[k] * component[k] - weighted[k] * basis[k]
-            source = point.mixed[4 * f + i]
-            for a in range(3):
-                target = point.solved[4 * f + i, a * num_samples : (a + 1) * num_samples]
-                u, v, w = point.inverse[3 * a], point.inverse[3 * a + 1], point.inverse[3 * a + 2]
-                for k in range(num_samples):
-                    target[k] = (
-                        u[k] * source[k]
-                        + v[k] * source[num_samples + k]
-                        + w[k] * source[2 * num_samples + k]
-                    )
-    trace = 0.0
-    for i in range(4 * num_views):
-        for j in range(i, 4 * num_views):
-            value = -_product(point.solved[i], point.mixed[j])
-            point.schur[i, j] = value
-            point.schur[j, i] = value
-    for f in range(num_views):
-        for i in range(4):
-            for j in range(4):
-                total, bend = 0.0, point.bend[f]
-                for k in range(num_samples):
-                    total += bend[k] * shading[i, k] * shading[j, k]
-                point.schur[4 * f + i, 4 * f + j] += total
-                if i == j:
-                    point.schur[4 * f + i, 4 * f + i] += data.regularization[f]
-                    trace += total + data.regularization[f]
-    for i in range(4 * num_views):
-        point.schur[i, i] += _RIDGE * max(trace / (4 * num_views), 1e-300)
+                ambient[i, k] += point.lights[f, i] * field[f, k]
+    for a in range(3):
+        target = result[4 * num_views + a * num_samples :]
+        for k in range(num_samples):
+            target[k] = (
+                basis[4 * a, k] * ambient[0, k]
+                + basis[4 * a + 1, k] * ambient[1, k]
+                + basis[4 * a + 2, k] * ambient[2, k]
+                + basis[4 * a + 3, k] * ambient[3, k]
+            )
+    return result
 
 
 @compiled(fast=True)
@@ -391,275 +153,298 @@ def _product(a: Doubles, b: Doubles) -> float:
 
 
 @compiled(fast=True)
-def _inverses(data: Data, lights: Doubles, shading: Doubles, point: Point) -> None:
-    """Invert every sample's block; zero for samples without data, which do not change."""
-    num_views = len(lights)
-    slope, images = np.empty_like(shading), np.empty_like(point.basis)
-    _prior_image(data, shading, slope)
-    for a in range(3):
-        _prior_image(data, point.basis[4 * a : 4 * a + 4], images[4 * a : 4 * a + 4])
-    for k in range(shading.shape[1]):
-        g1, g2, g3 = slope[1, k], slope[2, k], slope[3, k]
-        m00 = m01 = m02 = m11 = m12 = m22 = 0.0
-        for f in range(num_views):
-            bend, weighted = point.bend[f, k], point.weighted[f, k]
-            u = point.along[f, k]
-            v, w = point.along[num_views + f, k], point.along[2 * num_views + f, k]
-            m00 += bend * u * u
-            m01 += bend * u * v
-            m02 += bend * u * w
-            m11 += bend * v * v
-            m12 += bend * v * w
-            m22 += bend * w * w
-            g1 -= lights[f, 1] * weighted
-            g2 -= lights[f, 2] * weighted
-            g3 -= lights[f, 3] * weighted
-        p, q, r = images[0:4, k], images[4:8, k], images[8:12, k]
-        n, first, second = point.basis[0:4, k], point.basis[4:8, k], point.basis[8:12, k]
+def _descent(patch: Patch, point: Point) -> Doubles:
+    """Return minus half the gradient.
+
+    The patch's right-hand sides become minus half the derivative by shading vectors.
+    """
+    ambient, lights = patch.equations[10:], point.lights
+    for k in range(ambient.shape[1]):
+        prior = shading_steps.matrix_at(patch.prior, k)
+        image = shading_steps.apply(prior, shading_steps.vector_at(point.shading, k))
         for i in range(4):
-            m00 += n[i] * p[i]
-            m01 += first[i] * p[i]
-            m02 += second[i] * p[i]
-            m11 += first[i] * q[i]
-            m12 += second[i] * q[i]
-            m22 += second[i] * r[i]
-        albedo = shading[0, k]
-        per = 1 / albedo if albedo > 0 else 1.0
-        m01 += per * (g1 * first[1] + g2 * first[2] + g3 * first[3])
-        m02 += per * (g1 * second[1] + g2 * second[2] + g3 * second[3])
-        bending = per * (g1 * n[1] + g2 * n[2] + g3 * n[3])
-        m11 -= bending
-        m22 -= bending
-        c00, c01, c02 = m11 * m22 - m12 * m12, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
-        determinant = m00 * c00 + m01 * c01 + m02 * c02
-        inverse = 1 / determinant if determinant != 0 else 0.0
-        point.inverse[0, k] = inverse * c00
-        point.inverse[1, k] = point.inverse[3, k] = inverse * c01
-        point.inverse[2, k] = point.inverse[6, k] = inverse * c02
-        point.inverse[4, k] = inverse * (m00 * m22 - m02 * m02)
-        point.inverse[5, k] = point.inverse[7, k] = inverse * (m01 * m02 - m00 * m12)
-        point.inverse[8, k] = inverse * (m00 * m11 - m01 * m01)
+            ambient[i, k] = -image[i]
+    result = _pull(point, point.weighted, ambient)
+    for f in range(len(lights)):
+        for i in range(4):
+            difference = lights[f, i] - patch.prior_mean[f, i]
+            result[4 * f + i] -= patch.regularization[f] * difference
+    return result
 
 
 @compiled(fast=True)
-def _solve(point: Point, on_lights: Doubles, on_samples: Doubles) -> bool:
-    """Apply the Hessian's inverse to two right-hand sides, in place; False if it is singular.
-
-    Args:
-        on_lights: Right-hand side, view, 4.
-        on_samples: Right-hand side, tangent, sample.
-    """
-    num_views, num_samples = on_lights.shape[1], on_samples.shape[2]
-    schur, rhs = point.schur.copy(), np.empty((4 * num_views, 2))
-    inner = np.empty_like(on_samples)
-    for side in range(2):
+def _hessian(patch: Patch, point: Point) -> Hessian:
+    """Compute the Hessian; the patch's right-hand sides are those of :func:`_descent`."""
+    lights, shading, _, weighted, bend, _, basis = point
+    num_views, num_samples = bend.shape
+    shading_steps.matrices_of_samples(patch.prior, lights, bend, patch.equations)
+    inverse, along = np.empty((6, num_samples)), np.empty(num_samples)
+    for k in range(num_samples):
+        block = _inverse_block(patch.equations, shading_steps.vector_at(shading, k), k)
+        for entry in range(6):
+            inverse[entry, k] = block[entry]
+    mixed = np.empty((4 * num_views, 3 * num_samples))
+    for f in range(num_views):
         for a in range(3):
             for k in range(num_samples):
-                inner[side, a, k] = (
-                    point.inverse[3 * a, k] * on_samples[side, 0, k]
-                    + point.inverse[3 * a + 1, k] * on_samples[side, 1, k]
-                    + point.inverse[3 * a + 2, k] * on_samples[side, 2, k]
+                along[k] = bend[f, k] * (
+                    lights[f, 0] * basis[4 * a, k]
+                    + lights[f, 1] * basis[4 * a + 1, k]
+                    + lights[f, 2] * basis[4 * a + 2, k]
+                    + lights[f, 3] * basis[4 * a + 3, k]
                 )
-        for row in range(4 * num_views):
-            total = 0.0
-            for a in range(3):
+            for i in range(4):
+                component, tangent, factor = shading[i], basis[4 * a + i], weighted[f]
+                row = mixed[4 * f + i, a * num_samples : (a + 1) * num_samples]
                 for k in range(num_samples):
-                    total += point.mixed[row, a * num_samples + k] * inner[side, a, k]
-            rhs[row, side] = on_lights[side, row // 4, row % 4] - total
+                    row[k] = along[k] * component[k] - factor[k] * tangent[k]
+    return Hessian(inverse, mixed, _complement(patch, point, inverse, mixed))
+
+
+@compiled(fast=True)
+def _complement(patch: Patch, point: Point, inverse: Doubles, mixed: Doubles) -> Doubles:
+    """Return the lights' block minus that of the eliminated samples."""
+    size, trace = len(mixed), 0.0
+    schur, solved = np.empty((size, size)), np.empty(mixed.shape[1])
+    for i in range(size):
+        _apply_blocks(inverse, mixed[i], solved)
+        for j in range(i, size):
+            schur[i, j] = schur[j, i] = -_product(solved, mixed[j])
+    for f in range(len(point.lights)):
+        bend = point.bend[f]
+        for i in range(4):
+            for j in range(4):
+                first, second = point.shading[i], point.shading[j]
+                total = patch.regularization[f] if i == j else 0.0
+                for k in range(len(bend)):
+                    total += bend[k] * first[k] * second[k]
+                trace += total if i == j else 0.0
+                schur[4 * f + i, 4 * f + j] += total
+    for i in range(size):
+        schur[i, i] += _RIDGE * max(trace / size, 1e-300)
+    return schur
+
+
+@compiled(fast=True)
+def _inverse_block(equations: Doubles, s: shading_steps.Four, k: int) -> shading_steps.Six:
+    """Return the inverse of a sample's block, packed; zero without data: it does not change."""
+    n, first, second = shading_steps.frame(s)
+    a, b, c, d, e, f = shading_steps.congruence(
+        shading_steps.matrix_at(equations, k), n, first, second
+    )
+    per = 1 / s[0] if s[0] > 0 else 1.0
+    descent = equations[11, k], equations[12, k], equations[13, k]
+    b -= per * _dot(first, descent)
+    c -= per * _dot(second, descent)
+    d += per * _dot(n, descent)
+    f += per * _dot(n, descent)
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * p + b * q + c * r
+    inverse = 1 / determinant if determinant != 0 else 0.0
+    return (
+        inverse * p,
+        inverse * q,
+        inverse * r,
+        inverse * (a * f - c * c),
+        inverse * (b * c - a * e),
+        inverse * (a * d - b * b),
+    )
+
+
+@compiled(fast=True)
+def _dot(a: shading_steps.Three, b: shading_steps.Three) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled(fast=True)
+def _apply_blocks(inverse: Doubles, source: Doubles, target: Doubles) -> None:
+    """Write the samples' inverse blocks times their coordinates to ``target``."""
+    size = inverse.shape[1]
+    a, b, c, d, e, f = inverse[0], inverse[1], inverse[2], inverse[3], inverse[4], inverse[5]
+    u, v, w = source[:size], source[size : 2 * size], source[2 * size :]
+    for k in range(size):
+        target[k] = a[k] * u[k] + b[k] * v[k] + c[k] * w[k]
+    for k in range(size):
+        target[size + k] = b[k] * u[k] + d[k] * v[k] + e[k] * w[k]
+    for k in range(size):
+        target[2 * size + k] = c[k] * u[k] + e[k] * v[k] + f[k] * w[k]
+
+
+@compiled(fast=True)
+def _solve(hessian: Hessian, sides: tuple[Doubles, Doubles]) -> bool:
+    """Apply the Hessian's inverse to two right-hand sides, in place; False if it is singular."""
+    size = len(hessian.schur)
+    schur, rhs = hessian.schur.copy(), np.empty((size, 2))
+    inner = np.empty(hessian.mixed.shape[1])
+    for side in range(2):
+        _apply_blocks(hessian.inverse, sides[side][size:], inner)
+        for row in range(size):
+            rhs[row, side] = sides[side][row] - _product(hessian.mixed[row], inner)
     if not eliminate(schur, rhs):
         return False
     for side in range(2):
-        for row in range(4 * num_views):
-            step = rhs[row, side]
-            on_lights[side, row // 4, row % 4] = step
-            for a in range(3):
-                for k in range(num_samples):
-                    inner[side, a, k] -= point.solved[row, a * num_samples + k] * step
-    overwrite(on_samples[0], inner[0])
-    overwrite(on_samples[1], inner[1])
+        samples = sides[side][size:]
+        for row in range(size):
+            step, mixed = rhs[row, side], hessian.mixed[row]
+            sides[side][row] = step
+            for k in range(len(samples)):
+                samples[k] -= mixed[k] * step
+        _apply_blocks(hessian.inverse, samples.copy(), samples)
     return True
 
 
 @compiled(fast=True)
-def _by_deviation(point: Point, field: Doubles) -> None:
-    """Write the derivative of the weighted residuals by the deviation to ``field``.
-
-    It follows from that by the residuals, because weights depend only on residual over deviation.
-    """
-    per = 1 / point.numbers[0] if point.numbers[0] > 0 else 0.0
-    for f in range(len(field)):
-        for k in range(field.shape[1]):
-            field[f, k] = per * (point.weighted[f, k] - point.bend[f, k] * point.residual[f, k])
-
-
-@compiled(fast=True)
-def _ambient(point: Point, on_samples: Doubles, ambient: Doubles) -> None:
-    """Write the shading vectors of tangent coordinates to ``ambient``."""
-    for i in range(4):
-        for k in range(on_samples.shape[1]):
-            ambient[i, k] = (
-                point.basis[i, k] * on_samples[0, k]
-                + point.basis[4 + i, k] * on_samples[1, k]
-                + point.basis[8 + i, k] * on_samples[2, k]
-            )
-
-
-@compiled(fast=True)
-def _corrected(
-    point: Point,
-    other_lights: Doubles,
-    other_samples: Doubles,
-    on_lights: Doubles,
-    on_samples: Doubles,
-) -> bool:
-    """Solve with the Hessian and its rank-one term, by the Sherman-Morrison formula.
+def _newton_step(patch: Patch, point: Point, side: Doubles, transposed: bool) -> tuple[bool, float]:
+    """Solve with the Hessian and its rank-one term in place, by the Sherman-Morrison formula.
 
     Args:
-        other_lights: With ``other_samples``, the term's ``p``; the second right-hand side is ``q``.
-        on_lights: With ``on_samples``, two right-hand sides; the first is replaced by the solution.
+        transposed: Whether to solve with the transpose.
+
+    Returns:
+        False if the Hessian is singular, and the solution's product with the term's second vector.
     """
-    if not _solve(point, on_lights, on_samples):
-        return False
-    along = np.sum(other_lights * on_lights[0]) + np.sum(other_samples * on_samples[0])
-    remainder = 1 + np.sum(other_lights * on_lights[1]) + np.sum(other_samples * on_samples[1])
-    factor = along / remainder if remainder != 0 else 0.0
-    on_lights[0] -= factor * on_lights[1]
-    on_samples[0] -= factor * on_samples[1]
-    return True
+    # Weights depend on residual over deviation only: hence their derivative by the deviation.
+    per = 1 / point.deviation if point.deviation > 0 else 0.0
+    by_deviation = per * (point.weighted - point.bend * patch.residual)
+    q = _pull(point, by_deviation, np.zeros_like(point.shading))
+    p = _pull(point, point.by_residual, np.zeros_like(point.shading))
+    if transposed:
+        p, q = q, p
+    if not _solve(_hessian(patch, point), (side, q)):
+        return False, 0.0
+    remainder = 1 + _product(p, q)
+    factor = _product(p, side) / remainder if remainder != 0 else 0.0
+    for k in range(len(side)):
+        side[k] -= factor * q[k]
+    return True, _product(p, side)
 
 
 @compiled(fast=True)
-def _newton_refined(data: Data, lights: Doubles, shading: Doubles, weight: Doubles) -> float:
-    """Take Newton steps while they reduce the gradient; return the root mean square residual."""
-    num_views, num_samples = data.radiance.shape
-    point = _point(num_views, num_samples)
-    on_lights, on_samples = np.empty((2, num_views, 4)), np.empty((2, 3, num_samples))
-    p_lights, p_samples = np.empty((num_views, 4)), np.empty((3, num_samples))
-    field, change = np.empty((num_views, num_samples)), np.zeros((4, num_samples))
-    new_lights, new_shading, direction = lights.copy(), shading.copy(), np.zeros((num_views, 4))
-    size, fraction, rms = np.inf, 0.5, 0.0
+def _ambient(point: Point, step: Doubles) -> Doubles:
+    """Return the shading vectors of a step of all unknowns along the tangents."""
+    size, basis = point.shading.shape[1], point.basis
+    u, v, w = step[-3 * size : -2 * size], step[-2 * size : -size], step[-size:]
+    ambient = np.empty_like(point.shading)
+    for i in range(4):
+        for k in range(size):
+            ambient[i, k] = basis[i, k] * u[k] + basis[4 + i, k] * v[k] + basis[8 + i, k] * w[k]
+    return ambient
+
+
+@compiled(fast=True)
+def _refined(patch: Patch, lights: Doubles, shading: Doubles) -> tuple[Doubles, Doubles]:
+    """Take Newton steps while they reduce the gradient."""
+    step, change = np.zeros(lights.size), np.zeros_like(shading)
+    new_lights, new_shading = lights, shading
+    size, fraction = np.inf, 0.5
     for _ in range(_STEPS):
-        _evaluate(data, new_lights, new_shading, point)
-        new_size = _descent(data, new_lights, new_shading, point, on_lights[0], on_samples[0])
+        point = _evaluate(patch, new_lights, new_shading)
+        descent = _descent(patch, point)
+        new_size = _product(descent, descent)
         if new_size < size:
             moved_square, square = np.sum((new_lights - lights) ** 2), np.sum(lights**2)
-            overwrite(lights, new_lights)
-            overwrite(shading, new_shading)
-            overwrite(weight, data.given * point.weight)
-            first, rms = size == np.inf, point.numbers[1]
+            first, lights, shading = size == np.inf, new_lights, new_shading
             size, fraction = new_size, min(2 * fraction, 1.0)
             if moved_square <= _CLOSE * _CLOSE * square and not first:
-                return rms
-            _hessian(data, lights, shading, point)
-            _by_deviation(point, field)
-            _pull(field, lights, shading, point, on_lights[1], on_samples[1])
-            _pull(point.by_residual, lights, shading, point, p_lights, p_samples)
-            if not _corrected(point, p_lights, p_samples, on_lights, on_samples):
-                return rms
-            overwrite(direction, on_lights[0])
-            _ambient(point, on_samples[0], change)
+                break
+            regular, _ = _newton_step(patch, point, descent, False)
+            if not regular:
+                break
+            step, change = descent, _ambient(point, descent)
         else:
             fraction /= 2
             if fraction < _SHORTEST:
-                return rms
-        new_lights, trial = lights + fraction * direction, shading + fraction * change
-        for k in range(num_samples):
-            projected = project_to_cone(trial[0, k], trial[1, k], trial[2, k], trial[3, k])
+                break
+        new_lights = lights + fraction * step[: lights.size].reshape(lights.shape)
+        new_shading = shading + fraction * change
+        for k in range(shading.shape[1]):
+            b, x, y, z = shading_steps.vector_at(new_shading, k)
+            projected = shading_steps.project_to_cone(b, x, y, z)
             for i in range(4):
                 new_shading[i, k] = projected[i]
-    return rms
+    return lights, shading
+
+
+@compiled(fast=True)
+def _direct(
+    patch: Patch, point: Point, per_rms: float, selection: Selection, upstream: FactorSolution
+) -> Doubles:
+    """Return derivatives by residuals, through weights and residuals at constant factors."""
+    p, views, samples, _ = selection
+    width = patch.scale * point.deviation
+    inverse = 1 / width if width > 0 else 0.0
+    direct, total = np.empty_like(point.bend), 0.0
+    for f in range(len(direct)):
+        for k in range(direct.shape[1]):
+            given, residual = patch.given[f, k], patch.residual[f, k]
+            relative = residual * inverse
+            _, slope = residuals.weighed(patch.loss, given, relative * relative, 1.0)
+            on_relative = 2 * upstream.weight[p, views[f], samples[k]] * slope * relative
+            direct[f, k] = on_relative * inverse + per_rms * given * residual
+            total -= on_relative * relative
+    return direct + (total / point.deviation if total != 0 else 0.0) * point.by_residual
 
 
 @compiled(fast=True)
 def _pull_back(
-    data: Data,
-    light: Doubles,
-    shade: Doubles,
-    p: int,
-    views: Integers,
-    samples: Integers,
+    patch: Patch,
+    point: Point,
+    selection: Selection,
     upstream: FactorSolution,
     result: FactorData,
 ) -> None:
-    num_views, num_samples = len(views), len(samples)
-    point = _point(num_views, num_samples)
-    _evaluate(data, light, shade, point)
-    _hessian(data, light, shade, point)
-    deviation, rms, count = point.numbers[0], point.numbers[1], point.numbers[2]
-    width = data.scale * deviation
-    per_width = 1 / width if width > 0 else 0.0
+    p, views, samples, _ = selection
+    rms, count = residuals.residual_size(patch)
     per_rms = upstream.residual[p] / (count * rms) if rms > 0 else 0.0
-    # Derivatives by weights and residuals, with lights and shading fixed.
-    direct, total = np.empty((num_views, num_samples)), 0.0
-    for f in range(num_views):
-        for k in range(num_samples):
-            relative = point.residual[f, k] * per_width
-            on_weight = data.given[f, k] * upstream.weight[p, views[f], samples[k]]
-            on_relative = 2 * on_weight * point.slope[f, k] * relative
-            direct[f, k] = on_relative * per_width
-            direct[f, k] += per_rms * data.given[f, k] * point.residual[f, k]
-            total -= on_relative * relative
-    direct += (total / deviation if deviation > 0 else 0.0) * point.by_residual
-    on_lights, on_samples = np.empty((2, num_views, 4)), np.empty((2, 3, num_samples))
-    _pull(direct, light, shade, point, on_lights[0], on_samples[0])
-    ambient, coordinates = np.empty((4, num_samples)), np.empty((3, num_samples))
-    for i in range(4):
-        for f in range(num_views):
-            on_lights[0, f, i] = upstream.lights[p, views[f], i] - on_lights[0, f, i]
-        for k in range(num_samples):
-            ambient[i, k] = upstream.shading[p, i, samples[k]]
-    _coordinates(point, ambient, coordinates)
-    overwrite(on_samples[0], coordinates - on_samples[0])
-    q_lights, q_samples = np.empty((num_views, 4)), np.empty((3, num_samples))
-    field = np.empty((num_views, num_samples))
-    _by_deviation(point, field)
-    _pull(field, light, shade, point, q_lights, q_samples)
-    _pull(point.by_residual, light, shade, point, on_lights[1], on_samples[1])
-    if not _corrected(point, q_lights, q_samples, on_lights, on_samples):
+    direct = _direct(patch, point, per_rms, selection, upstream)
+    on_lights, ambient = gathered(upstream.lights, upstream.shading, selection, len(samples))
+    side = _pull(point, -direct, ambient)
+    side[: on_lights.size] += on_lights.ravel()
+    _descent(patch, point)
+    regular, on_deviation = _newton_step(patch, point, side, True)
+    if not regular or not np.sum(np.abs(side)) < _MAX_ADJOINT:
         return
-    if not np.sum(np.abs(on_lights[0])) + np.sum(np.abs(on_samples[0])) < _MAX_ADJOINT:
-        return
-    on_deviation = np.sum(q_lights * on_lights[0]) + np.sum(q_samples * on_samples[0])
-    _ambient(point, on_samples[0], ambient)
-    for f in range(num_views):
-        for k in range(num_samples):
-            change = (
-                on_lights[0, f, 0] * shade[0, k]
-                + on_lights[0, f, 1] * shade[1, k]
-                + on_lights[0, f, 2] * shade[2, k]
-                + on_lights[0, f, 3] * shade[3, k]
-                + light[f, 0] * ambient[0, k]
-                + light[f, 1] * ambient[1, k]
-                + light[f, 2] * ambient[2, k]
-                + light[f, 3] * ambient[3, k]
-            )
-            r, weight = point.residual[f, k], point.weight[f, k]
-            result.radiance[p, views[f], samples[k]] = (
-                point.bend[f, k] * change + on_deviation * point.by_residual[f, k] + direct[f, k]
-            )
-            result.weight[p, views[f], samples[k]] = weight * (
+    direct += on_deviation * point.by_residual
+    on_lights = side[: on_lights.size].copy().reshape(on_lights.shape)
+    ambient = _ambient(point, side)
+    width = patch.scale * point.deviation
+    inverse = 1 / width if width > 0 else 0.0
+    for f in range(len(views)):
+        for k in range(len(samples)):
+            change, r = 0.0, patch.residual[f, k]
+            for i in range(4):
+                change += on_lights[f, i] * point.shading[i, k] + point.lights[f, i] * ambient[i, k]
+            result.radiance[p, views[f], samples[k]] = point.bend[f, k] * change + direct[f, k]
+            weight, _ = residuals.weighed(patch.loss, 1.0, (r * inverse) ** 2, 1.0)
+            result.given[p, views[f], samples[k]] = weight * (
                 r * change + upstream.weight[p, views[f], samples[k]]
             ) + 0.5 * per_rms * (r * r - rms * rms)
+    _pull_back_priors(patch, point, on_lights, ambient, selection, result)
+
+
+@compiled(fast=True)
+def _pull_back_priors(
+    patch: Patch,
+    point: Point,
+    on_lights: Doubles,
+    ambient: Doubles,
+    selection: Selection,
+    result: FactorData,
+) -> None:
+    """Write the derivatives by the priors, from the adjoint of lights and shading."""
+    p, views, samples, _ = selection
+    for f in range(len(views)):
         for i in range(4):
-            result.prior_mean[p, views[f], i] = data.regularization[f] * on_lights[0, f, i]
-        result.regularization[p, views[f]] = np.sum(
-            on_lights[0, f] * (data.prior_mean[f] - light[f])
-        )
-    entry = 0
-    for i in range(4):
-        for j in range(i, 4):
-            for k in range(num_samples):
-                product = ambient[i, k] * shade[j, k]
-                if i != j:
-                    product += ambient[j, k] * shade[i, k]
-                result.prior[p, entry, samples[k]] = -product
-            entry += 1
-
-
-@compiled()
-def _is_prior_mean(problem: FactorData, p: int, f: int) -> bool:
-    """Return whether the light of a view is its prior mean, because it has no data."""
-    return problem.regularization[p, f] > 0 and not np.any(problem.weight[p, f] > 0)
+            result.prior_mean[p, views[f], i] = patch.regularization[f] * on_lights[f, i]
+            difference = patch.prior_mean[f, i] - point.lights[f, i]
+            result.regularization[p, views[f]] += on_lights[f, i] * difference
+    for entry in range(10):
+        i, j = ROWS[entry], COLUMNS[entry]
+        for k in range(len(samples)):
+            product = ambient[i, k] * point.shading[j, k]
+            if i != j:
+                product += ambient[j, k] * point.shading[i, k]
+            result.prior[p, entry, samples[k]] = -product
 
 
 @compiled(annotated=True)
@@ -674,28 +459,16 @@ def refine(
         stride: The deviation is estimated from every ``stride``-th sample.
         solution: Initial lights and shading, updated; weights and residuals, zero before.
     """
-    lights, shading, weight, residual = solution
-    for p in range(len(lights)):
-        for f in range(lights.shape[1]):
-            if _is_prior_mean(problem, p, f):
-                for i in range(4):
-                    lights[p, f, i] = problem.prior_mean[p, f, i]
-        views = _views_with_data(problem.weight[p])
-        samples, num_scale = samples_that_count(problem.weight[p], stride)
-        if len(views) == 0:
-            continue
-        data = _data(problem, p, views, samples, num_scale, loss, scale)
-        light, shade = _start(lights, shading, p, views, samples)
-        robust_weight = np.empty(data.given.shape)
-        residual[p] = _newton_refined(data, light, shade, robust_weight)
-        for f in range(len(views)):
-            for k in range(len(samples)):
-                weight[p, views[f], samples[k]] = robust_weight[f, k]
-        for i in range(4):
-            for f in range(len(views)):
-                lights[p, views[f], i] = light[f, i]
-            for k in range(len(samples)):
-                shading[p, i, samples[k]] = shade[i, k]
+    for p in range(len(problem.given)):
+        copy_unseen(problem, p, problem.prior_mean, solution.lights)
+        selection = selected(problem, p, stride)
+        patch = packed(problem, selection, 1, loss, scale)
+        num_samples = len(selection.samples)
+        light, shade = gathered(solution.lights, solution.shading, selection, num_samples)
+        light, shade = _refined(patch, light, shade)
+        residuals.update_weights(patch, light, shade, 0.0, np.float64)
+        solution.residual[p], _ = residuals.residual_size(patch)
+        scattered(solution, selection, patch.weight, light, shade)
 
 
 @compiled(annotated=True)
@@ -717,14 +490,8 @@ def pull_back(
         result: Zero before; stays zero for a patch with a singular Hessian, such as without albedo.
     """
     for p in range(len(lights)):
-        for f in range(lights.shape[1]):
-            if _is_prior_mean(problem, p, f):
-                for i in range(4):
-                    result.prior_mean[p, f, i] = upstream.lights[p, f, i]
-        views = _views_with_data(problem.weight[p])
-        samples, num_scale = samples_that_count(problem.weight[p], stride)
-        if len(views) == 0:
-            continue
-        data = _data(problem, p, views, samples, num_scale, loss, scale)
-        light, shade = _start(lights, shading, p, views, samples)
-        _pull_back(data, light, shade, p, views, samples, upstream, result)
+        copy_unseen(problem, p, upstream.lights, result.prior_mean)
+        selection = selected(problem, p, stride)
+        patch = packed(problem, selection, 1, loss, scale)
+        light, shade = gathered(lights, shading, selection, len(selection.samples))
+        _pull_back(patch, _evaluate(patch, light, shade), selection, upstream, result)

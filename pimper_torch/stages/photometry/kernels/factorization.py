@@ -14,20 +14,26 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.dense_systems import solve_damped
-from pimper_torch.kernels.robust_scale import robust_variance
-from pimper_torch.kernels.signatures import Floats1, Floats2, Floats3, Integers1
 from pimper_torch.kernels.twin_constants import (
-    CAUCHY,
     DAMPING_DECREASE,
     DAMPING_INCREASE,
-    GEMAN_MCCLURE,
     INITIAL_DAMPING,
-    MIN_DEVIATION,
     SHADING_STEPS,
     SQUARES,
     ZERO_ROUNDINGS,
 )
-from pimper_torch.stages.photometry.kernels.shading_steps import TILE, update_shading, whitening
+from pimper_torch.stages.photometry.kernels import residuals, shading_steps
+from pimper_torch.stages.photometry.kernels.packed_patches import (
+    ConeProblem,
+    ConeSolution,
+    Patch,
+    copy_unseen,
+    gathered,
+    packed,
+    scattered,
+    selected,
+)
+from pimper_torch.stages.photometry.kernels.shading_steps import COLUMNS, ROWS, TILE
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -38,20 +44,6 @@ _EPS = float(np.finfo(np.float32).eps)
 # Codes of StopCause.
 _CONVERGED, _STALLED, _LIMIT, _EMPTY = 0, 1, 2, 3
 
-# Row and column of each entry of a packed matrix.
-_ROWS = (0, 0, 0, 0, 1, 1, 1, 2, 2, 3)
-_COLUMNS = (0, 1, 2, 3, 1, 2, 3, 2, 3, 3)
-
-
-class ConeProblem(NamedTuple):
-    """A batch of problems: see ``stages.photometry.bilinear``; ``given`` are the weights."""
-
-    radiance: Floats3
-    given: Floats3
-    prior_mean: Floats3
-    regularization: Floats2
-    prior: Floats3
-
 
 class Limits(NamedTuple):
     """See ``solve_variable_projection``; ``curvature_samples`` of 0 uses all samples."""
@@ -60,157 +52,6 @@ class Limits(NamedTuple):
     tolerance: float
     small_steps: int
     curvature_samples: int
-
-
-class ConeSolution(NamedTuple):
-    """The solution of a batch.
-
-    Attributes:
-        shading: Samples without weight keep their initial value.
-        weight: Final weights; zero before.
-        residual: Root mean square.
-        cause: Code of the stop cause.
-    """
-
-    lights: Floats3
-    shading: Floats3
-    weight: Floats3
-    iterations: Integers1
-    residual: Floats1
-    cause: Integers1
-
-
-class Patch(NamedTuple):
-    """A packed patch: views and samples with data, padded to whole tiles.
-
-    Attributes:
-        radiance: View by sample.
-        given: Weight of each entry; 0 in the padding.
-        weight: ``given`` times robust weights.
-        residual: Workspace.
-        prior: Packed entry by sample.
-        equations: The samples' normal equations: ten packed entries and the right-hand side.
-        prior_mean: View by 4.
-        regularization: Of each view.
-        slack: Sum of the regularization of the omitted views, times 4.
-        num_views: Including omitted views.
-        num_scale: Number of samples, the first ones, for the estimate of the residual deviation.
-        min_deviation: Minimum deviation of residuals.
-        loss: Code of the loss.
-        scale: Of the loss, in deviations.
-    """
-
-    radiance: Floats
-    given: Floats
-    weight: Floats
-    residual: Floats
-    prior: Floats
-    equations: Floats
-    prior_mean: Floats
-    regularization: Floats
-    slack: float
-    num_views: int
-    num_scale: int
-    min_deviation: float
-    loss: int
-    scale: float
-
-
-@compiled()
-def _views_that_count(
-    given: Floats, prior_mean: Floats, regularization: Floats, lights: Floats
-) -> Integers:
-    """Return the views with data or with a light that is not its prior mean."""
-    indices = np.empty(len(given), np.int64)
-    count = 0
-    for f in range(len(given)):
-        fixed = regularization[f] > 0
-        for i in range(4):
-            fixed = fixed and lights[f, i] == prior_mean[f, i]
-        if not fixed or np.any(given[f] > 0):
-            indices[count] = f
-            count += 1
-    return indices[:count]
-
-
-@compiled()
-def samples_that_count(given: Floats, stride: int) -> tuple[Integers, int]:
-    """Return the samples with data, first those for the deviation, and the number of the latter."""
-    seen = np.zeros(given.shape[1], np.bool_)
-    for f in range(len(given)):
-        row = given[f]
-        for k in range(len(row)):
-            seen[k] |= row[k] > 0
-    indices = np.empty(given.shape[1], np.int64)
-    count = 0
-    for k in range(0, len(seen), stride):
-        if seen[k]:
-            indices[count] = k
-            count += 1
-    num_scale = count
-    for k in range(len(seen)):
-        if seen[k] and k % stride > 0:
-            indices[count] = k
-            count += 1
-    return indices[:count], num_scale
-
-
-@compiled()
-def _packed(
-    problem: ConeProblem,
-    p: int,
-    views: Integers,
-    selection: tuple[Integers, int],
-    loss: int,
-    scale: float,
-) -> Patch:
-    samples, num_scale = selection
-    radiance, given, prior_mean = problem.radiance[p], problem.given[p], problem.prior_mean[p]
-    regularization, prior = problem.regularization[p], problem.prior[p]
-    num_views, num_samples = len(views), len(samples)
-    padded = TILE * (-(-num_samples // TILE))
-    shape = (num_views, padded)
-    radiance_rows, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    view_prior_mean, view_regularization = (
-        np.empty((num_views, 4), np.float32),
-        np.empty(num_views, np.float32),
-    )
-    size, count, slack = 0.0, 0.0, 0.0
-    for f in range(len(regularization)):
-        slack += 4 * regularization[f]
-    for f in range(num_views):
-        source, weights_row = radiance[views[f]], given[views[f]]
-        for k in range(num_samples):
-            radiance_rows[f, k], weight[f, k] = source[samples[k]], weights_row[samples[k]]
-            size += abs(radiance_rows[f, k])
-            count += weight[f, k]
-        for i in range(4):
-            view_prior_mean[f, i] = prior_mean[views[f], i]
-        view_regularization[f] = regularization[views[f]]
-        slack -= 4 * view_regularization[f]
-    prior_rows = np.zeros((10, padded), np.float32)
-    for i in range(10):
-        for k in range(num_samples):
-            prior_rows[i, k] = prior[i, samples[k]]
-    # The identity makes the equations of the padding regular.
-    for i in (0, 4, 7, 9):
-        prior_rows[i, num_samples:] = 1
-    return Patch(
-        radiance=radiance_rows,
-        given=weight,
-        weight=weight.copy(),
-        residual=np.empty(shape, np.float32),
-        prior=prior_rows,
-        equations=np.empty((14, padded), np.float32),
-        prior_mean=view_prior_mean,
-        regularization=view_regularization,
-        slack=max(slack, 0.0),
-        num_views=len(regularization),
-        num_scale=num_scale,
-        min_deviation=MIN_DEVIATION * size / max(count, 1.0),
-        loss=loss,
-        scale=scale,
-    )
 
 
 @compiled()
@@ -231,9 +72,9 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
     # functions inlined here are called only once: compiling a copy takes seconds.
     for iteration in range(max_iterations + 2):
         if better and iteration != 1:
-            scale = _robust_weights(patch, lights, shading, scale)
+            _, scale = residuals.update_weights(patch, lights, shading, scale, np.float32)
             if iteration == 0:
-                energy = _energy(patch)
+                energy, _ = residuals.weighted_square(patch.weight, patch.radiance)
             elif patch.loss != SQUARES:
                 cost = _evaluate(patch, lights, shading, slope)
         if exact or small >= small_steps:
@@ -261,7 +102,7 @@ def _solve(patch: Patch, lights: Floats, shading: Floats, limits: Limits) -> tup
                 overwrite(new_shading, shading)
                 _keep_scale(patch, lights, new_lights, new_shading)
             _equations(patch, new_lights)
-            update_shading(patch.equations, new_shading, SHADING_STEPS)
+            shading_steps.update_shading(patch.equations, new_shading, SHADING_STEPS)
             after = _evaluate(patch, new_lights, new_shading, new_slope)
         better = iteration == 0 or after < cost
         if iteration > 0:
@@ -287,71 +128,8 @@ def overwrite(target: NDArray[Any], source: NDArray[Any]) -> None:
 
 
 @compiled(fast=True)
-def _robust_weights(patch: Patch, lights: Floats, shading: Floats, start_scale: float) -> float:
-    """Update the robust weights; return the initial scale for the next call."""
-    if patch.loss == SQUARES:
-        return 0.0
-    squares = np.empty(patch.radiance.shape[0] * patch.num_scale, np.float32)
-    count = 0
-    for f in range(len(lights)):
-        _residual(patch, lights[f], shading, f)
-        residual_row, given = patch.residual[f], patch.given[f]
-        for k in range(patch.num_scale):
-            squares[count] = residual_row[k] * residual_row[k]
-            count += given[k] > 0
-    variance, scale = robust_variance(squares[:count], start_scale, np.float32)
-    width = patch.scale * max(math.sqrt(variance), patch.min_deviation)
-    one, inverse = np.float32(1), np.float32(1 / width if width > 0 else 0.0)
-    for f in range(len(lights)):
-        residual_row, given, weight = patch.residual[f], patch.given[f], patch.weight[f]
-        if patch.loss == CAUCHY:
-            for k in range(len(residual_row)):
-                relative = residual_row[k] * inverse
-                weight[k] = given[k] / (one + relative * relative)
-        elif patch.loss == GEMAN_MCCLURE:
-            for k in range(len(residual_row)):
-                relative = residual_row[k] * inverse
-                root = one / (one + relative * relative)
-                weight[k] = given[k] * root * root
-        else:
-            for k in range(len(residual_row)):
-                weight[k] = given[k] / max(one, abs(residual_row[k] * inverse))
-    return scale
-
-
-@compiled(fast=True)
-def _residual(patch: Patch, light: Floats, shading: Floats, f: int) -> None:
-    radiance, residual_row = patch.radiance[f], patch.residual[f]
-    s, x, y, z = shading[0], shading[1], shading[2], shading[3]
-    for k in range(len(residual_row)):
-        residual_row[k] = radiance[k] - (
-            light[0] * s[k] + light[1] * x[k] + light[2] * y[k] + light[3] * z[k]
-        )
-
-
-@compiled(fast=True)
-def _energy(patch: Patch) -> float:
-    total = 0.0
-    for f in range(len(patch.radiance)):
-        radiance, weight = patch.radiance[f], patch.weight[f]
-        view_total = np.float32(0)
-        for k in range(len(radiance)):
-            view_total += weight[k] * radiance[k] * radiance[k]
-        total += float(view_total)
-    return total
-
-
-@compiled(fast=True)
 def _equations(patch: Patch, lights: Floats) -> None:
-    for i in range(10):
-        total, prior_rows = patch.equations[i], patch.prior[i]
-        row, column = _ROWS[i], _COLUMNS[i]
-        for k in range(len(total)):
-            total[k] = prior_rows[k]
-        for f in range(len(lights)):
-            weight, factor = patch.weight[f], lights[f, row] * lights[f, column]
-            for k in range(len(total)):
-                total[k] += factor * weight[k]
+    shading_steps.matrices_of_samples(patch.prior, lights, patch.weight, patch.equations)
     for i in range(4):
         total = patch.equations[10 + i]
         total[:] = 0
@@ -425,7 +203,7 @@ def _curvature(
     """Compute the upper triangle of the Gauss-Newton matrix from the current equations."""
     num_views, num_samples = patch.radiance.shape
     whitener = np.empty((12, num_samples), np.float32)
-    whitening(patch.equations, shading, whitener)
+    shading_steps.whitening(patch.equations, shading, whitener)
     stride = max(1, num_samples // samples) if samples > 0 else 1
     chosen = -(-num_samples // stride)
     white, pairs = (
@@ -433,7 +211,7 @@ def _curvature(
         np.empty((10, chosen), np.float32),
     )
     for i in range(10):
-        target, first, second = pairs[i], shading[_ROWS[i]], shading[_COLUMNS[i]]
+        target, first, second = pairs[i], shading[ROWS[i]], shading[COLUMNS[i]]
         for k in range(chosen):
             target[k] = first[k * stride] * second[k * stride]
     for j in range(3):
@@ -490,21 +268,9 @@ def _block(
         sn += fraction * n[k]
     sums = (sa, sb, sc, sd, se, si, sj, sh, sm, sn)
     for index in range(10):
-        row, column = _ROWS[index], _COLUMNS[index]
+        row, column = ROWS[index], COLUMNS[index]
         curvature[4 * f + row, 4 * g + column] = factor * sums[index]
         curvature[4 * f + column, 4 * g + row] = factor * sums[index]
-
-
-@compiled(fast=True)
-def _root_mean_square(patch: Patch, lights: Floats, shading: Floats) -> tuple[float, bool]:
-    total, count = 0.0, 0.0
-    for f in range(len(lights)):
-        _residual(patch, lights[f], shading, f)
-        residual_row, given = patch.residual[f], patch.given[f]
-        for k in range(len(residual_row)):
-            total += given[k] * residual_row[k] * residual_row[k]
-            count += given[k]
-    return (math.sqrt(total / count) if count > 0 else 0.0), count > 0
 
 
 @compiled(annotated=True)
@@ -524,29 +290,15 @@ def solve_on_cone(
         stride: The deviation is estimated from every ``stride``-th sample.
         solution: Result; lights and shading are the start.
     """
-    _, given, prior_mean, regularization, _ = problem
-    lights, shading, weight, iterations, residual, cause = solution
-    for p in range(len(given)):
-        views = _views_that_count(given[p], prior_mean[p], regularization[p], lights[p])
-        samples, num_scale = samples_that_count(given[p], stride)
-        patch = _packed(problem, p, views, (samples, num_scale), loss, scale)
-        light = np.empty((len(views), 4), np.float32)
-        shade = np.zeros((4, patch.radiance.shape[1]), np.float32)
-        for f in range(len(views)):
-            for i in range(4):
-                light[f, i] = lights[p, views[f], i]
-        for k in range(len(samples)):
-            for i in range(4):
-                shade[i, k] = shading[p, i, samples[k]]
-        iterations[p], cause[p] = _solve(patch, light, shade, limits)
-        residual[p], has_data = _root_mean_square(patch, light, shade)
-        if not has_data:
-            cause[p] = _EMPTY
-        for f in range(len(views)):
-            for i in range(4):
-                lights[p, views[f], i] = light[f, i]
-            for k in range(len(samples)):
-                weight[p, views[f], samples[k]] = patch.weight[f, k]
-        for i in range(4):
-            for k in range(len(samples)):
-                shading[p, i, samples[k]] = shade[i, k]
+    for p in range(len(problem.given)):
+        copy_unseen(problem, p, problem.prior_mean, solution.lights)
+        selection = selected(problem, p, stride)
+        patch = packed(problem, selection, TILE, loss, scale)
+        padded = patch.radiance.shape[1]
+        light, shade = gathered(solution.lights, solution.shading, selection, padded)
+        solution.iterations[p], solution.cause[p] = _solve(patch, light, shade, limits)
+        residuals.compute(patch, light, shade)
+        solution.residual[p], count = residuals.residual_size(patch)
+        if not count > 0:
+            solution.cause[p] = _EMPTY
+        scattered(solution, selection, patch.weight, light, shade)

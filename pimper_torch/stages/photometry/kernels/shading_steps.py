@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pimper_torch.kernels.compile import compiled
 from pimper_torch.kernels.twin_constants import MAX_STEP
+from pimper_torch.stages.photometry.kernels.packed_patches import Numbers
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -22,9 +23,39 @@ Ten = tuple[float, float, float, float, float, float, float, float, float, float
 # Samples of a tile: a choice, two cache lines of float32 a row.
 TILE = 32
 
+# Row and column of each entry of a packed matrix.
+ROWS = (0, 0, 0, 0, 1, 1, 1, 2, 2, 3)
+COLUMNS = (0, 1, 2, 3, 1, 2, 3, 2, 3, 3)
+
 # As in ``stages.photometry.bilinear``, and as in ``stages.photometry.quadratics`` in float64.
 _ROUNDING = 8 * float(np.finfo(np.float32).eps)
 _TINY = float(np.finfo(np.float64).tiny) ** 0.5
+
+
+@compiled(fast=True)
+def matrices_of_samples(prior: Numbers, lights: Numbers, weight: Numbers, total: Numbers) -> None:
+    """Write the packed ``A`` of every sample: its prior, and the sum of ``w l l^T`` over views."""
+    for i in range(10):
+        target, prior_row, row, column = total[i], prior[i], ROWS[i], COLUMNS[i]
+        for k in range(len(target)):
+            target[k] = prior_row[k]
+        for f in range(len(lights)):
+            weight_row, factor = weight[f], lights[f, row] * lights[f, column]
+            for k in range(len(target)):
+                target[k] += factor * weight_row[k]
+
+
+@compiled(fast=True)
+def matrix_at(rows: Numbers, k: int) -> Ten:
+    """Return the packed matrix of a sample, a column of ten rows."""
+    a, b, c, d, e = rows[0, k], rows[1, k], rows[2, k], rows[3, k], rows[4, k]
+    return a, b, c, d, e, rows[5, k], rows[6, k], rows[7, k], rows[8, k], rows[9, k]
+
+
+@compiled(fast=True)
+def vector_at(rows: Numbers, k: int) -> Four:
+    """Return the vector of a sample, a column of four rows."""
+    return rows[0, k], rows[1, k], rows[2, k], rows[3, k]
 
 
 @compiled(fast=True)
