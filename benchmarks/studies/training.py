@@ -87,7 +87,7 @@ def of_normals(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress:
 
     while True:
         prior = pt.priors_of(facing, scene, "normals", axes="opencv", error_deg=3.0)
-        own = scene.replace(views=scene.views.replace(normals=prior))
+        own = scene.replace(views=scene.views.replace(priors=(prior,)))
         (step,) = chain.steps(frozen.replace(scene=own))
         value = loss(step.surface, scene, visible)
         yield value, f"{float((1 - value.detach()).arccos().rad2deg()):.2f} degrees", optimizer
