@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import interpolate, normalize, pad
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
 import pimper_torch as pt
@@ -68,29 +68,33 @@ def of_response(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress
 
 
 def of_normals(chain: pt.Chain, prepared: Prepared, truth: Capture) -> Progress:
-    """Train a small network from scratch whose normals are a prior of the chain."""
+    """Train a small network from scratch to the normals of the surface, whose prior it is."""
     if truth.normals is None:
         raise SystemExit(f"{truth.name}: no true normals; needed: maps as of `pimper render`.")
-    loss, scene = pt.losses.NormalLoss(truth.normals), prepared.scene
+    scene, true = prepared.scene, truth.normals
     torch.manual_seed(0)
     network = nn.Sequential(
         nn.Conv2d(3, 16, 5, 2, 2), nn.SiLU(), nn.Conv2d(16, 32, 3, 2, 1), nn.SiLU(),
         nn.Conv2d(32, 32, 3, 2, 1), nn.SiLU(), nn.Conv2d(32, 3, 3, 1, 1),
     )  # fmt: skip
-    optimizer = torch.optim.Adam(network.parameters(), lr=3e-3, betas=(0.7, 0.9))
+    optimizer = torch.optim.Adam(network.parameters(), lr=4e-3, betas=(0.7, 0.9))
     with torch.no_grad():
         first = next(chain.steps(prepared))
     frozen, visible = first.frozen(), well_visible(first.surface, scene.cameras)
 
     def facing(image: Tensor) -> Tensor:
-        return normalize(network(image) - image.new_tensor([0, 0, 1])[:, None, None], dim=1)
+        found = interpolate(network(image), image.shape[-2:], mode="bilinear")
+        return normalize(found - image.new_tensor([0, 0, 1])[:, None, None], dim=1)
 
     while True:
-        prior = pt.priors_of(facing, scene, "normals", axes="opencv", error_deg=3.0)
+        prior = pt.priors_of(facing, scene, "normals", axes="opencv", error_deg=20.0)
+        assert isinstance(prior, pt.NormalPrior)
         own = scene.replace(views=scene.views.replace(priors=(prior,)))
         (step,) = chain.steps(frozen.replace(scene=own))
-        value = loss(step.surface, scene, visible)
-        yield value, f"{float((1 - value.detach()).arccos().rad2deg()):.2f} degrees", optimizer
+        value = pt.losses.NormalLoss(prior)(step.surface, scene, visible)
+        known = true.variance.isfinite() & prior.variance.isfinite()
+        cosine = (true.normals * prior.normals.detach()).sum(dim=-1)[known].clamp(-1, 1)
+        yield value, f"{float(cosine.arccos().rad2deg().mean()):.1f} degrees", optimizer
 
 
 TASKS = {"cameras": of_cameras, "response": of_response, "normals": of_normals}
