@@ -144,6 +144,7 @@ def given():
         delta=torch.full((4, 6), 1e-3),
         apart=pt.CameraDistance(first="view_00", second="view_02", length=10.0),
         photometric=pt.losses.PhotometricLoss(darkest=-1.0, brightest=10.0),
+        consistent=pt.losses.ConsistencyLoss(darkest=-1.0, brightest=10.0),
         angular=pt.losses.NormalLoss(maps),
         outlines=pt.Silhouettes.everything(scene.views).replace(
             inside=torch.zeros(4, 24, 32).index_fill(1, torch.arange(6, 18), 1.0),
@@ -181,6 +182,11 @@ def written(tmp):
         return pt.read_mesh(Path(folder) / "out" / "mesh.ply")
 
 
+def meshes_of(tmp, kind):
+    pt.write_mesh(tmp.finished.mesh, tmp.folder / f"kind.{kind}")
+    return pt.read_mesh(tmp.folder / f"kind.{kind}")
+
+
 def stereo(one, **method):
     return pt.photometric_stereo(one.radiance, one.mask, **method)
 
@@ -216,6 +222,9 @@ CALLS = {
         one.coarse, one.scene.cameras, 0, pt.by_facet(one.step.patches, "spacing")
     ).clear(),
     "PhotometricLoss": lambda one: one.photometric(one.ball, one.scene),
+    "ConsistencyLoss": lambda one: one.consistent(
+        one.ball, one.scene, one.photometric.visible(one.ball, one.scene)
+    ),
     "NormalLoss": lambda one: one.angular(one.ball, one.scene),
     "PointToSurfaceLoss": lambda one: pt.losses.PointToSurfaceLoss(one.coarse.mesh)(one.ball),
     "SilhouetteLoss": lambda one: pt.losses.SilhouetteLoss(one.outlines, one.scene.cameras)(
@@ -243,11 +252,13 @@ FILES = {
     "save_record": lambda tmp: pt.save_record(tmp.finished, tmp.folder / "again.safetensors"),
     "load_record": lambda tmp: pt.load_record(pt.Reconstruction, tmp.folder / "result.safetensors"),
     "read_mesh": lambda tmp: pt.read_mesh(tmp.folder / "written" / "mesh.ply"),
+    "write_mesh": lambda tmp: [meshes_of(tmp, kind) for kind in ("ply", "glb", "obj", "stl")],
     "read_result": lambda tmp: pt.export.read_written(tmp.folder / "written").replace(summary={}),
     "write_result": lambda tmp: written(tmp),
 }
 # Of public functions that make no tensors, or show others' results.
 WITHOUT = {"batch", "load_chain", "make_chain", "load_config", "user_cache", "show", "segment"}
+WITHOUT |= {"from_onnx"}  # priors_of calls the network
 
 
 def call(name):

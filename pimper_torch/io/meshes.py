@@ -43,6 +43,7 @@ _MAX_ROUNDING = 1e-6
 _KINDS = {"uint8": "uchar", "float32": "float", "float64": "double"}  # PLY's names
 
 
+@isolated
 def write_mesh(mesh: Mesh, path: Path | str) -> None:
     """Write a mesh as it is, in its unit and axes; ``mesh.save(path)`` is the same.
 

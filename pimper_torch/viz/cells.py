@@ -11,7 +11,7 @@ from pimper_torch.radiometry.base_color import albedo_scale
 from pimper_torch.records import Mesh, Reconstruction, Record, Silhouettes, SparseScene, Views
 from pimper_torch.viz import tiles
 from pimper_torch.viz.maps import normal_colors, view_maps
-from pimper_torch.viz.overview import framed, preview, selected, thumbnail_sheet
+from pimper_torch.viz.overview import framed, preview, shown_views, thumbnail_sheet
 
 LAMP = Path(__file__).with_name("lamp.html").read_text(encoding="utf-8")
 """Disc that sets the direction of a light; it writes into the text field before it."""
@@ -56,7 +56,7 @@ def _thumbnails(views: Views) -> Image.Image:
     masks = views.inside if views.masks is None else views.masks
     trusted = torch.ones(views.num_views, dtype=torch.bool)
     silhouettes = Silhouettes(inside=masks.float(), reliable=trusted, source="masks")
-    sheet = thumbnail_sheet(views, silhouettes, selected(trusted), width_px=_WIDTH_PX)
+    sheet = thumbnail_sheet(views, silhouettes, shown_views(trusted), width_px=_WIDTH_PX)
     return tiles.image_of(tiles.array(sheet))
 
 

@@ -83,7 +83,7 @@ def panels_of(result: Reconstruction, panel_px: int) -> list[tiles.Tile]:
 def _all_views(result: Reconstruction, width_px: int) -> tiles.Tile:
     """Draw photographs with their silhouettes: all, or a selection with the unreliable ones."""
     silhouettes = result.silhouettes
-    views = selected(silhouettes.reliable.cpu())
+    views = shown_views(silhouettes.reliable.cpu())
     small = thumbnail_sheet(result.scene.views, silhouettes, views, width_px=width_px)
     origin = "masks given" if silhouettes.source == "masks" else "silhouettes found"
     count = len(silhouettes.reliable)
@@ -93,7 +93,7 @@ def _all_views(result: Reconstruction, width_px: int) -> tiles.Tile:
     return tiles.Tile(title=title, picture=tiles.array(small), wide=True)
 
 
-def selected(reliable: Bool[Tensor, " view"]) -> list[int]:
+def shown_views(reliable: Bool[Tensor, " view"]) -> list[int]:
     """Return the drawn views, in order: unreliable ones, and an even selection of the others."""
     unreliable = (~reliable).nonzero()[:_MOST_THUMBNAILS, 0]
     trusted = reliable.nonzero()[:, 0]

@@ -19,7 +19,7 @@ from pimper_torch.viz.overview import (
     headline,
     panels_of,
     preview,
-    selected,
+    shown_views,
     thumbnail_sheet,
 )
 from pimper_torch.viz.render import crop_to, shade
@@ -110,14 +110,14 @@ def test_silhouettes_are_drawn_over_the_photograph_and_all_views_below(reconstru
 def test_all_views_or_a_selection_with_all_unreliable_ones_are_shown(count):
     reliable = torch.ones(count, dtype=torch.bool)
     reliable[count // 2] = False
-    shown = selected(reliable)
+    shown = shown_views(reliable)
     assert len(shown) == len(set(shown)) == min(count, 64)
     assert shown == sorted(shown)
     assert count // 2 in shown
     assert shown[0] == 0
     assert shown[-1] == count - 1
     assert max((b - a for a, b in itertools.pairwise(shown)), default=1) <= -(-count // 62)
-    assert len(selected(torch.zeros(count, dtype=torch.bool))) == min(count, 64)
+    assert len(shown_views(torch.zeros(count, dtype=torch.bool))) == min(count, 64)
 
 
 def test_records_with_gradients_are_drawn(reconstruction, tmp_path):
