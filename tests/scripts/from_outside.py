@@ -18,7 +18,7 @@ def main(site_packages: str) -> None:
     assert (bundled_photographs() / "ATTRIBUTION.md").is_file()
     assert (home / "py.typed").is_file()
     chain = pt.load_chain("default")
-    assert_type(chain, pt.CoarseToFine | pt.Published)
+    assert_type(chain, pt.CoarseToFine)
 
 
 def reconstructed(folder: str) -> pt.Mesh:
