@@ -60,6 +60,11 @@ class PhotometricLoss(nn.Module):
             InputError: No photograph shows more vertices than its light has unknowns.
         """
         visible = self.visible(surface, scene) if visible is None else visible
+        if visible.shape[1] != len(surface.vertices_world):
+            raise InputError(
+                f"visible: of {visible.shape[1]} vertices; needed: of the surface's "
+                f"{len(surface.vertices_world)}. A chain keeps them with `fuse.max_lost` 0."
+            )
         views = (visible.sum(dim=1) > _UNKNOWNS).nonzero()[:, 0].tolist()
         if not views:
             raise InputError(

@@ -212,3 +212,10 @@ def test_cameras_move_by_steps_in_se3(scene):
         assert torch.autograd.gradcheck(
             lambda value: cameras.retract(value).cam_from_world, start.requires_grad_()
         )
+
+
+def test_visibility_of_another_surface_is_refused(scene, ball):
+    visible = pt.losses.PhotometricLoss().visible(ball, scene)
+    for loss in (pt.losses.PhotometricLoss(), pt.losses.ConsistencyLoss()):
+        with pytest.raises(pt.InputError, match="needed: of the surface's"):
+            loss(ball, scene, visible[:, 1:])
