@@ -198,6 +198,7 @@ CALLS = {
     "facets_of": lambda one: pt.facets_of(one.coarse.mesh, one.scene),
     "prepare": lambda one: chain().prepare(one.scene).replace(reports=()),
     "steps": lambda one: next(chain().steps(one.scene)).surface,
+    "frozen": lambda one: one.step.frozen().patches,
     "finish": lambda one: chain().finish(one.result).replace(report=()),
     "priors_of": lambda one: pt.priors_of(
         lambda image: 0.2 * image - 0.6, one.scene, "normals", axes="opencv", mean=[0.5, 0.4, 0.3]

@@ -93,6 +93,7 @@ class Step(Record):
         """Photographs used only to estimate cameras; ``None`` without any."""
         return self.prepared.held_out
 
+    @isolated
     def frozen(self) -> Prepared:
         """Return what was prepared with the facets and templates of this step's surface.
 

@@ -95,10 +95,11 @@ def reduced(mesh: Mesh, num_faces: int) -> Mesh:
         trimesh.Trimesh(*shifted, process=False).export(before, vertex_normal=False)
         program = pycolmap.simplify_mesh
         vertices, faces = _mesh_from(after, "simplification", program, before, after, options)
+    faces = _oriented(faces)
     # A small piece collapses to two faces back to back, which have no normal.
     corners = faces.sort(dim=1).values
     _, same, times = torch.unique(corners, dim=0, return_inverse=True, return_counts=True)
-    used, faces = torch.unique(_oriented(faces[times[same] == 1]), return_inverse=True)
+    used, faces = torch.unique(faces[times[same] == 1], return_inverse=True)
     points = vertices[used].double() + centre
     names = [field.name for field in fields(Mesh) if getattr(mesh, field.name) is not None][2:]
     return Mesh(

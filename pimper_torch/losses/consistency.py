@@ -11,7 +11,7 @@ from pimper_torch.losses.photometric import PhotometricLoss, gray_at
 from pimper_torch.losses.visible import Visible
 from pimper_torch.records import SparseScene, Surface
 
-_ROUNDS = 10  # of the fit, which reweighs entries after each
+_ROUNDS = 10  # of the fit, which reweighs entries after each: a choice
 _MIN_VIEWS = 4  # fewer photographs than the light has unknowns agree on any albedo: a choice
 
 
