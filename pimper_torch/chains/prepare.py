@@ -171,7 +171,7 @@ def locate(
     scene = with_undistorted_priors(with_poses(sound(scene)))
     finder = chain.silhouettes
     if not isinstance(finder, FindSilhouettes) or finder.config.object != "everything":
-        refuse_wrong_masks(scene, (views if isinstance(views, Views) else views.views).names)
+        refuse_wrong_masks(scene)
     return scene, decisions
 
 

@@ -136,6 +136,7 @@ def _of_silhouettes(
         return names[int(views[values.argmax()])]
 
     reliable, overlap = silhouettes.reliable, silhouettes.expected_overlap
+    advice = "Correct the given masks." if silhouettes.source == "masks" else _MASKS
     count, every = int(reliable.sum()), torch.arange(len(reliable), device=reliable.device)
     trusted = reliable.nonzero()[:, 0]
     yield _Figure(
@@ -143,7 +144,7 @@ def _of_silhouettes(
         count / len(reliable),
         worst((~reliable).int(), every),
         f"{len(reliable) - count} of {len(reliable)} silhouettes contradict the others",
-        _MASKS,
+        advice,
     )
     if overlap is not None:
         yield _Figure(
@@ -151,7 +152,7 @@ def _of_silhouettes(
             float(overlap.mean()),
             worst(-overlap, every),
             f"the silhouettes are expected to overlap the object by only {overlap.mean():.0%}",
-            _MASKS,
+            advice,
         )
     lacking, exceeding = ((x.mean(), x.max()) for x in (found.uncovered, found.outside))
     yield _Figure(
@@ -167,5 +168,5 @@ def _of_silhouettes(
         worst(found.outside, trusted),
         f"the surface sticks out of the silhouette by {exceeding[1]:.0%} of its area, and by "
         f"{exceeding[0]:.0%} in the mean",
-        _MASKS,
+        advice,
     )
