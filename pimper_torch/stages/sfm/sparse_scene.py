@@ -23,6 +23,7 @@ from pimper_torch.runtime.failures import skipped
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import each
 from pimper_torch.stages.sfm.colmap import reprojection_errors, write_binary
+from pimper_torch.stages.sfm.photograph_check import of_something_else
 
 
 def assemble_scene(views: Views, model: SparseModel) -> SparseScene:
@@ -124,7 +125,7 @@ def point_colors(scene: SparseScene) -> UInt8[Tensor, "point 3"]:
 
 @torch.no_grad()
 def sound(scene: SparseScene) -> SparseScene:
-    """Remove views without usable pixels or with invalid cameras, and points that are not finite.
+    """Remove views without usable pixels or the camera's view, and points that are not finite.
 
     Args:
         scene: Photographs, cameras and cloud. If all can be used, it is returned itself.
@@ -136,6 +137,7 @@ def sound(scene: SparseScene) -> SparseScene:
         skipped(_failure("points", share, "their coordinates are not finite", "They are skipped"))
         scene = with_points(scene, finite)
     reasons: dict[int, str] = {}
+    others = of_something_else(scene)
     masks = scene.views.masks
     for view, (image, valid) in enumerate(each(scene.views.images, scene.views.inside)):
         lit = ((image > 0) & (image < SATURATED)).any(dim=0) & valid  # false for NaN
@@ -144,7 +146,7 @@ def sound(scene: SparseScene) -> SparseScene:
             reason = "it is black, saturated or not finite everywhere"
         elif not reason and masks is not None and not bool((lit & masks[view]).any()):
             reason = "its mask is empty, or contains no lit pixel"
-        if reason:
+        if reason := reason or others.get(view, ""):
             reasons[view] = reason
     unusable = [scene.views.names[view] for view in reasons]
     leave_out("sfm.sound_views", len(unusable), total=scene.views.num_views, names=unusable)
