@@ -23,10 +23,8 @@ _OTHERS = (
 )
 _PICTURES = (*HEIC_SUFFIXES, *RAW_SUFFIXES, *_OTHERS)
 _VIDEO = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts")
-# Folders next to those of poses, with masks and maps of photographs.
-_MAPS = re.compile(
-    r"(masks?|silhouettes?|mattes?|segmentations?|normals?|depths?|disparit(y|ies))", re.IGNORECASE
-)
+# Last words in names of folders next to those of poses, with masks and maps of photographs.
+_MAPS = re.compile(r"(?i)(mask|silhouette|matte|segmentation|normal|depth|disparity)s?|disparities")
 
 # Rank of files with the same name by the extra that they need; the lowest is read.
 _RANKS = {"raw": 0, "": 1, "heic": 2}
@@ -59,10 +57,12 @@ def list_images(folder: Path | str) -> list[Path]:
         raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
     paths = _readable(entries)
     if not paths:
-        poses = [path for path in sorted(entries) if not _MAPS.fullmatch(path.name)]
-        folders = [path for path in poses if path.is_dir() and _has_images(path)]
-        if len(folders) >= MIN_PHOTOGRAPHS:
-            paths = [image for pose in folders for image in _readable(_visible(pose))]
+        folders = [path for path in sorted(entries) if path.is_dir() and _has_images(path)]
+        folders = [path for path in folders if not _MAPS.fullmatch(path.name)]
+        # If all names end with such a word, a mask may be the object: front_mask, back_mask.
+        poses = [path for path in folders if not _MAPS.fullmatch(re.split("[ _.-]", path.name)[-1])]
+        if len(poses := poses or folders) >= MIN_PHOTOGRAPHS:
+            paths = [image for pose in poses for image in _readable(_visible(pose))]
     if not paths:
         for path in sorted(entries):
             if path.is_file() and (extra := extra_of(path)):

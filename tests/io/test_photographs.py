@@ -243,7 +243,9 @@ def test_each_subfolder_has_the_photographs_of_one_pose(tmp_path, pixels):
         assert torch.equal(one_a_pose.masks, views.masks)
 
 
-@pytest.mark.parametrize("beside", ["masks", "Mask", "silhouettes", "normals", "depth"])
+@pytest.mark.parametrize(
+    "beside", ["masks", "Mask", "silhouettes", "normals", "depth", "object_masks", "jar mask"]
+)
 def test_a_subfolder_of_masks_or_maps_is_not_a_pose(tmp_path, pixels, beside):
     for pose in (1, 2, 3):
         save(tmp_path / f"pose_{pose}" / "1.png", pixels)
@@ -258,6 +260,14 @@ def test_a_subfolder_of_masks_or_maps_is_not_a_pose(tmp_path, pixels, beside):
     shutil.rmtree(tmp_path / "pose_3")
     with pytest.raises(InputError, match="no images"):
         load_views(tmp_path)
+
+
+def test_poses_of_a_mask_that_was_photographed_are_poses(tmp_path, pixels):
+    names = tuple(f"{pose}_mask/1.png" for pose in ("back", "front", "left"))
+    for name in names:
+        save(tmp_path / name, pixels)
+    with pytest.warns(PimperWarning, match="3 camera poses"):
+        assert load_views(tmp_path).names == names
 
 
 def test_two_subfolders_are_not_poses(tmp_path, pixels):
