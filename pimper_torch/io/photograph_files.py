@@ -17,11 +17,10 @@ from pimper_torch.runtime.errors import InputError, caution, some
 
 MIN_PHOTOGRAPHS = 3  # fewer do not separate shape, light and viewpoint
 # Files that users may expect to be read, though not in SUFFIXES: images and camera raw; video.
-_OTHERS = (
-    *(".gif", ".avif", ".webp", ".bmp", ".jp2", ".jxl"),
+_PICTURES = (
+    *(*HEIC_SUFFIXES, *RAW_SUFFIXES, ".gif", ".avif", ".webp", ".bmp", ".jp2", ".jxl"),
     *(".psd", ".exr", ".hdr", ".ppm", ".pgm", ".raw"),
 )
-_PICTURES = (*HEIC_SUFFIXES, *RAW_SUFFIXES, *_OTHERS)
 _VIDEO = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts")
 # Last words in names of folders next to those of poses, with masks and maps of photographs.
 _MAPS = re.compile(r"(?i)(mask|silhouette|matte|segmentation|normal|depth|disparity)s?|disparities")
@@ -143,10 +142,9 @@ def warn_of_skipped_files(folder: Path | str, read: Sequence[Path | str]) -> Non
         )
     if kinds:
         counts = ", ".join(f"{kind} ({count})" for kind, count in Counter(kinds.values()).items())
-        extras = {extra_of(path) for path in kinds if path.is_file()} - {""}
         hint = "".join(
             f' `pip install "pimper_torch[{extra}]"` reads {extra}.'
-            for extra in sorted(extras)
+            for extra in sorted({extra_of(path) for path in kinds if path.is_file()} - {""})
             if not is_installed(extra)
         )
         caution(
