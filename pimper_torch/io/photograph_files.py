@@ -17,16 +17,13 @@ from pimper_torch.runtime.errors import InputError, caution, some
 
 MIN_PHOTOGRAPHS = 3  # fewer do not separate shape, light and viewpoint
 # Files that users may expect to be read, though not in SUFFIXES: images and camera raw; video.
-_OTHERS = (
-    *(".gif", ".avif", ".webp", ".bmp", ".jp2", ".jxl"),
+_PICTURES = (
+    *(*HEIC_SUFFIXES, *RAW_SUFFIXES, ".gif", ".avif", ".webp", ".bmp", ".jp2", ".jxl"),
     *(".psd", ".exr", ".hdr", ".ppm", ".pgm", ".raw"),
 )
-_PICTURES = (*HEIC_SUFFIXES, *RAW_SUFFIXES, *_OTHERS)
 _VIDEO = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts")
-# Folders next to those of poses, with masks and maps of photographs.
-_MAPS = re.compile(
-    r"(masks?|silhouettes?|mattes?|segmentations?|normals?|depths?|disparit(y|ies))", re.IGNORECASE
-)
+# Last words in names of folders next to those of poses, with masks and maps of photographs.
+_MAPS = re.compile(r"(?i)(mask|silhouette|matte|segmentation|normal|depth|disparity)s?|disparities")
 
 # Rank of files with the same name by the extra that they need; the lowest is read.
 _RANKS = {"raw": 0, "": 1, "heic": 2}
@@ -59,10 +56,12 @@ def list_images(folder: Path | str) -> list[Path]:
         raise InputError(f"{folder}: cannot be listed ({error.strerror}).") from error
     paths = _readable(entries)
     if not paths:
-        poses = [path for path in sorted(entries) if not _MAPS.fullmatch(path.name)]
-        folders = [path for path in poses if path.is_dir() and _has_images(path)]
-        if len(folders) >= MIN_PHOTOGRAPHS:
-            paths = [image for pose in folders for image in _readable(_visible(pose))]
+        folders = [path for path in sorted(entries) if path.is_dir() and _has_images(path)]
+        folders = [path for path in folders if not _MAPS.fullmatch(path.name)]
+        # If all names end with such a word, a mask may be the object: front_mask, back_mask.
+        poses = [path for path in folders if not _MAPS.fullmatch(re.split("[ _.-]", path.name)[-1])]
+        if len(poses := poses or folders) >= MIN_PHOTOGRAPHS:
+            paths = [image for pose in poses for image in _readable(_visible(pose))]
     if not paths:
         for path in sorted(entries):
             if path.is_file() and (extra := extra_of(path)):
@@ -143,10 +142,9 @@ def warn_of_skipped_files(folder: Path | str, read: Sequence[Path | str]) -> Non
         )
     if kinds:
         counts = ", ".join(f"{kind} ({count})" for kind, count in Counter(kinds.values()).items())
-        extras = {extra_of(path) for path in kinds if path.is_file()} - {""}
         hint = "".join(
             f' `pip install "pimper_torch[{extra}]"` reads {extra}.'
-            for extra in sorted(extras)
+            for extra in sorted({extra_of(path) for path in kinds if path.is_file()} - {""})
             if not is_installed(extra)
         )
         caution(

@@ -148,8 +148,7 @@ def _fill_masks(
         else:
             inside[index, :high, :wide] = True if opaque is None else opaque[:high, :wide]
         drop_pages()
-    names = zip(files.names, alphas, strict=True)
-    masked = [name for name, opaque in names if opaque is not None]
+    masked = [name for name, opaque in zip(files.names, alphas, strict=True) if opaque is not None]
     if masked and not opacities:
         caution(
             f"{files.folder}: {len(masked)} of {len(alphas)} photographs have transparent pixels "
@@ -302,7 +301,7 @@ def _check_exposure(
     nearly saturated photographs give a warning.
     """
     folder, names = files.folder, files.names
-    black, empty, usable = list[str](), list[str](), dict[str, float]()
+    black, empty, grey, usable = list[str](), list[str](), list[str](), dict[str, float]()
     pixels = zip(names, each(images, inside), files.sizes, strict=True)
     for name, (image, mask), (wide, high) in pixels:
         # A thousandth of saturation is level 3 of 255 in sRGB, as with a lens cap on.
@@ -311,6 +310,7 @@ def _check_exposure(
             continue
         if not bool(mask.any()):
             empty.append(name)
+        grey += [name] * bool((image.amax(dim=0) - image.amin(dim=0) < 1e-3).all())
         usable[name] = float((image.amax(dim=0)[mask] < SATURATED).float().mean())
     count = f"{len(black)} of {len(names)} photographs ({some(black)})"
     if black and len(names) - len(black) < max(MIN_PHOTOGRAPHS, len(black)):
@@ -330,12 +330,17 @@ def _check_exposure(
             f"{where} of {some(empty)} mark no pixel as object; needed: bright (opaque) on the "
             "object, black elsewhere. Draw them again, or remove these photographs."
         )
-    saturated = [name for name, fraction in usable.items() if fraction <= _LIT_FRACTION]
     remedy = "Expose less, or state the saturation level by `photographs.saturation`"
-    if saturated:
+    if saturated := [name for name, fraction in usable.items() if fraction <= _LIT_FRACTION]:
         raise InputError(
             f"{folder}: {some(saturated)} {'is' if len(saturated) == 1 else 'are'} completely "
             f"saturated. Remove them from the folder. {remedy}."
+        )
+    if 0 < len(grey) < len(usable):
+        caution(
+            f"{folder}: grey photographs among coloured ones falsify the colours of albedo and "
+            f"light: {some(grey)}. Give them in colour, or remove them.",
+            stacklevel=3,
         )
     if scant := [f"{name} ({part:.1%} usable)" for name, part in usable.items() if part < 0.1]:
         caution(

@@ -27,6 +27,7 @@ from types import SimpleNamespace
 from typing import Annotated, TypeVar, get_origin, get_type_hints
 
 import pimper_torch.kernels
+from pimper_torch.runtime.errors import caution
 from pimper_torch.runtime.progress import report
 from pimper_torch.runtime.user_cache import user_cache
 
@@ -57,7 +58,7 @@ GRADIENTS = ("factor_adjoint", "resampling_adjoint", "sweep_adjoint")
 # NaN and infinity keep their meaning.
 _FAST = {"reassoc", "contract", "arcp", "nsz"}
 
-_NICENESS = 10  # of the child processes: the run itself has priority
+_PATIENCE_S = 1200.0  # a choice: a row takes a quarter of that on two cores
 
 
 def compiled(
@@ -74,7 +75,6 @@ def compiled(
             :mod:`~pimper_torch.kernels.signatures`; the function returns ``None``.
     """
     import numba
-    from filelock import FileLock
 
     # A function that is not inlined has two versions: its own machine code, and a copy in each
     # calling kernel, which is optimized again and rounds differently. The linker uses the first one
@@ -94,9 +94,8 @@ def compiled(
         if called:
             kernel._cache = _cache_class()(kernel.py_func)
             types = [numba.void(*_numba_types(kernel.py_func))] if annotated else signatures
-            module = function.__module__.rpartition(".")[2]
-            with FileLock(cache_folder() / f"{module}.lock"):
-                for signature in types:
+            for signature in types:
+                with suppress(OSError):  # saving is the last step: the folder may be read-only
                     kernel.compile(signature)
             kernel.disable_compile()
         return kernel
@@ -116,13 +115,7 @@ def _numba_types(annotated: object) -> list[object]:
         if get_origin(hint) is Annotated:
             result.append(normalize_signature(f"void({hint.__metadata__[0]})")[0][0])
         elif issubclass(hint, tuple):
-            fields = _numba_types(hint)
-            uniform = len({*fields}) == 1
-            result.append(
-                types.NamedUniTuple(fields[0], len(fields), hint)
-                if uniform
-                else types.NamedTuple(fields, hint)
-            )
+            result.append(types.BaseTuple.from_types(_numba_types(hint), hint))
         else:
             result.append(types.int64 if hint is int else types.float64)
     return result
@@ -148,8 +141,8 @@ def _cache_class() -> Callable[[object], object]:
 def cache_folder() -> Path:
     """Return the folder of machine code, accessible to the user only: code is unpickled from it.
 
-    It is in ``NUMBA_CACHE_DIR`` or the user's cache. If that is not writable, it is next to the
-    kernels, or else a temporary folder.
+    It is in ``NUMBA_CACHE_DIR`` or the user's cache. If that is incomplete and not writable, it is
+    next to the kernels, or else a temporary folder, with a warning.
     """
     import numba
     from numba.core.registry import cpu_target
@@ -161,13 +154,20 @@ def cache_folder() -> Path:
     for source in sources():
         code.update(source.read_bytes())
     name = f"kernels-{code.hexdigest()[:32]}"
-    cache = Path(numba.config.CACHE_DIR or user_cache())
-    for folder in (cache / name, beside / name):
+    places = [beside / name]
+    with suppress(RuntimeError):  # the user has no home
+        places.insert(0, Path(numba.config.CACHE_DIR or user_cache(), name))
+    for folder in places:
         with suppress(OSError):
             folder.mkdir(0o700, parents=True, exist_ok=True)
-            if _is_private(folder):
-                os.utime(folder)  # marks it as in use for forget_unused
+            if _is_private(folder) and (os.access(folder, os.W_OK) or all_compiled(folder)):
+                with suppress(OSError):
+                    os.utime(folder)  # marks it as in use for forget_unused
                 return folder
+    caution(
+        f"{places[0]}: this user cannot write there, or others can, so kernels are compiled in "
+        "every run. Set NUMBA_CACHE_DIR to a folder of this user."
+    )
     folder = Path(tempfile.mkdtemp(), name)
     folder.mkdir(0o700)
     atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
@@ -188,10 +188,10 @@ def modules() -> Mapping[str, str]:
 
 
 def _is_private(folder: Path) -> bool:
-    """Return whether only the user has access to a folder, and can write it."""
+    """Return whether only the user has access to a folder."""
     status = folder.lstat()
     private = os.name == "nt" or (status.st_uid == os.getuid() and not status.st_mode & 0o077)
-    return stat.S_ISDIR(status.st_mode) and private and os.access(folder, os.W_OK)
+    return stat.S_ISDIR(status.st_mode) and private
 
 
 def load(names: Sequence[str]) -> None:
@@ -199,26 +199,28 @@ def load(names: Sequence[str]) -> None:
 
     If a child died, this process compiles the rest.
     """
+    late = time.monotonic() + _PATIENCE_S
     for done, name in enumerate(names, start=1):
         while not _is_done(name) and any(child.poll() is None for child in compile_ahead()):
             time.sleep(0.05)
+            if time.monotonic() > late:
+                late += _PATIENCE_S
+                caution(
+                    f"{cache_folder()}: kernels are not compiled yet. If no other run compiles "
+                    "them, delete the files *.lock there."
+                )
         import_module(modules().get(name, name))
         report(done, len(names))
 
 
-def compile_all() -> None:
-    """Compile all kernels of a run that are not cached."""
-    load([name for row in ROWS for name in row])
+def all_compiled(folder: Path | None = None) -> bool:
+    """Return whether all kernels of a run are cached, by default in :func:`cache_folder`."""
+    return all(_is_done(name, folder) for row in ROWS for name in row)
 
 
-def all_compiled() -> bool:
-    """Return whether all kernels of a run are cached."""
-    return all(_is_done(name) for row in ROWS for name in row)
-
-
-def _is_done(name: str) -> bool:
+def _is_done(name: str, folder: Path | None = None) -> bool:
     """Return whether a child has completely compiled a module."""
-    return (cache_folder() / f"{name}.done").exists()
+    return Path(folder or cache_folder(), f"{name}.done").exists()
 
 
 @cache
@@ -246,7 +248,7 @@ def compile_ahead() -> "tuple[subprocess.Popen[bytes], ...]":
 
 
 def _child(row: int) -> None:
-    """Compile a row of modules, at low priority."""
+    """Compile a row of modules, at low priority, unless another process compiles it."""
     from filelock import FileLock
 
     def end_with_parent() -> None:
@@ -255,15 +257,19 @@ def _child(row: int) -> None:
 
     threading.Thread(target=end_with_parent, daemon=True).start()
     with suppress(AttributeError, OSError):  # not on Windows
-        os.nice(_NICENESS)
+        os.nice(10)  # the run itself has priority
     folder = cache_folder()
-    with FileLock(folder / f"{row}.lock"):
-        if not all(map(_is_done, ROWS[row])):
-            # Never load other processes' code: code depends on the modules compiled before.
-            _cache_class().load_overload = lambda *_: None  # type: ignore[attr-defined]
-            for name in ROWS[row]:
-                import_module(modules().get(name, name))
-                (folder / f"{name}.done").touch()
+    lock = FileLock(folder / f"{row}.lock", timeout=_PATIENCE_S)
+    # After a timeout, or on a disk without locks, both compile: numba replaces files as a whole.
+    with suppress(OSError, NotImplementedError):
+        lock.acquire()
+    if not all(map(_is_done, ROWS[row])):
+        # Never load other processes' code: code depends on the modules compiled before.
+        _cache_class().load_overload = lambda *_: None  # type: ignore[attr-defined]
+        for name in ROWS[row]:
+            import_module(modules().get(name, name))
+            (folder / f"{name}.done").touch()
+    lock.release()
     forget_unused(folder.parent)
     os._exit(0)
 

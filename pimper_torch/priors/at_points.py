@@ -95,9 +95,7 @@ def reoriented_vectors(
     return transposed * torch.cat([*signs, torch.ones_like(signs[0])], dim=-1)
 
 
-def _flips(
-    tag: Int[Tensor, "*pixel"],
-) -> tuple[Bool[Tensor, "*pixel"], Bool[Tensor, "*pixel"]]:
+def _flips(tag: Int[Tensor, "*pixel"]) -> tuple[Bool[Tensor, "*pixel"], Bool[Tensor, "*pixel"]]:
     """Return whether EXIF flips left and right, and top and bottom, after transposing."""
     return (tag % 4 == 2) | (tag % 4 == 3), (tag == 3) | (tag == 4) | (tag >= 7)
 

@@ -115,13 +115,7 @@ def _simplest(where: str, best: int, medians: Tensor, scores: Tensor) -> tuple[i
 
 
 def _doubt_contradicted(
-    where: str,
-    stated: int,
-    gauge: int,
-    best: int,
-    medians: Tensor,
-    scores: Tensor,
-    trained: bool,
+    where: str, stated: int, gauge: int, best: int, medians: Tensor, scores: Tensor, trained: bool
 ) -> None:
     """Doubt the stated reading and gauge if different ones fit far better."""
     if clearly_better(scores[best, -1], scores[stated, -1]):
@@ -245,10 +239,8 @@ def _fit_lines(
         Factor and offset of each map; NaN where too few points determine them.
     """
     lines = values.new_full((count, 2), torch.nan)
-    for index in torch.unique(maps).tolist():
+    for index in (torch.bincount(maps) >= _MIN_POINTS).nonzero()[:, 0].tolist():
         x, y = values[maps == index], truth[maps == index]
-        if len(x) < _MIN_POINTS:
-            continue
         weight = torch.ones_like(y)
         for _ in range(_STEPS):
             weight = weight / weight.sum()

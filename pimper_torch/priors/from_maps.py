@@ -42,11 +42,7 @@ class Maps(NamedTuple):
     @property
     def about(self) -> dict[str, Any]:
         """Fields that all kinds of priors share."""
-        return {
-            "names": self.names,
-            "sizes_px": self.sizes_px,
-            "undistorted": self.undistorted,
-        }
+        return {"names": self.names, "sizes_px": self.sizes_px, "undistorted": self.undistorted}
 
 
 def padded(maps: Mapping[str, tuple[Tensor, Tensor | None]], undistorted: bool = False) -> Maps:
@@ -73,10 +69,15 @@ def padded(maps: Mapping[str, tuple[Tensor, Tensor | None]], undistorted: bool =
 def normals_from(
     maps: Maps, axes: NormalAxes = "auto", *, error_deg: float = NORMALS_ERROR_DEG
 ) -> NormalPrior:
-    """Return a prior of normals; maps without negative values contain ``(n + 1) / 2``."""
+    """Return a prior of normals; nonnegative maps contain ``(n + 1) / 2`` if more are unit then."""
     require(0 < error_deg <= 180, "error_deg", error_deg, "above 0, at most 180 degrees")
-    encoded = ~(maps.values < 0).flatten(1).any(dim=1)
-    values = torch.where(encoded[:, None, None, None], 2 * maps.values - 1, maps.values)
+    decoded = 2 * maps.values - 1
+    unit, unit_decoded = (
+        ((vectors.norm(dim=-1) - 1).abs() < 0.05).flatten(1).sum(dim=1)  # 8 bits: 0.01
+        for vectors in (maps.values, decoded)
+    )
+    encoded = ~(maps.values < 0).flatten(1).any(dim=1) & (unit_decoded >= unit)
+    values = torch.where(encoded[:, None, None, None], decoded, maps.values)
     length = values.norm(dim=-1)
     valid = (length > _SHORTEST) & (length < _LONGEST)
     return NormalPrior(
@@ -105,9 +106,7 @@ def depth_from(
     if inverse is None or gauge == "affine":
         # Quantiles, as the ends of a map's range may be outliers.
         spans = [
-            float(np.diff(np.quantile(layer[mask].cpu().numpy(), (0.02, 0.98)))[0])
-            if mask.any()
-            else 0.0
+            np.ptp(np.quantile(layer[mask].cpu().numpy(), (0.02, 0.98))) if mask.any() else 0.0
             for layer, mask in zip(values.detach(), valid, strict=True)
         ]
         deviation = (error * values.new_tensor(spans)[:, None, None]).expand_as(values)

@@ -52,6 +52,7 @@ _POINTS, _NEIGHBOURS, _RIM, _INSIDE = 600, 8, 64, 2.0
 # Least mean score. True normals of rendered scenes (potatoes, jar, balls, mug, 12 of 160x120) have
 # 0.66 to 0.83, with 30 degrees of noise 0.31 to 0.70; normals in a different world 0.10 at most.
 _LEAST = 0.2
+_MIXED_UP = "Photographs and maps may be mixed up."
 _BGR = "red and blue exchanged, as in images that OpenCV writes"
 
 
@@ -98,43 +99,41 @@ def resolve_normal_conventions(
     scores = _scores(bare, valid)
     means = scores.mean(dim=1) if scores.shape[1] else scores.new_zeros(len(_READINGS))
     best = int(means.argmax())
-
+    fits = float(means[best]) >= _LEAST
     trained = prior.normals.requires_grad and prior.axes is not None
 
     def contradicted(found: str, remedy: str) -> None:
         doubt(f"{where} {found}, as cloud, outlines and cameras show. {remedy}", trained)
 
-    if _in_other_world(bare, valid) and means[best] < _LEAST:
+    if _in_other_world(bare, valid) and not fits:
         remedy = "Give camera normals, or the cameras of that world with `--sparse`."
         contradicted("are consistent, but in a different world frame", remedy)
     if change := _better_change(bare, samples, scene, best):
         if change == _BGR and not trained:
             caution(f"{where} have {_BGR}; this is corrected.", stacklevel=4)
-            return resolve_normal_conventions(
-                prior.replace(normals=prior.normals.flip(-1)), scene, silhouettes
-            )
+            exchanged = prior.replace(normals=prior.normals.flip(-1))
+            return resolve_normal_conventions(exchanged, scene, silhouettes)
         contradicted(f"are {change}", "Orient maps and vectors like the photographs.")
     index = int(means[: _WORLD + 1].argmax())
     if prior.axes:
         index = _WORLD if prior.frame == "world" else list(AXES).index(prior.axes)
     if clearly_better(scores[best], scores[index]):
         given = f"given as {_MEANINGS[index]}" if prior.axes else "as no known network writes them"
-        contradicted(f"are {_MEANINGS[best]}, {given}", "State `axes`, or convert them.")
-    if prior.axes is None:
-        _announce(where, index, scores, means)
-    elif trained and scores.shape[1] and float(means[index]) < _LEAST:
+        remedy = "State `axes`, or convert them." if best <= _WORLD else "Convert them."
+        contradicted(f"are {_MEANINGS[best]}, {given}", remedy if fits else _MIXED_UP)
+    poor = scores.shape[1] > 0 and float(means[index]) < _LEAST
+    if poor and trained:
         contradicted("hardly fit", "")
-    elif scores.shape[1] and float(means[index]) < _LEAST:
-        caution(
-            f"{where} hardly fit cloud, outlines and cameras, to {float(means[index]):.2f} of 1. "
-            "Photographs and maps may be mixed up.",
-            stacklevel=4,
-        )
+    elif poor and not prior.normals.requires_grad:
+        hardly = f"{where} hardly fit cloud, outlines and cameras, to {means[index]:.2f} of 1"
+        if prior.axes is None:
+            raise InputError(f"{hardly}, in any axes. {_MIXED_UP}")
+        caution(f"{hardly}. {_MIXED_UP}", stacklevel=4)
+    elif prior.axes is None:
+        _announce(where, index, scores, means)
     signs = _READINGS[_MEANINGS[index]]
-    if signs is None:
-        return prior.replace(frame="world", axes="opencv")
-    normals = prior.normals * prior.normals.new_tensor(signs)
-    return prior.replace(normals=normals, frame="camera", axes="opencv")
+    normals = prior.normals * prior.normals.new_tensor(signs) if signs else prior.normals
+    return prior.replace(normals=normals, frame="camera" if signs else "world", axes="opencv")
 
 
 def _better_change(prior: NormalPrior, samples: _Samples, scene: SparseScene, best: int) -> str:

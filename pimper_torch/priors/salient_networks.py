@@ -45,7 +45,7 @@ def network_identity(network: str) -> str:
     """Return a text that is different for networks with different results."""
     path = network_file(network)
     if path is None:
-        return f"rembg {version('rembg')} {_name_of(network)}"
+        return f"rembg {version('rembg')} {_session_class(network).name()}"
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -70,10 +70,6 @@ def rembg_session(network: str) -> Any:  # noqa: ANN401 - a class of rembg
         ) from error
 
 
-def _name_of(network: str) -> str:
-    return DEFAULT if network == "rembg" else network
-
-
 def _session_class(network: str) -> Any:  # noqa: ANN401 - a class of rembg
     # Without onnxruntime, importing rembg ends the program.
     if find_spec("rembg") is None or find_spec("onnxruntime") is None:
@@ -89,6 +85,6 @@ def _session_class(network: str) -> Any:  # noqa: ANN401 - a class of rembg
         for name, session in sessions.items()
         if session.is_local() and name not in _OTHERS
     }
-    names = ", ".join(sorted(usable))
-    require(_name_of(network) in usable, "segmenter", network, f"an ONNX file, or one of {names}")
-    return usable[_name_of(network)]
+    name, names = DEFAULT if network == "rembg" else network, ", ".join(sorted(usable))
+    require(name in usable, "segmenter", network, f"an ONNX file, or one of {names}")
+    return usable[name]

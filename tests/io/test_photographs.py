@@ -64,7 +64,8 @@ def test_grey_photographs_have_one_channel_unless_one_is_coloured(photos, pixels
         save(photos / name, pixels[..., 0])
     assert load_views(photos).images.shape[1] == 1
     save(photos / "3.png", pixels)
-    images = load_views(photos).images
+    with pytest.warns(PimperWarning, match="grey photographs among coloured ones"):
+        images = load_views(photos).images
     assert images.shape[1] == 3
     assert torch.equal(images[0, 0], images[0, 2])
 
@@ -219,10 +220,23 @@ def test_one_photograph_much_larger_than_the_others_is_refused_or_shrunk(tmp_pat
 
 def test_padding_does_not_make_a_photograph_black(photos):
     dim = np.zeros((8, 12, 3), dtype=np.uint8)
-    dim[:2, :2] = 200
+    dim[:2, :2] = 200, 190, 180
     save(photos / "2.png", dim)
-    save(photos / "3.png", np.full((300, 300, 3), 99, dtype=np.uint8))
+    save(photos / "3.png", np.full((300, 300, 3), (99, 90, 80), dtype=np.uint8))
     assert load_views(photos).num_views == 4
+
+
+def test_a_grey_photograph_among_coloured_ones_is_named(tmp_path, pixels):
+    grey = np.asarray(Image.fromarray(pixels).convert("L"))
+    for name, image in (("1.png", pixels), ("2.png", grey), ("3.png", pixels)):
+        save(tmp_path / name, image)
+    with pytest.warns(PimperWarning, match=r"falsify the colours of albedo and light: 2\.png\. "):
+        load_views(tmp_path)
+    for name in ("1.png", "3.png"):
+        save(tmp_path / name, grey)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_views(tmp_path)
 
 
 def test_each_subfolder_has_the_photographs_of_one_pose(tmp_path, pixels):
@@ -243,7 +257,9 @@ def test_each_subfolder_has_the_photographs_of_one_pose(tmp_path, pixels):
         assert torch.equal(one_a_pose.masks, views.masks)
 
 
-@pytest.mark.parametrize("beside", ["masks", "Mask", "silhouettes", "normals", "depth"])
+@pytest.mark.parametrize(
+    "beside", ["masks", "Mask", "silhouettes", "normals", "depth", "object_masks", "jar mask"]
+)
 def test_a_subfolder_of_masks_or_maps_is_not_a_pose(tmp_path, pixels, beside):
     for pose in (1, 2, 3):
         save(tmp_path / f"pose_{pose}" / "1.png", pixels)
@@ -258,6 +274,14 @@ def test_a_subfolder_of_masks_or_maps_is_not_a_pose(tmp_path, pixels, beside):
     shutil.rmtree(tmp_path / "pose_3")
     with pytest.raises(InputError, match="no images"):
         load_views(tmp_path)
+
+
+def test_poses_of_a_mask_that_was_photographed_are_poses(tmp_path, pixels):
+    names = tuple(f"{pose}_mask/1.png" for pose in ("back", "front", "left"))
+    for name in names:
+        save(tmp_path / name, pixels)
+    with pytest.warns(PimperWarning, match="3 camera poses"):
+        assert load_views(tmp_path).names == names
 
 
 def test_two_subfolders_are_not_poses(tmp_path, pixels):

@@ -158,7 +158,7 @@ def test_fully_saturated_photographs_are_refused_and_nearly_so_give_a_warning(ph
         InputError, match=r"2\.png is completely saturated.*photographs\.saturation"
     ):
         load_views(photos)
-    array[0, :5] = 40
+    array[0, :5] = 40, 30, 20
     Image.fromarray(array).save(photos / "2.png")
     with pytest.warns(PimperWarning, match=r"nearly all .* saturated in 2\.png \(5\.2% usable\)"):
         views = load_views(photos)
@@ -168,7 +168,7 @@ def test_fully_saturated_photographs_are_refused_and_nearly_so_give_a_warning(ph
 def test_saturation_off_the_object_does_not_matter(photos, pixels, tmp_path):
     (tmp_path / "masks").mkdir()
     array = np.full_like(pixels, 255)
-    array[2:4, 3:5] = 90
+    array[2:4, 3:5] = 90, 80, 70
     drawn = np.zeros((8, 12), dtype=np.uint8)
     drawn[2:4, 3:5] = 255
     Image.fromarray(array).save(photos / "2.png")

@@ -3,6 +3,7 @@ import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from filelock import FileLock
@@ -21,6 +22,7 @@ from pimper_torch.kernels.compile import (
     load,
     sources,
 )
+from pimper_torch.runtime.errors import PimperWarning
 
 AHEAD = "from pimper_torch.kernels.compile import *; children = compile_ahead(); "
 
@@ -44,11 +46,12 @@ def test_compiled_functions_agree_with_python():
     assert halved(3.0) == 1.5
 
 
-def test_compile_all_keeps_torch_threads_and_leaves_nothing_to_compile():
+def test_loading_all_kernels_keeps_torch_threads_and_leaves_nothing_to_compile():
     code = (
         "import torch; torch.set_num_threads(2)\n"
-        "from pimper_torch.kernels.compile import compile_ahead, compile_all\n"
-        "compile_all(); assert torch.get_num_threads() == 2; assert not compile_ahead.__wrapped__()"
+        "from pimper_torch.kernels.compile import ROWS, compile_ahead, load\n"
+        "load(sum(ROWS, ())); assert torch.get_num_threads() == 2\n"
+        "assert not compile_ahead.__wrapped__()"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -172,7 +175,76 @@ def test_machine_code_is_only_read_from_folders_of_the_user(tmp_path, monkeypatc
     assert beside == tmp_path / "kernels" / "__pycache__" / folder.name
     beside.rmdir()
     beside.symlink_to(tmp_path)
-    assert tmp_path not in cache_folder.__wrapped__().parents
+    with pytest.warns(PimperWarning, match="compiled in every run. Set NUMBA_CACHE_DIR to"):
+        temporary = cache_folder.__wrapped__()
+    assert tmp_path not in temporary.parents
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such modes")
+def test_a_complete_folder_is_used_without_write_permission(tmp_path, monkeypatch):
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path / "kernels")])
+    folder = cache_folder.__wrapped__()
+    monkeypatch.setattr("os.access", lambda path, _: path != folder)
+    assert cache_folder.__wrapped__() == tmp_path / "kernels" / "__pycache__" / folder.name
+    for name in (name for row in ROWS for name in row):
+        (folder / f"{name}.done").touch()
+    assert cache_folder.__wrapped__() == folder
+
+
+def test_without_a_home_the_folder_next_to_the_kernels_is_used(tmp_path, monkeypatch):
+    def homeless() -> None:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    monkeypatch.setattr("pimper_torch.kernels.compile.user_cache", homeless)
+    monkeypatch.setattr("pimper_torch.kernels.__path__", [str(tmp_path / "kernels")])
+    assert cache_folder.__wrapped__().parent == tmp_path / "kernels" / "__pycache__"
+
+
+@pytest.mark.parametrize(
+    "lock",
+    [
+        "OSError(errno.ENOLCK, 'No locks available')",  # network disks
+        "OSError(errno.ENOTSUP, 'Operation not supported')",
+        "NotImplementedError('no flock')",  # earlier versions of filelock
+        "",  # held by a process that does not end
+    ],
+)
+def test_kernels_are_compiled_for_later_runs_without_locks(lock, fresh):
+    """The child then compiles without a lock; a finished kernel needs none."""
+    refuse = f"def refuse(*_): raise {lock}\nfilelock.FileLock.acquire = refuse\n" if lock else ""
+    code = (
+        "import errno, filelock, pimper_torch.kernels.compile as c\n"
+        f"{refuse}c.ROWS, c._PATIENCE_S = (('line_matches',),), 0.1\n"
+        "print(c.cache_folder(), flush=True); input(); c._child(0)"
+    )
+    with started(code) as child:
+        assert child.stdout is not None
+        assert child.stdin is not None
+        folder = child.stdout.readline().strip()
+        with FileLock(f"{folder}/0.lock"):
+            print(file=child.stdin, flush=True)
+            assert child.wait(timeout=300) == 0
+            loaded = (
+                "from pimper_torch.stages.sfm.kernels.line_matches import most_alike as kernel\n"
+                "print(*kernel.stats.cache_hits.values())"
+            )
+            assert subprocess.check_output([sys.executable, "-c", loaded]) == b"1\n"
+    assert Path(folder, "line_matches.done").exists()
+
+
+def test_a_long_wait_for_another_process_is_said(monkeypatch):
+    class Waiting:
+        states = iter([None, None, 1])
+
+        def poll(self) -> int | None:
+            return next(self.states)
+
+    monkeypatch.setattr("pimper_torch.kernels.compile._PATIENCE_S", 0.0)
+    monkeypatch.setattr("pimper_torch.kernels.compile.compile_ahead", lambda: (Waiting(),))
+    with pytest.warns(PimperWarning, match=r"not compiled yet.* delete the files \*\.lock there"):
+        load(("json",))
 
 
 def test_unused_folders_of_old_code_are_removed(tmp_path):

@@ -66,6 +66,18 @@ def test_normals_of_every_format_are_read(file, tolerance, views, normals, tmp_p
     found.check("test")
 
 
+def test_world_normals_without_a_negative_component_are_not_decoded(views, tmp_path):
+    """A box seen from one corner; its coded map looks the same to a test of signs."""
+    sides = np.eye(3, dtype=np.float32)[np.random.default_rng(4).integers(3, size=(24, 32))]
+    sides[0] = 0  # unknown
+    for values in (sides, (sides + 1) / 2, 127.5 * (sides + 1)):
+        np.save(tmp_path / "a b.npy", values, allow_pickle=False)
+        found = read_normals(tmp_path, views, "world")
+        assert_close(found.normals[0], torch.from_numpy(sides))
+        assert found.variance[0, 0].isinf().all()
+        assert found.variance[0, 1:].isfinite().all()
+
+
 def test_eight_bits_and_arrays_in_unit_range_are_decoded(views, normals, tmp_path):
     normals = normals[:, :24]
     Image.fromarray(np.rint(255 * (normals + 1) / 2).astype(np.uint8)).save(tmp_path / "cup_1.png")
@@ -150,6 +162,9 @@ def depth_with(none, *, dtype=np.float32, near=1000, far=9000):
         (65535, np.uint16, "65535"),
         (65535, np.int32, "65535"),
         (1e10, np.float32, r"1e\+10"),
+        (20_000, np.float32, "20000"),
+        (17_001, np.uint16, "17001"),
+        (-9999, np.float32, "-9999"),
         (np.inf, np.float32, "inf"),
         (np.array([65504, np.inf] * 16), np.float32, "65504, inf"),
     ],
@@ -173,6 +188,31 @@ def test_full_scale_values_of_a_gradual_map_are_depth(views, tmp_path):
     found = read_depth(tmp_path, views)
     assert found.variance.isfinite()[0].all()
     assert_close(found.depth[0] * 65535, torch.from_numpy(levels.astype(np.float32)))
+
+
+@pytest.mark.parametrize(
+    ("far", "near", "dtype"),
+    [
+        (16_900, 9000, np.float32),  # a wall, as far behind the rest as this extends
+        (9000, 9000, np.float32),  # the same, touching it
+        (255, 180, np.uint8),
+        ([20_000] + [9000] * 31, 9000, np.float32),  # one pixel
+    ],
+)
+def test_a_largest_depth_near_others_or_of_one_pixel_is_depth(far, near, dtype, views, tmp_path):
+    levels = depth_with(far, dtype=dtype, near=min(1000, near / 2), far=near)
+    np.save(tmp_path / "a b.npy", levels, allow_pickle=False)
+    found = read_depth(tmp_path, views)
+    assert found.variance.isfinite()[0].all()
+
+
+def test_a_far_plane_of_inverse_depth_is_missing(views, tmp_path):
+    inverse = 1 / depth_with(1e6, near=2, far=3)
+    np.save(tmp_path / "a b.npy", inverse, allow_pickle=False)
+    with pytest.warns(PimperWarning, match=": 32 pixels contain 1e-06, which is treated"):
+        found = read_depth(tmp_path, views, inverse=True)
+    assert found.variance[0, 0].isinf().all()
+    assert found.variance[0, 1:].isfinite().all()
 
 
 def test_depth_in_levels_of_sixteen_bits_is_up_to_its_scale(views, tmp_path):
@@ -299,7 +339,6 @@ COLOURED = np.where(LABELS[..., None] > 2, [1.0, -1, -1], [-1, 1, 1])
         (read_normals, "a b.txt", ONES, r"contains no maps; needed: files ending in .npz"),
         (read_depth, "a b.npy", 0 * ONES[..., 0], "a b.jpg contain no usable values"),
         (read_depth, "a b.png", ONES * [1, 0, -1], "has colours; needed: one value per pixel"),
-        (read_normals, "a b.npy", 127.5 * (ONES + 1), "from 0 to 255; .* Divide the values by 255"),
         (read_normals, "a b.npy", LABELS, "one value per pixel; .* Are they labels"),
         (read_depth, "a b.npy", LABELS, "has integers below 32, which are labels; needed: depth"),
         (read_depth, "a b.npy", LABELS.astype(np.int64), "integers below 32, which are labels"),

@@ -366,8 +366,19 @@ def test_normals_unrelated_to_the_scene_give_a_warning_or_error(rendered):
     normals = normalize(random.movedim(1, -1), dim=-1)
     with pytest.warns(PimperWarning, match="hardly fit cloud, outlines and cameras, to 0.0"):
         settle(rendered.scene, of_normals(rendered.scene, normals))
-    with pytest.raises(InputError, match=r"the scene does not show if they .* State `axes`"):
+    with pytest.raises(InputError, match=r"hardly fit .* of 1, in any axes. .* mixed up.$"):
         settle(rendered.scene, of_normals(rendered.scene, normals, axes=None))
+
+
+def test_the_advice_to_state_axes_is_given_where_they_can_be_stated(rendered):
+    for given, end in (
+        ((1, -1, -1), "State `axes`, or convert them."),
+        ((-1, 1, 1), "Convert them."),
+    ):
+        written = rendered.camera * torch.tensor(given)
+        with pytest.raises(InputError) as refused:
+            settle(rendered.scene, of_normals(rendered.scene, written))
+        assert str(refused.value).endswith(f"show. {end}")
 
 
 @pytest.mark.parametrize("given", ["lub", "world", "mirrored", "exchanged", "random"])

@@ -23,6 +23,8 @@ from pimper_bench.metrics.evaluation import (
     evaluate,
 )
 from pimper_bench.metrics.figure_rows import report, rows
+from pimper_bench.metrics.other_poses import warn_of_other_poses
+from pimper_bench.metrics.similarity import transfer
 from pimper_bench.metrics.surface_distances import true_surface
 from pimper_bench.truth import Capture, DtuProtocol, Truth
 from pimper_torch.cli.arguments import Flag, read_arguments
@@ -79,6 +81,9 @@ def run(job: EvaluateJob, output: Output) -> None:
     estimate = read_estimate(job.result)
     capture, maps, protocol = read_truth(job, estimate, config)
     evaluation = evaluate(estimate, capture, config, maps=maps, dtu=protocol)
+    if evaluation.surface is not None:
+        moved = transfer(estimate.mesh, evaluation.alignment.truth_from_world)
+        warn_of_other_poses(moved, capture, config.seen_from)
     relighting = read_relighting(job.result)
     if not output.as_json:
         show(evaluation, Console(), relighting)

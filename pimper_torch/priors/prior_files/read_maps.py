@@ -26,9 +26,10 @@ def read_normals(
     """Read normals of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
 
     A map has the name of its photograph, with words that networks append, its aspect ratio, and any
-    size. PNG and arrays without a negative value contain ``(n + 1) / 2``. Vectors far from unit
-    length, and NaN, are unknown. ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, is the mean
-    squared angular error in squared radians.
+    size. PNG and arrays without a negative value contain ``(n + 1) / 2``, up to 1 or 255, except if
+    vectors have unit length without decoding. Vectors far from unit length, and NaN, are unknown.
+    ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, is the mean squared angular error in
+    squared radians.
 
     Args:
         axes: Of the normals: ``opencv`` (Metric3D, Omnidata, MoGe's arrays), ``opengl`` (Marigold,
@@ -46,13 +47,9 @@ def _vectors(path: Path, layer: Layer) -> np.ndarray:
     if values.shape[2] != 3:
         guess = "Are they labels?" if layer.labelled else "Is it depth?"
         raise InputError(f"{path}: has one value per pixel; needed: normals, with three. {guess}")
-    low, high = float(np.nanmin(values, initial=0)), float(np.nanmax(values, initial=0))
-    if low >= 0 and 127.5 < high <= 255:  # at least one component is positive
-        raise InputError(
-            f"{path}: contains values from {low:g} to {high:g}; needed: unit normals, or "
-            "(n + 1) / 2 from 0 to 1. Divide the values by 255, or write 8-bit integers."
-        )
-    return values
+    low, high = np.nanmin(values, initial=0), np.nanmax(values, initial=0)
+    # Of 8 bits as floating point; at least one component is positive.
+    return values / np.float32(255) if low >= 0 and 127.5 < high <= 255 else values
 
 
 def read_depth(
@@ -68,10 +65,10 @@ def read_depth(
     """Read depth of photographs from a folder: PNG of 8 or 16 bits, EXR, NPZ or NPY.
 
     A map has the name of its photograph, with words that networks append, its aspect ratio, and any
-    size. 0, NaN, infinity, 1e10, and 65504 and 65535 far from other values are unknown, with a
-    warning that counts them (except 0 and NaN). PNG values are fractions of full scale, MoGe's in
-    metres (text ``near`` and ``far``). ``NAME_variance.npy``, or ``variance`` in NPZ and EXR, has
-    squared units.
+    size. 0 and NaN are unknown; so are, with a warning that counts them, infinity and a far plane:
+    the largest or smallest value if many pixels have it, far from other values. PNG values are
+    fractions of full scale, MoGe's in metres (text ``near`` and ``far``). ``NAME_variance.npy``, or
+    ``variance`` in NPZ and EXR, has squared units.
 
     Args:
         inverse: Whether maps contain inverse depth (disparity: Depth Anything 2, MiDaS); ``None``
@@ -92,14 +89,8 @@ def read_depth(
             raise InputError(
                 f"{path}: has integers below {LABELS}, which are labels; needed: depth."
             )
+        missing = np.isinf(values) | (values == _far_plane(values))
         levels = values * (layer.full or 1)
-        # Programs write missing depth as infinity, 1e10, or the largest half-precision number or
-        # 16-bit integer. The last two count as depth if other values are within a tenth of them (a
-        # choice), as in a map that was stretched to full scale.
-        missing = np.isinf(levels) | (levels >= 1e10)
-        for marker in (65504, 65535):
-            if not ((levels > 0.9 * marker) & (levels != marker) & ~missing).any():
-                missing |= levels == marker
         for marker, count in zip(*np.unique(levels[missing], return_counts=True), strict=True):
             markers[f"{marker:g}"] += int(count)
         return np.where(missing, np.float32(np.nan), values)
@@ -112,3 +103,18 @@ def read_depth(
             stacklevel=2,
         )
     return from_maps.depth_from(maps, inverse, along=along, gauge=gauge, error=error)
+
+
+def _far_plane(values: np.ndarray) -> float:
+    """Return the depth, or inverse depth, that a program wrote where it has none; else NaN.
+
+    More than a thousandth of the pixels have it, and it is farther from all other values than these
+    are from each other: a choice. Walls are nearer to what is in front of them, or vary in depth.
+    """
+    depths = values[np.isfinite(values) & (values != 0)]
+    for end in (depths.max(), depths.min()) if depths.size else ():
+        others = depths[depths != end]
+        many = len(depths) - len(others) > max(1, values.size / 1000)
+        if many and len(others) and np.abs(others - end).min() > np.ptp(others):
+            return float(end)
+    return np.nan

@@ -33,8 +33,9 @@ def rendering(tmp_path_factory):
 def test_a_mesh_is_measured_against_a_mesh(ball, tmp_path, capsys):
     larger = write_ball(tmp_path / "larger.ply", 1.1)
     assert run(larger, ball, "--samples", 3000) == 0
-    printed = capsys.readouterr().out
+    printed, said = capsys.readouterr()
     assert "none: the frames are assumed to be the same" in printed
+    assert "different frame: turned by 0 degrees, and 1.1 times as large" in " ".join(said.split())
     # Facets of a ball of 1280 faces lie a little under it.
     (line,) = [line for line in printed.splitlines() if line.split()[:1] == ["accuracy"]]
     assert float(line.split()[1]) == pytest.approx(0.1, rel=0.03)
