@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import Distortion, PosedCamera, polynomial_lens
+from pimper_torch.io.cameras.posed_camera import Distortion, PosedCamera, opencv_lens
 from pimper_torch.records import CameraModel
 from pimper_torch.records.shapes import Pose
 from pimper_torch.runtime.errors import some
@@ -131,4 +131,4 @@ def _distortion(entry: Mapping[str, object], file: DataSetPath) -> Distortion:
     if name in _NONE:
         return "PINHOLE", ()
     k1, k2, k3, t1, t2 = (*values, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-    return polynomial_lens(k1, k2, t1, t2, k3)
+    return opencv_lens(k1, k2, t1, t2, k3)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import PosedCamera, polynomial_lens
+from pimper_torch.io.cameras.posed_camera import PosedCamera, opencv_lens
 from pimper_torch.records import CameraModel
 from pimper_torch.runtime.errors import InputError, caution, some
 
@@ -165,7 +165,7 @@ def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[
     p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))
     pinhole = (f + b1, f, width / 2 + value("cx"), height / 2 + value("cy"))
     kind = calibration.get("type") or sensor.get("type") or "frame"
-    model, params = polynomial_lens(k1, k2, p2, p1, k3)
+    model, params = opencv_lens(k1, k2, p2, p1, k3)
     supported = kind == "frame" and not any((k4, p3, p4)) and not (b2 and params)
     if kind == "fisheye":
         model, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)

@@ -46,9 +46,13 @@ def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
     ]
 
 
-def polynomial_lens(k1: float, k2: float, p1: float, p2: float, k3: float) -> Distortion:
-    """Return COLMAP's model of an OpenCV distortion; ``PINHOLE`` if all parameters are 0."""
-    params = (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+def opencv_lens(k1: float, k2: float, p1: float, p2: float, *others: float) -> Distortion:
+    """Return COLMAP's model of an OpenCV distortion; ``PINHOLE`` if all parameters are 0.
+
+    Args:
+        others: ``k3`` to ``k6``, of which the last ones may be missing.
+    """
+    params = (k1, k2, p1, p2, *others, *[0.0] * (4 - len(others)))
     return ("FULL_OPENCV", params) if any(params) else ("PINHOLE", ())
 
 

@@ -15,7 +15,7 @@ from pimper_torch.io.cameras.posed_camera import (
     PosedCamera,
     SizesOf,
     number_lenses,
-    polynomial_lens,
+    opencv_lens,
 )
 from pimper_torch.records import CameraModel
 from pimper_torch.records.shapes import Points
@@ -26,7 +26,7 @@ KIND = "a transforms.json set"
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64, device="cpu")
 """Converts OpenGL's camera axes, with y up and the view along -z."""
 
-_POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+_OPENCV = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 
 def has_frames(path: Path) -> bool:
@@ -51,7 +51,7 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
     ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
     The focal length is ``fl_x``, ``fl_y`` in pixels, or follows from ``camera_angle_x``; the
     principal point ``cx``, ``cy`` is the centre of the image unless given. All of these, and
-    ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may be in the file
+    ``w``, ``h``, ``k1`` to ``k6``, ``p1``, ``p2`` and ``camera_model``, may be in the file
     or in a frame. instant-ngp and nerfstudio use COLMAP's values and cast rays through
     x + 0.5 (nerfstudio, "Data conventions" and ``Cameras.get_image_coords``), and Blender's
     centre is that of the image's area: their pixel coordinates are ours.
@@ -152,12 +152,14 @@ def _lens(
     file.expect(focal > 0 or focal_y > 0, needed, "neither, or none above 0")
     fx, fy = focal or focal_y, focal_y or focal
     pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
-    k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k1, k2, *others = (value(f"k{number}") for number in range(1, 7))
     model = str(frame.get("camera_model") or "OPENCV")
     fisheye = model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True
-    file.expect(fisheye or model in _POLYNOMIAL, f"a camera_model of {_POLYNOMIAL}", model)
-    file.expect(fisheye or k4 == 0, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
-    kind, params = polynomial_lens(k1, k2, p1, p2, k3)
+    file.expect(fisheye or model in _OPENCV, f"a camera_model of {_OPENCV}", model)
+    last = 4 if fisheye else 6 if model == "FULL_OPENCV" else 3
+    needed = f"k{last + 1} = 0 for {name}, or a model that has it (OPENCV_FISHEYE, FULL_OPENCV)"
+    file.expect(not any(others[last - 2 :]), needed, f"k3 to k6 = {others}, camera_model {model}")
+    kind, params = opencv_lens(k1, k2, value("p1"), value("p2"), *others)
     if fisheye:
-        kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
+        kind, params = "OPENCV_FISHEYE", (k1, k2, *others[:2])
     return CameraModel(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)
