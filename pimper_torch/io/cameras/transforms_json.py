@@ -1,7 +1,7 @@
 """Cameras of NeRF's ``transforms.json``, as written by Blender, instant-ngp and nerfstudio."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -11,12 +11,7 @@ import torch
 
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import (
-    PosedCamera,
-    SizesOf,
-    number_lenses,
-    opencv_lens,
-)
+from pimper_torch.io.cameras.posed_camera import PosedCamera, SizesOf, number_lenses, opencv_lens
 from pimper_torch.records import CameraModel
 from pimper_torch.records.shapes import Points
 from pimper_torch.runtime.errors import InputError, caution
@@ -27,11 +22,6 @@ FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64, device="cpu")
 """Converts OpenGL's camera axes, with y up and the view along -z."""
 
 _OPENCV = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
-
-
-def has_frames(path: Path) -> bool:
-    """Return whether a JSON file has frames, which identify this format."""
-    return "frames" in DataSetPath(path, "a camera file").read_json()
 
 
 def read_frames(path: Path) -> list[dict[str, object]]:
@@ -45,7 +35,7 @@ def read_frames(path: Path) -> list[dict[str, object]]:
     return frames
 
 
-def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
+def read_nerf(path: Path, _: object, sizes_of: SizesOf) -> list[PosedCamera]:
     """Read the cameras; sizes that the file lacks are those of the photographs.
 
     ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
@@ -62,12 +52,18 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
     Returns:
         In the order of the file; without frames of unknown size.
     """
-    frames = read_frames(path)
+    return cameras_of_frames(read_frames(path), DataSetPath(path, KIND), sizes_of)
+
+
+def cameras_of_frames(
+    frames: Sequence[Mapping[str, object]], file: DataSetPath, sizes_of: SizesOf = lambda _: ()
+) -> list[PosedCamera]:
+    """Return the cameras of frames, as :func:`read_nerf`."""
     names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]
     sizes = [_stated_size(frame) for frame in frames]
     photograph_sizes = sizes if all(sizes) else sizes_of(names)
     cameras = [
-        _camera(frame, name, size, DataSetPath(path, KIND))
+        _camera(frame, name, size, file)
         for frame, name, *options in zip(frames, names, sizes, photograph_sizes, strict=True)
         if (size := options[0] or options[1])
     ]
@@ -159,7 +155,7 @@ def _lens(
     last = 4 if fisheye else 6 if model == "FULL_OPENCV" else 3
     needed = f"k{last + 1} = 0 for {name}, or a model that has it (OPENCV_FISHEYE, FULL_OPENCV)"
     file.expect(not any(others[last - 2 :]), needed, f"k3 to k6 = {others}, camera_model {model}")
-    kind, params = opencv_lens(k1, k2, value("p1"), value("p2"), *others)
     if fisheye:
-        kind, params = "OPENCV_FISHEYE", (k1, k2, *others[:2])
-    return CameraModel(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)
+        terms = (k1, k2, *others[:2])
+        return opencv_lens(size_px, pinhole).replace(model="OPENCV_FISHEYE", params=pinhole + terms)
+    return opencv_lens(size_px, pinhole, (k1, k2, value("p1"), value("p2"), *others))
