@@ -31,12 +31,12 @@ from fleet_captures import MESHES, SUBSET, fleet, rendered
 from silhouettes import known_masks, overlaps
 
 from pimper_bench.datasets import read_rendered
+from pimper_bench.metrics.estimates import read_estimate
 from pimper_bench.metrics.in_view import compare_along_rays
 from pimper_bench.metrics.similarity import align_estimate, transfer
 from pimper_bench.metrics.surface_distances import TrueSurface
 from pimper_torch.chains.prepare import locate
 from pimper_torch.export.result_folder.marker import STAGES
-from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.photographs import load_views
 from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.records.sparse_model import SparseModel

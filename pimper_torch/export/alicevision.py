@@ -54,7 +54,7 @@ def write_alicevision(result: Result, folder: Path) -> None:
 def write_sfm(cameras: Cameras, paths: Sequence[str], file: Path | str) -> None:
     """Write pinhole cameras as SfMData in JSON, with numbers as texts.
 
-    See :func:`~pimper_torch.io.cameras.meshroom_sfm.read_meshroom_cameras` for its
+    See :func:`~pimper_torch.io.cameras.meshroom_sfm.read_meshroom` for its
     conventions.
 
     Args:

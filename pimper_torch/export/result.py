@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
@@ -15,7 +15,6 @@ from pimper_torch.geometry.local_frame import Offset, local_origin, to_local
 from pimper_torch.geometry.undistortion import pinholes_for
 from pimper_torch.io.cameras.layout import DataSetPath
 from pimper_torch.io.cameras.model_files import read_model
-from pimper_torch.io.estimates import mask_path, read_lights, read_reference
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.photograph_files import image_name, list_images
 from pimper_torch.io.photographs import load_views, read_mask
@@ -24,6 +23,7 @@ from pimper_torch.records import Cameras, Mesh, Record, Silhouettes, SparseScene
 from pimper_torch.records.sparse_model import SparseModel
 from pimper_torch.runtime.config import build, read_mapping
 from pimper_torch.runtime.errors import InputError, PimperWarning, caution, some
+from pimper_torch.runtime.numpy_files import read_npz
 from pimper_torch.runtime.torch_settings import isolated
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 from pimper_torch.viz.cells import lit_cell
@@ -241,3 +241,42 @@ def _silhouettes(
         reliable=torch.tensor([name not in unreliable for name in views.names]),
         source="masks" if given or summary.get("masks") else "found",
     )
+
+
+def read_lights(path: Path | str, names: tuple[str, ...]) -> Float[Tensor, "view 4"] | None:
+    """Read the light of every named view; NaN if the file lacks it.
+
+    Returns:
+        ``None`` without such a file, without views, or without lights.
+    """
+    file = DataSetPath(Path(path), _KIND)
+    if not file.path.is_file() or not names:
+        return None
+    views = file.objects(file.read_json().get("views"), "views")
+    light_of = {str(view.get("name")): view.get("light") for view in views}
+    unknown = torch.full((4,), torch.nan, dtype=torch.float64)
+    rows = [
+        file.numbers(light_of[name], 4, f"light of {name}") if light_of.get(name) else unknown
+        for name in names
+    ]
+    lights = torch.stack(rows)
+    return lights if bool(lights.isfinite().any()) else None
+
+
+def read_reference(path: Path | str) -> str | None:
+    """Read the name of the reference view; ``None`` without such a file."""
+    file = DataSetPath(Path(path), _KIND)
+    if not file.path.is_file():
+        return None
+    arrays = file.read(lambda path: read_npz(path, lambda name: name == "name"), "an archive")
+    return str(arrays["name"]) if "name" in arrays else None
+
+
+def mask_path(folder: Path | str, name: str) -> Path:
+    """Return the path of the mask of a photograph, by its name and always inside the folder.
+
+    >>> mask_path(Path("masks"), "pose_03/../light_02.jpg").as_posix()
+    'masks/pose_03/light_02.png'
+    """
+    parts = PurePosixPath(name.replace("\\", "_")).with_suffix(".png").parts
+    return Path(folder).joinpath(*(part for part in parts if part not in ("/", "..")))

@@ -15,6 +15,7 @@ from pimper_torch.chains.coarse_to_fine import CoarseToFine
 from pimper_torch.export import reports
 from pimper_torch.export.picture_files import write_mask
 from pimper_torch.export.pictures import Pictures, completed, drawn
+from pimper_torch.export.result import mask_path, read_lights
 from pimper_torch.export.result_folder.folders import written_whole
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.geometry.pinholes import up_world
@@ -22,7 +23,6 @@ from pimper_torch.io.assets.mesh_files import MeshFiles as MeshFiles
 from pimper_torch.io.assets.placement import Placement, standing
 from pimper_torch.io.assets.usd import write_usdz
 from pimper_torch.io.assets.write import write_asset, write_asset_obj
-from pimper_torch.io.estimates import mask_path, read_lights
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale

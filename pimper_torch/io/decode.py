@@ -48,15 +48,12 @@ class Decoded(Record):
         alpha: Opacity in [0, 1]; ``None`` if the file has none.
         lossy: True for JPEG and HEIC, which ring around edges.
         full: Full-scale level of the file, a sample of 1: 255, 65535, or as the file states.
-        colour: Colour metadata of the file.
     """
 
     levels: Integer[Tensor, "channel height width"]
     alpha: Map | None
     lossy: bool
     full: int
-    full_scale_given: bool = False
-    colour: Colour = SILENT
 
     @property
     def samples(self) -> Float[Tensor, "channel height width"]:
@@ -178,7 +175,7 @@ def _guarded(path: Path, read: Callable[[], Result]) -> Result:
 def decode(path: Path | str, least_px: tuple[int, int] | None = None) -> Decoded:
     """Return the samples of an image file at full bit depth, with EXIF's orientation applied.
 
-    Profiles are returned as ``colour``, but not applied.
+    Profiles, which the header has as ``colour``, are not applied.
 
     Args:
         least_px: Width and height that suffice. JPEG is decoded at the smallest of a half, a
@@ -208,8 +205,6 @@ def decode(path: Path | str, least_px: tuple[int, int] | None = None) -> Decoded
         alpha=planes[-1].float() / int(full) if has_alpha else None,
         lossy=format_of(path) in ("JPEG", "HEIC"),
         full=int(full),
-        full_scale_given=header.full_scale_given,
-        colour=header.colour,
     )
 
 

@@ -154,12 +154,12 @@ def _fill(
 
     def read(index: int) -> tuple[Mask | None, _Kind, _Tally | None]:
         wide, high = sizes_px[index]
-        decoded = decode(paths[index], (wide, high))
-        response = decoded.colour.response if given is None else given
+        decoded, colour = decode(paths[index], (wide, high)), headers[index].colour
+        response = colour.response if given is None else given
         per_colour = isinstance(response, Curve) and len(response.radiance) > len(decoded.levels)
         if response is None or (given is None and per_colour):
             response = Srgb()
-        kind = _Kind(decoded.full, decoded.full_scale_given, response)
+        kind = _Kind(decoded.full, headers[index].full_scale_given, response)
         black, white = _levels(encoding, decoded, paths[index], whites.get(kind))
         linear = _scaled_response(response, decoded, paths[index]).linear_from_encoded
         # Black becomes 0, and saturation 1.
@@ -168,8 +168,8 @@ def _fill(
         encoded = (torch.arange(decoded.full + 1.0) / decoded.full).expand(len(white), 1, -1)
         table = ((linear(encoded) - dark) / span).clamp(0, 1)[:, 0]
         radiance, counts = _looked_up(table, decoded.levels)
-        if decoded.colour.srgb_from_file is not None and len(radiance) == 3:
-            radiance = in_srgb_primaries(radiance, decoded.colour.srgb_from_file)
+        if colour.srgb_from_file is not None and len(radiance) == 3:
+            radiance = in_srgb_primaries(radiance, colour.srgb_from_file)
         images[index, :, :high, :wide] = resized_radiance(radiance, wide, high)
         transparent = decoded.alpha is not None and bool((decoded.alpha < OPAQUE).any())
         mask = resized_mask(decoded.alpha, wide, high) if transparent else None

@@ -28,7 +28,6 @@ from pimper_torch.runtime.errors import InputError
 _ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}
 # Widths of the windows of linear interpolation, for Bayer patterns and X-Trans.
 _WINDOWS = {2: 3, 6: 7}
-_SOURCE = "camera raw"
 _UNKNOWN_CAMERA = "is from a camera of unknown colours; albedo keeps the colours of the sensor"
 
 
@@ -60,7 +59,7 @@ def read_raw_header(path: Path | str) -> Header:
             deep=True,
             full=np.iinfo(np.uint16).max,
             full_scale_given=True,
-            colour=Colour(source=_SOURCE, response=Linear(), srgb_from_file=matrix),
+            colour=Colour(source="camera raw", response=Linear(), srgb_from_file=matrix),
             cautions=(_UNKNOWN_CAMERA,) if unknown else (),
         )
 

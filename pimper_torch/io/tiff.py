@@ -31,23 +31,14 @@ PREMULTIPLIED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """Layout of the samples of a TIFF.
+    """Layout of the samples of a TIFF."""
 
-    Attributes:
-        deep: 16-bit colour, which Pillow would truncate to 8 bits.
-        planes: Deep colour in separate planes.
-        inverted: 0 is white, and Pillow does not invert it.
-        full: Full-scale level of the file.
-        transfer: Whether there is a TransferFunction, a table of radiance.
-        unknown: Whether there are extra samples of unknown meaning.
-    """
-
-    deep: bool
-    planes: bool
-    inverted: bool
-    full: int
-    transfer: bool
-    unknown: bool
+    deep: bool  # 16-bit colour, which Pillow would truncate to 8 bits
+    planes: bool  # deep colour in separate planes
+    inverted: bool  # 0 is white, and Pillow does not invert it
+    full: int  # full-scale level of the file
+    transfer: bool  # there is a TransferFunction, a table of radiance
+    unknown: bool  # there are extra samples of unknown meaning
 
 
 def layout_of(path: Path | str) -> Layout:

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from pimper_torch.chains.chain import Step
-from pimper_torch.export.result import Result, read_result
+from pimper_torch.export.result import Result, read_reference, read_result
+from pimper_torch.geometry.lens_models import pinholes_of
 from pimper_torch.io.cameras.layout import DataSetPath
 from pimper_torch.io.cameras.model_files import read_model
-from pimper_torch.io.estimates import read_estimate
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Mesh, Reconstruction, SparseScene
 from pimper_torch.runtime.errors import InputError, caution
 from pimper_torch.runtime.torch_settings import isolated
@@ -34,15 +35,14 @@ def add_folder(viewer: Viewer, path: Path | str, photographs: Path | str | None 
             viewer.unit = str(scale["unit"]) if isinstance(scale, dict) else None
         result = read_result(path, photographs)
     except InputError as error:
-        estimate = read_estimate(path)
+        mesh = read_mesh(path / "mesh.ply" if path.is_dir() else path)
         if path.is_dir():
             caution(f"{error} The viewer shows no photographs.", stacklevel=2)
-        names, reference = estimate.names, estimate.reference
-        if estimate.cameras is not None and names:
-            index = names.index(reference) if reference in names else 0
-            points = read_model(path / "sparse").points_world
-            viewer.add_cameras(names, estimate.cameras, points, index)
-        viewer.add_pass(RESULT, estimate.mesh)
+        if (path / "sparse").is_dir():
+            model, reference = read_model(path / "sparse"), read_reference(path / "depth.npz")
+            index = model.names.index(reference) if reference in model.names else 0
+            viewer.add_cameras(model.names, pinholes_of(model), model.points_world, index)
+        viewer.add_pass(RESULT, mesh)
     else:
         add_found(viewer, result)
 

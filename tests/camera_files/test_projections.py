@@ -4,7 +4,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
-from pimper_torch.io.cameras.posed_camera import decompose_projections
+from pimper_torch.io.cameras.camera_arrays import decompose_projections
 
 
 @settings(max_examples=25, deadline=None)

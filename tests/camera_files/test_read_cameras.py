@@ -33,6 +33,7 @@ WAYS = [
     rigs.of_metashape,
     rigs.of_meshroom,
     rigs.of_sfm_json,
+    rigs.of_polycam,
     rigs.of_idr,
     rigs.of_matrices,
     rigs.of_named_poses,
@@ -188,6 +189,60 @@ def test_an_unknown_file_is_refused(name, tmp_path):
     (tmp_path / name).write_text("nothing of the kind")
     with pytest.raises(InputError, match=name.replace(".", r"\.")):
         existing_model(rigs.views_of(), tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.json", {"views": 1, "lens": 2}, r"but has views, lens; needed: .*cameras\.sfm \("),
+        ("a.sfm", {"root": 1}, "is not a camera file, but has root; needed: "),
+        ("metadata", {"dw": 192}, "is not a camera file, but has dw; needed: .*metadata \\(Record"),
+        (
+            "sfm_data.json",
+            {"sfm_data_version": "0.3", "views": [], "intrinsics": [], "extrinsics": []},
+            "has sfm_data_version, views, .* OpenMVG makes a COLMAP model by `openMVG_main",
+        ),
+        (
+            "reconstruction.json",
+            [{"cameras": {}, "shots": {}, "points": {}}],
+            "has cameras, shots, points; needed: .* OpenSfM makes a COLMAP model by `opensfm",
+        ),
+    ],
+)
+def test_json_of_an_unknown_program_is_refused_with_its_keys(name, content, message, tmp_path):
+    (tmp_path / name).write_text(json.dumps(content))
+    with pytest.raises(InputError, match=message):
+        existing_model(rigs.views_of(), tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "columns", ["x,y,z", "x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+)
+def test_tables_of_realitycapture_are_refused_with_the_way_to_a_model(columns, tmp_path):
+    path = tmp_path / "registration.csv"
+    path.write_text(f"#name,{columns}\n")
+    message = "has #name, x, y, .*; needed: .* RealityCapture exports COLMAP models, which define"
+    with pytest.raises(InputError, match=message):
+        existing_model(rigs.views_of(), path)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xd8", b"nothing of the kind"])
+def test_a_file_without_suffix_that_is_not_json_is_refused(content, tmp_path):
+    (tmp_path / "metadata").write_bytes(content)
+    with pytest.raises(InputError, match="metadata: cannot be read as JSON in UTF-8"):
+        existing_model(rigs.views_of(), tmp_path / "metadata")
+
+
+def test_a_folder_of_json_without_a_model_stands_for_its_first_file(rig, tmp_path):
+    path = rigs.of_transforms(rig, tmp_path)
+    assert existing_model(rigs.views_of(), tmp_path).names == rigs.NAMES
+    (tmp_path / "a.json").write_text('{"lens": []}')
+    with pytest.raises(InputError, match=r"a\.json: is not a camera file, but has lens"):
+        existing_model(rigs.views_of(), tmp_path)
+    # A model in the folder, or in one of its folders, counts first.
+    rigs.of_colmap(rig, tmp_path)
+    assert existing_model(rigs.views_of(), tmp_path).names == rigs.NAMES
+    assert path.is_file()
 
 
 def test_two_cameras_of_one_photograph_are_refused(rig, tmp_path):

@@ -6,7 +6,7 @@ from torch.testing import assert_close
 from pimper_bench.datasets import read_camera_file
 from pimper_torch.export.alicevision import write_alicevision, write_sfm
 from pimper_torch.geometry.lens_models import pinhole_of
-from pimper_torch.io.cameras.meshroom_sfm import read_meshroom_cameras
+from pimper_torch.io.cameras.meshroom_sfm import read_meshroom
 from pimper_torch.viz.maps import view_maps
 
 
@@ -29,7 +29,7 @@ def test_pinholes_of_different_focal_lengths_and_sizes_are_read_back(result, tmp
     sizes = torch.tensor([[16, 12], [13, 9]])
     cameras = result.cameras.take([0, 1]).replace(intrinsics=K.double(), sizes_px=sizes)
     write_sfm(cameras, ["a.png", "b.png"], tmp_path / "x.sfm")
-    found = read_meshroom_cameras(tmp_path / "x.sfm")
+    found = read_meshroom(tmp_path / "x.sfm")
     pinholes = torch.stack([pinhole_of(one.lens) for one in found])
     assert_close(pinholes, cameras.intrinsics, rtol=0, atol=1e-9)
     assert [[one.lens.width, one.lens.height] for one in found] == sizes.tolist()

@@ -269,6 +269,7 @@ def _camera_files(root: Path) -> list[Seed]:
         rigs.of_transforms,
         rigs.of_meshroom,
         rigs.of_metashape,
+        rigs.of_record3d,
     )
     return [seed(write) for write in ways]
 

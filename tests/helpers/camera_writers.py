@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from sparse_models import observed
 
 from pimper_torch.export.alicevision import write_sfm
@@ -94,6 +95,31 @@ def of_meshroom(rig: Cameras, folder: Path) -> Path:
 
 def of_sfm_json(rig: Cameras, folder: Path) -> Path:
     return of_meshroom(rig, folder).rename(folder / "sfm.json")
+
+
+def of_polycam(rig: Cameras, folder: Path) -> Path:
+    """Write a file for each camera, named like its photograph, with ARKit's axes."""
+    path = folder / "keyframes" / "corrected_cameras"
+    path.mkdir(parents=True)
+    K = rig.intrinsics[0].tolist()
+    lens = {"fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2]}
+    size = {"width": WIDTH, "height": HEIGHT}
+    poses = invert_rigid(rig.cam_from_world) * torch.tensor([1.0, -1, -1, 1])
+    for name, pose in zip(NAMES, poses.tolist(), strict=True):
+        cells = {f"t_{i}{j}": pose[i][j] for i in range(3) for j in range(4)}
+        file = path / name.replace(".png", ".json")
+        file.write_text(json.dumps({**lens, **size, **cells, "blur_score": 100.0}))
+    return path
+
+
+def of_record3d(rig: Cameras, folder: Path) -> Path:
+    """Write quaternions, real part last, and positions, with ARKit's axes."""
+    poses = invert_rigid(rig.cam_from_world) * torch.tensor([1.0, -1, -1, 1])
+    turns = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat()
+    rows = np.concatenate([turns, poses[:, :3, 3].numpy()], axis=1).tolist()
+    content = {"K": rig.intrinsics[0].T.flatten().tolist(), "w": WIDTH, "h": HEIGHT, "poses": rows}
+    (folder / "metadata").write_text(json.dumps(content))
+    return folder / "metadata"
 
 
 def saved(folder: Path, **arrays: object) -> Path:

@@ -5,11 +5,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from pimper_bench.metrics.estimates import estimate_of
+from pimper_bench.metrics.estimates import estimate_of, read_estimate
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.export import results
 from pimper_torch.io.assets.mesh_files import MeshFiles
-from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import write_ply
 from pimper_torch.runtime.errors import InputError
 

@@ -83,7 +83,8 @@ def test_raw_is_linear_radiance_in_the_primaries_of_srgb(folder, colours):
 
 def test_samples_are_scaled_from_black_to_saturation(folder, colours):
     decoded = decode(folder / "0.dng")
-    assert (decoded.full, decoded.full_scale_given, decoded.lossy) == (65535, True, False)
+    assert (decoded.full, decoded.lossy) == (65535, False)
+    assert read_header(folder / "0.dng").full_scale_given
     inner = (slice(None), slice(3, -3), slice(3, -3))
     wanted = sensor_of(colours)[inner].float()
     assert_close(decoded.samples[inner], wanted, rtol=0, atol=5e-4)  # a level of 3,744

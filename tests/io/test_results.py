@@ -12,7 +12,7 @@ import yaml
 from PIL import Image
 from torch.testing import assert_close
 
-from pimper_bench.metrics.estimates import estimate_of
+from pimper_bench.metrics.estimates import estimate_of, read_estimate
 from pimper_bench.scenes.procedural_meshes import icosphere
 from pimper_torch.export import results
 from pimper_torch.export.reports import common_lights, lights_report, summary_report, world_lights
@@ -23,7 +23,6 @@ from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.io.assets.mesh_files import MeshFiles
 from pimper_torch.io.cameras.model_files import read_model
-from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.radiometry.base_color import albedo_scale

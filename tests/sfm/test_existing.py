@@ -6,12 +6,15 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from pimper_torch.geometry.lens_models import distort
 from pimper_torch.geometry.quarter_turns import QUARTERS
 from pimper_torch.io.cameras.existing import existing_model
 from pimper_torch.radiometry import to_bytes
-from pimper_torch.records import Views
+from pimper_torch.records import CameraModel, Views
+from pimper_torch.records.sparse_model import SparseModel
+from pimper_torch.records.stored import load_record, save_record
 from pimper_torch.runtime.errors import InputError, PimperWarning
-from pimper_torch.stages.sfm.colmap import write_binary
+from pimper_torch.stages.sfm.colmap import reconstruction_of, write_binary
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene
 from tests.sfm import ball
 from tests.sfm.ball import HEIGHT, WIDTH
@@ -98,6 +101,40 @@ def test_turned_and_reduced_photographs_have_transformed_camera_models(stored, s
     assert (lens.width, lens.height) == (HEIGHT // 2, WIDTH // 2)
     assert lens.params == pytest.approx((420.0, HEIGHT / 4, WIDTH / 4, 0.0))
     assert {lens.camera for lens in found.lenses} == {1}
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_all_parameters_of_a_lens_are_written_read_and_kept(stored, tmp_path, text):
+    numbers = (0.1, -0.2, 1e-3, -2e-3, 0.3, 0.04, -0.05, 0.06)  # k1, k2, p1, p2, k3 to k6
+    lens = CameraModel(
+        camera=1,
+        model="FULL_OPENCV",
+        params=(800.0, 810.0, WIDTH / 2 + 1, HEIGHT / 2 - 2, *numbers),
+        width=WIDTH,
+        height=HEIGHT,
+    )
+    model = ball_model().replace(lenses=(lens,) * 6)
+    path = written(model, tmp_path)
+    if text:
+        colours = to_bytes(torch.ones(len(model.points_world), 3))
+        reconstruction_of(model, colours).write_text(str(path))
+        for binary in path.glob("*.bin"):
+            binary.unlink()
+    assert existing_model(stored, path).lenses == model.lenses
+    save_record(model, tmp_path / "model.safetensors")
+    assert load_record(SparseModel, tmp_path / "model.safetensors").lenses == model.lenses
+    x, y = 0.2, -0.1
+    k1, k2, p1, p2, k3, k4, k5, k6 = numbers
+    r2 = x * x + y * y
+    ratio = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    u = x * ratio + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * ratio + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    # Clockwise, right becomes down, and down becomes left.
+    with pytest.warns(PimperWarning, match="before EXIF turns them"):
+        found = existing_model(turned(stored, [1] * 6), path).lenses[0]
+    expected = [HEIGHT - (810 * v + HEIGHT / 2 - 2), 800 * u + WIDTH / 2 + 1]
+    ray = torch.tensor([[-y, x, 1.0]], dtype=torch.float64)
+    assert distort(found, ray)[0].tolist() == pytest.approx(expected)
 
 
 def test_a_model_of_exif_turned_photographs_is_unchanged(stored, sparse):

@@ -16,6 +16,7 @@ from pimper_bench.datasets.diligent import read_diligent_mv
 from pimper_bench.datasets.dtu_sets import read_dtu_mvs, read_dtu_protocol
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.metrics.compared_page import write_compared_page
+from pimper_bench.metrics.estimates import read_estimate
 from pimper_bench.metrics.evaluation import (
     EvaluateConfig,
     Evaluation,
@@ -30,7 +31,6 @@ from pimper_bench.truth import Capture, DtuProtocol, Truth
 from pimper_torch.cli.arguments import Flag, read_arguments
 from pimper_torch.cli.output import Output
 from pimper_torch.export.result_folder.files import file_written_whole, prepare_file
-from pimper_torch.io.estimates import read_estimate
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
 from pimper_torch.records import Estimate, Views

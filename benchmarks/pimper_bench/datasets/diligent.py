@@ -14,8 +14,8 @@ from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_bench.datasets.raster import nearest
 from pimper_bench.datasets.sampling import LightOptions, Shot, read_shots
 from pimper_bench.truth import Capture, Truth
+from pimper_torch.io.cameras.camera_arrays import decompose_projections
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import decompose_projections
 from pimper_torch.io.meshes import read_mesh
 
 # Photometric stereo's axes are x right, y up, z towards the viewer; this converts them to ours.

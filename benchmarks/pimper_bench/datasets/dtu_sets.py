@@ -13,8 +13,8 @@ from pimper_bench.datasets.matlab import read_matlab, read_toolbox_projections
 from pimper_bench.datasets.posed import file_in, first_of
 from pimper_bench.datasets.sampling import LightOptions, Shot, read_shots
 from pimper_bench.truth import Capture, DtuProtocol, Truth
+from pimper_torch.io.cameras.camera_arrays import decompose_projections
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import decompose_projections
 from pimper_torch.io.meshes import read_mesh
 
 _POINTS = "the DTU point feature set"

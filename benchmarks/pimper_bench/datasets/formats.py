@@ -239,7 +239,7 @@ def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capt
     """Read the cameras of a ``transforms.json`` and the photographs it names.
 
     For their meaning, see
-    :func:`~pimper_torch.io.cameras.transforms_json.read_transforms_cameras`. Lenses are
+    :func:`~pimper_torch.io.cameras.transforms_json.read_nerf`. Lenses are
     undistorted. The mask is ``mask_path`` if a frame has one, else the image's alpha channel.
     Photographs are named by their files, or by full paths in the file if these are not unique.
 
@@ -253,8 +253,8 @@ def read_transforms(folder: Path | str, **options: Unpack[PosedOptions]) -> Capt
     def image_of(name: str) -> Path:
         return _with_suffix(around.inside(name))
 
-    cameras = transforms_json.read_transforms_cameras(
-        file.path, lambda names: _sizes([image_of(name) for name in names])
+    cameras = transforms_json.read_nerf(
+        file.path, (), lambda names: _sizes([image_of(name) for name in names])
     )
     images = [image_of(camera.name) for camera in cameras]
     names = [image.name for image in images]

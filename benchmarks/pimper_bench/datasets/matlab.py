@@ -151,7 +151,7 @@ def read_toolbox_projections(
     Returns:
         Projections in float64 on pixels counted from the centre of the first one. ``R`` is
         not corrected: in published files it is not exactly orthogonal, which
-        :func:`~pimper_torch.io.cameras.posed_camera.decompose_projections` handles.
+        :func:`~pimper_torch.io.cameras.camera_arrays.decompose_projections` handles.
     """
     poses = [name for number in numbers for name in (f"Rc_{number}", f"Tc_{number}")]
     intrinsic = ["KK"] if "KK" in _variables(file) else ["fc", "cc"]

@@ -1,10 +1,45 @@
-"""Conversion of this package's results to estimates for evaluation."""
+"""Estimates to evaluate: a result in memory or in its folder, or a mesh of any method."""
+
+from pathlib import Path
 
 import torch
 
 from pimper_torch.export.reports import common_lights
+from pimper_torch.export.result import read_lights, read_reference
+from pimper_torch.geometry.lens_models import pinholes_of
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
+from pimper_torch.io.cameras.model_files import read_model
+from pimper_torch.io.meshes import read_mesh
 from pimper_torch.records import Estimate, Reconstruction
+from pimper_torch.runtime.errors import InputError
+
+
+def read_estimate(path: Path | str) -> Estimate:
+    """Read a method's estimate of an object.
+
+    Args:
+        path: A mesh or point cloud; or a folder with ``mesh.ply`` and optionally ``sparse/``
+            (COLMAP model with the cameras), ``lights.json`` and ``depth.npz`` (with the ``name`` of
+            the reference view), as written by
+            :func:`pimper_torch.export.results.write_result`.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return Estimate(mesh=read_mesh(path))
+    if not (path / "mesh.ply").is_file():
+        raise InputError(
+            f"{path}: contains no mesh.ply; needed: a folder written by `pimper reconstruct`, or "
+            "the path of a mesh file."
+        )
+    model = read_model(path / "sparse") if (path / "sparse").is_dir() else None
+    names = () if model is None else model.names
+    return Estimate(
+        mesh=read_mesh(path / "mesh.ply"),
+        names=names,
+        cameras=None if model is None else pinholes_of(model),
+        lights_world=read_lights(path / "lights.json", names),
+        reference=read_reference(path / "depth.npz"),
+    )
 
 
 def estimate_of(result: Reconstruction) -> Estimate:

@@ -4,24 +4,22 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import scipy.linalg
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pimper_torch.geometry.pixels import pixels_from_indices
+from pimper_torch.geometry.rigid import rigid
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import (
-    PosedCamera,
-    Rig,
-    SizesOf,
-    decompose_projections,
-    number_lenses,
-)
-from pimper_torch.records import CameraModel
+from pimper_torch.io.cameras.posed_camera import PosedCamera, SizesOf, number_lenses, opencv_lens
+from pimper_torch.records.shapes import Poses
 from pimper_torch.runtime.errors import some
 from pimper_torch.runtime.numpy_files import read_npz
 
 Arrays = dict[str, np.ndarray]
+Rig = tuple[Float[Tensor, "view 3 3"], Poses]
+"""Intrinsics and ``cam_from_world``."""
 
 _KIND = "an archive of cameras"
 
@@ -67,10 +65,7 @@ def read_camera_arrays(
     cameras = []
     for name, size, K, pose in zip(names, sizes_of(names), intrinsics.tolist(), poses, strict=True):
         if size is not None:
-            params = (K[0][0], K[1][1], K[0][2], K[1][2])
-            lens = CameraModel(
-                camera=1, model="PINHOLE", params=params, width=size[0], height=size[1]
-            )
+            lens = opencv_lens(size, (K[0][0], K[1][1], K[0][2], K[1][2]))
             cameras.append(PosedCamera(name=name, lens=lens, skew_px=K[0][1], cam_from_world=pose))
     return number_lenses(cameras)
 
@@ -135,3 +130,37 @@ def _decomposed(projections: Float[Tensor, "view 3 4"], file: DataSetPath) -> Ri
         return decompose_projections(projections)
     except ValueError as error:
         file.refuse("K [R t] as each projection", str(error))
+
+
+def decompose_projections(projections: Float[Tensor, "view 3 4"]) -> Rig:
+    r"""Split ``P ~ K [R | t]`` into intrinsics and ``cam_from_world``.
+
+    ``P`` is known up to a factor, which may be negative. The left 3x3 block is an upper
+    triangular matrix times an orthogonal one (RQ). The split is unique, as the diagonal of ``K``
+    is positive and ``R`` is a rotation. Projections stay the same, even if ``R`` in the file was
+    not orthogonal: the remainder becomes part of ``K``.
+
+    Returns:
+        ``K`` with ``K[2, 2] = 1``, including skew, and rigid transforms; float64.
+
+    Raises:
+        ValueError: A left block has no inverse, so the camera is not finite.
+
+    Source: Hartley & Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4.
+    """
+    intrinsics, poses = [], []
+    for index, matrix in enumerate(projections.detach().cpu().double().numpy()):
+        left = matrix[:, :3]
+        determinant = float(np.linalg.det(left))
+        size = float(np.linalg.norm(left))
+        # Rows of K [R | t] differ by factors of the focal length in pixels, at most its cube.
+        if not np.isfinite(size) or abs(determinant) <= 1e-13 * size**3:
+            raise ValueError(f"the left 3x3 block of number {index} has no inverse")
+        proper = matrix if determinant > 0 else -matrix
+        K, R = scipy.linalg.rq(proper[:, :3])
+        signs = np.where(np.diag(K) < 0, -1.0, 1.0)
+        K, R = K * signs, signs[:, None] * R
+        intrinsics.append(torch.from_numpy(K / K[2, 2]))
+        translation = torch.from_numpy(np.linalg.solve(K, proper[:, 3]))
+        poses.append(rigid(torch.from_numpy(R), translation))
+    return torch.stack(intrinsics), torch.stack(poses)

@@ -7,14 +7,8 @@ from pathlib import Path
 import torch
 from PIL import Image
 
+from pimper_torch.geometry import quarter_turns
 from pimper_torch.geometry.lens_models import rescale_lens
-from pimper_torch.geometry.quarter_turns import (
-    QUARTERS,
-    turned_lens,
-    turned_pixels,
-    turned_pose,
-    turned_size,
-)
 from pimper_torch.io.cameras.model_files import largest_model, read_model
 from pimper_torch.io.cameras.read_cameras import read_cameras
 from pimper_torch.io.cameras.transforms_json import read_cloud
@@ -32,7 +26,7 @@ def existing_model(views: Views, path: Path) -> SparseModel:
             camera of their pose. Cameras may be of images of a different size, and of the stored
             pixels if EXIF turns them by a quarter.
         path: Folder of a COLMAP model, or of subfolders with models, of which the largest is read;
-            or a camera file, see
+            or a camera file, or a folder of these, see
             :func:`~pimper_torch.io.cameras.read_cameras.read_cameras`.
 
     Returns:
@@ -79,7 +73,7 @@ def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
     read. One photograph whose shape is conclusive decides for all.
     """
     tags = [1] * views.num_views if views.orientations is None else views.orientations.tolist()
-    exif = [QUARTERS.get(tag, 0) for tag in tags]
+    exif = [quarter_turns.QUARTERS.get(tag, 0) for tag in tags]
     sizes = views.sizes_px.tolist()
     odd = [
         f"{name} is {width}x{height}, its camera's image {lens.width}x{lens.height}"
@@ -87,7 +81,7 @@ def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
         if not resize_fits(lens, width, height)
     ]
     as_stored = all(
-        resize_fits(lens, *turned_size(width, height, quarters))
+        resize_fits(lens, *quarter_turns.turned_size(width, height, quarters))
         for lens, (width, height), quarters in zip(model.lenses, sizes, exif, strict=True)
     )
     if odd and not as_stored:
@@ -116,7 +110,9 @@ def _quarter_turns(model: SparseModel, views: Views, where: str) -> list[int]:
 
 def source_label(path: Path) -> str:
     """Return a description of the source of cameras, to begin a sentence."""
-    return f"The camera file {path}" if path.is_file() else f"The COLMAP model in {path}"
+    if path.is_file():
+        return f"The camera file {path}"
+    return f"The {'cameras' if any(path.glob('*.json')) else 'COLMAP model'} in {path}"
 
 
 def registered_views(views: Views, model: SparseModel) -> Views:
@@ -178,15 +174,17 @@ def _in_photographs(model: SparseModel, views: Views, turns: Sequence[int]) -> S
     poses = torch.empty_like(model.cam_from_world)
     for view, (lens, quarters) in enumerate(zip(model.lenses, turns, strict=True)):
         width, height = views.sizes_px[view].tolist()
-        size = turned_size(width, height, quarters)
+        size = quarter_turns.turned_size(width, height, quarters)
         # Photographs of one camera that were resized or turned differently no longer share it; the
         # first of them keep its number.
         key, is_used = (lens.camera, *size, quarters), lens.camera in cameras.values()
         camera = cameras.setdefault(key, next_camera + len(cameras) if is_used else lens.camera)
         resized = rescale_lens(lens, *size).replace(camera=camera)
-        placed.append(turned_lens(resized, quarters))
+        placed.append(quarter_turns.turned_lens(resized, quarters))
         scale = pixels.new_tensor([size[0] / lens.width, size[1] / lens.height])
         rows = model.observation_view == view
-        pixels[rows] = turned_pixels(model.observation_pixels[rows] * scale, *size, quarters)
-        poses[view] = turned_pose(model.cam_from_world[view], quarters)
+        pixels[rows] = quarter_turns.turned_pixels(
+            model.observation_pixels[rows] * scale, *size, quarters
+        )
+        poses[view] = quarter_turns.turned_pose(model.cam_from_world[view], quarters)
     return model.replace(lenses=tuple(placed), cam_from_world=poses, observation_pixels=pixels)

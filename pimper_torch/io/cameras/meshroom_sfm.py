@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import Distortion, PosedCamera, polynomial_lens
+from pimper_torch.io.cameras.posed_camera import Numbers, PosedCamera, opencv_lens
 from pimper_torch.records import CameraModel
 from pimper_torch.records.shapes import Pose
 from pimper_torch.runtime.errors import some
@@ -21,7 +21,7 @@ _PARAMETERS = {"radial1": 1, "radial3": 3, "radialk1": 1, "radialk3": 3, "brown"
 _NONE = ("pinhole", "none")
 
 
-def read_meshroom_cameras(path: Path) -> list[PosedCamera]:
+def read_meshroom(path: Path, *_: object) -> list[PosedCamera]:
     """Read the cameras, named by the paths of their photographs.
 
     As AliceVision reads its own file (``sfmDataIO/jsonIO.cpp``):
@@ -100,14 +100,13 @@ def _lens(
     center = value("principalPoint", 2)
     center = pixels_from_indices(center if version < (1, 2, 1) else center + size / 2)
     pinhole = (float(focal[0]), float(focal[1]), float(center[0]), float(center[1]))
-    model, params = _distortion(entry, file)
-    return CameraModel(
-        camera=camera, model=model, params=(*pinhole, *params), width=width, height=height
-    )
+    fisheye, terms = _distortion(entry, file)
+    lens = opencv_lens((width, height), pinhole, () if fisheye else terms, camera)
+    return lens.replace(model="OPENCV_FISHEYE", params=pinhole + terms) if fisheye else lens
 
 
-def _distortion(entry: Mapping[str, object], file: DataSetPath) -> Distortion:
-    """Return COLMAP's model of a distortion, and its parameters after the principal point.
+def _distortion(entry: Mapping[str, object], file: DataSetPath) -> tuple[bool, Numbers]:
+    """Return whether a lens is a fisheye, and the terms of OpenCV's model.
 
     AliceVision's Brown model (k1, k2, k3, t1, t2) is OpenCV's, and its ``fisheye4`` is OpenCV's
     fisheye, as in its own exporter to COLMAP (``sfmDataIO/colmap.cpp``).
@@ -127,8 +126,6 @@ def _distortion(entry: Mapping[str, object], file: DataSetPath) -> Distortion:
         "the undistorted photographs with their cameras",
     )
     if name == "fisheye4":
-        return "OPENCV_FISHEYE", tuple(values)
-    if name in _NONE:
-        return "PINHOLE", ()
-    k1, k2, k3, t1, t2 = (*values, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-    return polynomial_lens(k1, k2, t1, t2, k3)
+        return True, tuple(values)
+    k1, k2, k3, t1, t2 = (*([] if name in _NONE else values), 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    return False, (k1, k2, t1, t2, k3)

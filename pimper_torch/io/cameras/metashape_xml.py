@@ -2,7 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, fromstring
 from xml.parsers import expat
 
 from jaxtyping import Float
@@ -10,14 +10,15 @@ from torch import Tensor
 
 from pimper_torch.geometry.rigid import invert_rigid, rigid
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import PosedCamera, polynomial_lens
+from pimper_torch.io.cameras.posed_camera import PosedCamera, opencv_lens
 from pimper_torch.records import CameraModel
+from pimper_torch.records.shapes import Pose
 from pimper_torch.runtime.errors import InputError, caution, some
 
 KIND = "a Metashape camera XML"
 
 
-def read_metashape_cameras(path: Path) -> list[PosedCamera]:
+def read_metashape(path: Path, *_: object) -> list[PosedCamera]:
     """Read the cameras, named by their labels in Metashape.
 
     A camera's ``transform`` is ``chunk_from_cam``, row by row, with our camera axes. The
@@ -58,7 +59,7 @@ def read_metashape_cameras(path: Path) -> list[PosedCamera]:
     return cameras
 
 
-def parse_without_entities(path: Path) -> ElementTree.Element:
+def parse_without_entities(path: Path) -> Element:
     """Parse untrusted XML; a document type declaration is an error.
 
     Entities need one. They allow a small file to grow without bound, or to refer to other files.
@@ -74,10 +75,10 @@ def parse_without_entities(path: Path) -> ElementTree.Element:
     checker = expat.ParserCreate()
     checker.StartDoctypeDeclHandler = refuse
     checker.Parse(content, True)
-    return ElementTree.fromstring(content)
+    return fromstring(content)
 
 
-def _chunk(file: DataSetPath) -> ElementTree.Element:
+def _chunk(file: DataSetPath) -> Element:
     root = file.read(parse_without_entities, "XML")
     chunks = [root] if root.tag == "chunk" else root.findall("chunk")
     file.expect(bool(chunks), "a document with one chunk", f"<{root.tag}> without a chunk")
@@ -91,7 +92,7 @@ def _chunk(file: DataSetPath) -> ElementTree.Element:
     return aligned[0]
 
 
-def _aligned(chunk: ElementTree.Element) -> list[ElementTree.Element]:
+def _aligned(chunk: Element) -> list[Element]:
     """List the enabled cameras that have a transform."""
     return [
         camera
@@ -100,7 +101,7 @@ def _aligned(chunk: ElementTree.Element) -> list[ElementTree.Element]:
     ]
 
 
-def _largest_component(cameras: list[ElementTree.Element], path: Path) -> list[ElementTree.Element]:
+def _largest_component(cameras: list[Element], path: Path) -> list[Element]:
     sizes = Counter(camera.get("component_id") for camera in cameras).most_common()
     if len(sizes) < 2:
         return cameras
@@ -114,9 +115,7 @@ def _largest_component(cameras: list[ElementTree.Element], path: Path) -> list[E
     return [camera for camera in cameras if camera.get("component_id") == largest]
 
 
-def _cam_from_world(
-    camera: ElementTree.Element, chunk: ElementTree.Element, file: DataSetPath
-) -> Float[Tensor, "4 4"]:
+def _cam_from_world(camera: Element, chunk: Element, file: DataSetPath) -> Pose:
     what = f"transform of {camera.get('label')}"
     chunk_from_cam = file.numbers(camera.findtext("transform"), 16, what).reshape(4, 4)
     pose = file.rigid(chunk_from_cam[:3, :3], chunk_from_cam[:3, 3], what)
@@ -140,7 +139,7 @@ def _cam_from_world(
     return invert_rigid(world_from_chunk @ rigid(pose[:3, :3], scale * pose[:3, 3]))
 
 
-def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[CameraModel, float]:
+def _lens(sensor: Element, number: int, file: DataSetPath) -> tuple[CameraModel, float]:
     """Return the lens of a sensor's calibration, and its skew in pixels."""
     label = sensor.get("label") or sensor.get("id")
     calibrations = sensor.findall("calibration")
@@ -165,10 +164,10 @@ def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[
     p1, p2, p3, p4 = (value(tag) for tag in ("p1", "p2", "p3", "p4"))
     pinhole = (f + b1, f, width / 2 + value("cx"), height / 2 + value("cy"))
     kind = calibration.get("type") or sensor.get("type") or "frame"
-    model, params = polynomial_lens(k1, k2, p2, p1, k3)
-    supported = kind == "frame" and not any((k4, p3, p4)) and not (b2 and params)
+    lens = opencv_lens((width, height), pinhole, (k1, k2, p2, p1, k3), number)
+    supported = kind == "frame" and not any((k4, p3, p4)) and not (b2 and lens.model != "PINHOLE")
     if kind == "fisheye":
-        model, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
+        lens = lens.replace(model="OPENCV_FISHEYE", params=(*pinhole, k1, k2, k3, k4))
         supported = not any((p1, p2, p3, p4, b2))
     nonzero = [e.tag for e in calibration if (e.text or "").strip() not in ("", "0", "0.0")]
     file.expect(
@@ -177,8 +176,5 @@ def _lens(sensor: ElementTree.Element, number: int, file: DataSetPath) -> tuple[
         f"sensor {label}",
         f"a {kind} camera with {', '.join(nonzero)}; export undistorted photographs with their "
         "cameras, or align again without the other parameters",
-    )
-    lens = CameraModel(
-        camera=number, model=model, params=(*pinhole, *params), width=width, height=height
     )
     return lens, b2

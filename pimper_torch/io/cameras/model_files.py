@@ -27,18 +27,13 @@ _MAX_COORDINATE = 1e30  # poses and points beyond leave the range of single prec
 
 
 class _Image(NamedTuple):
-    """An image in its file.
-
-    Attributes:
-        pose: ``cam_from_world``: a quaternion, real part first, then the translation.
-        pixels: Of its features, ``feature 2``. Tracks specify their points.
-    """
+    """An image in its file; tracks specify the points of its features."""
 
     number: int
-    pose: tuple[float, ...]
+    pose: tuple[float, ...]  # cam_from_world: a quaternion, real part first, and the translation
     camera: int
     name: str
-    pixels: np.ndarray
+    pixels: np.ndarray  # of its features, ``feature 2``
 
 
 class _Point(NamedTuple):
@@ -114,11 +109,12 @@ def read_model(folder: Path) -> SparseModel:
 
 
 def largest_model(folder: Path) -> Path:
-    """Return a folder with a model, or the subfolder with the largest model; warn about others."""
+    """Return a folder with a model, its subfolder with the largest one, or its first JSON file."""
     inner = sorted(folder.iterdir()) if folder.is_dir() and not _ending(folder) else []
     endings = {path: ending for path in inner if (ending := _ending(path))}
     sizes = {path: (path / f"images{ending}").stat().st_size for path, ending in endings.items()}
-    largest = max(sizes, key=sizes.__getitem__, default=folder)
+    first = next((path for path in inner if path.suffix.lower() == ".json"), folder)
+    largest = max(sizes, key=sizes.__getitem__, default=first)
     if len(sizes) > 1:
         others = some([path.name for path in sizes if path != largest])
         caution(
@@ -130,11 +126,8 @@ def largest_model(folder: Path) -> Path:
 
 def _ending(folder: Path) -> str | None:
     """Return the ending of the three files of a model; ``None`` if one is missing."""
-    for ending in (".bin", ".txt"):
-        names = (f"{part}{ending}" for part in _PARTS)
-        if all((folder / name).is_file() for name in names):
-            return ending
-    return None
+    files = {end: [folder / f"{part}{end}" for part in _PARTS] for end in (".bin", ".txt")}
+    return next((end for end, paths in files.items() if all(map(Path.is_file, paths))), None)
 
 
 def _binary_cameras(data: bytes) -> Iterator[CameraModel]:

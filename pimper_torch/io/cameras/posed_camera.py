@@ -3,20 +3,10 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-import scipy.linalg
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from pimper_torch.geometry.rigid import rigid
 from pimper_torch.records import CameraModel, Record
-from pimper_torch.records.shapes import Pose, Poses
+from pimper_torch.records.shapes import Pose
 
-Rig = tuple[Float[Tensor, "view 3 3"], Poses]
-"""Intrinsics and ``cam_from_world``."""
-Distortion = tuple[str, tuple[float, ...]]
-"""COLMAP's name of a lens model, and its parameters after those of ``K``."""
+Numbers = tuple[float, ...]
 SizesOf = Callable[[Sequence[str]], Sequence[tuple[int, int] | None]]
 """Returns width and height of photographs by their names in a file; ``None`` if missing."""
 
@@ -46,41 +36,15 @@ def number_lenses(cameras: Sequence[PosedCamera]) -> list[PosedCamera]:
     ]
 
 
-def polynomial_lens(k1: float, k2: float, p1: float, p2: float, k3: float) -> Distortion:
-    """Return COLMAP's model of an OpenCV distortion; ``PINHOLE`` if all parameters are 0."""
-    params = (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-    return ("FULL_OPENCV", params) if any(params) else ("PINHOLE", ())
+def opencv_lens(
+    size_px: tuple[int, int], pinhole: Numbers, terms: Numbers = (), camera: int = 1
+) -> CameraModel:
+    """Return a lens of OpenCV: ``FULL_OPENCV``, or ``PINHOLE`` if all terms are 0.
 
-
-def decompose_projections(projections: Float[Tensor, "view 3 4"]) -> Rig:
-    r"""Split ``P ~ K [R | t]`` into intrinsics and ``cam_from_world``.
-
-    ``P`` is known up to a factor, which may be negative. The left 3x3 block is an upper
-    triangular matrix times an orthogonal one (RQ). The split is unique, as the diagonal of ``K``
-    is positive and ``R`` is a rotation. Projections stay the same, even if ``R`` in the file was
-    not orthogonal: the remainder becomes part of ``K``.
-
-    Returns:
-        ``K`` with ``K[2, 2] = 1``, including skew, and rigid transforms; float64.
-
-    Raises:
-        ValueError: A left block has no inverse, so the camera is not finite.
-
-    Source: Hartley & Zisserman, Multiple View Geometry, 2nd edition, section 6.2.4.
+    Args:
+        pinhole: ``fx``, ``fy``, ``cx``, ``cy``.
+        terms: ``k1``, ``k2``, ``p1``, ``p2``, ``k3`` to ``k6``; the last ones may be missing.
     """
-    intrinsics, poses = [], []
-    for index, matrix in enumerate(projections.detach().cpu().double().numpy()):
-        left = matrix[:, :3]
-        determinant = float(np.linalg.det(left))
-        size = float(np.linalg.norm(left))
-        # Rows of K [R | t] differ by factors of the focal length in pixels, at most its cube.
-        if not np.isfinite(size) or abs(determinant) <= 1e-13 * size**3:
-            raise ValueError(f"the left 3x3 block of number {index} has no inverse")
-        proper = matrix if determinant > 0 else -matrix
-        K, R = scipy.linalg.rq(proper[:, :3])
-        signs = np.where(np.diag(K) < 0, -1.0, 1.0)
-        K, R = K * signs, signs[:, None] * R
-        intrinsics.append(torch.from_numpy(K / K[2, 2]))
-        translation = torch.from_numpy(np.linalg.solve(K, proper[:, 3]))
-        poses.append(rigid(torch.from_numpy(R), translation))
-    return torch.stack(intrinsics), torch.stack(poses)
+    model, count = ("FULL_OPENCV", 8) if any(terms) else ("PINHOLE", 0)
+    params, (width, height) = (*pinhole, *(*terms, *[0.0] * 8)[:count]), size_px
+    return CameraModel(camera=camera, model=model, params=params, width=width, height=height)

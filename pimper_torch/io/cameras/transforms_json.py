@@ -1,7 +1,7 @@
 """Cameras of NeRF's ``transforms.json``, as written by Blender, instant-ngp and nerfstudio."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -11,12 +11,7 @@ import torch
 
 from pimper_torch.geometry.rigid import invert_rigid
 from pimper_torch.io.cameras.layout import DataSetPath
-from pimper_torch.io.cameras.posed_camera import (
-    PosedCamera,
-    SizesOf,
-    number_lenses,
-    polynomial_lens,
-)
+from pimper_torch.io.cameras.posed_camera import PosedCamera, SizesOf, number_lenses, opencv_lens
 from pimper_torch.records import CameraModel
 from pimper_torch.records.shapes import Points
 from pimper_torch.runtime.errors import InputError, caution
@@ -26,12 +21,7 @@ KIND = "a transforms.json set"
 FLIP = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64, device="cpu")
 """Converts OpenGL's camera axes, with y up and the view along -z."""
 
-_POLYNOMIAL = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
-
-
-def has_frames(path: Path) -> bool:
-    """Return whether a JSON file has frames, which identify this format."""
-    return "frames" in DataSetPath(path, "a camera file").read_json()
+_OPENCV = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 
 def read_frames(path: Path) -> list[dict[str, object]]:
@@ -45,13 +35,13 @@ def read_frames(path: Path) -> list[dict[str, object]]:
     return frames
 
 
-def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
+def read_nerf(path: Path, _: object, sizes_of: SizesOf) -> list[PosedCamera]:
     """Read the cameras; sizes that the file lacks are those of the photographs.
 
     ``transform_matrix`` is ``world_from_cam`` with OpenGL's camera axes (right, up, back).
     The focal length is ``fl_x``, ``fl_y`` in pixels, or follows from ``camera_angle_x``; the
     principal point ``cx``, ``cy`` is the centre of the image unless given. All of these, and
-    ``w``, ``h``, ``k1`` to ``k4``, ``p1``, ``p2`` and ``camera_model``, may be in the file
+    ``w``, ``h``, ``k1`` to ``k6``, ``p1``, ``p2`` and ``camera_model``, may be in the file
     or in a frame. instant-ngp and nerfstudio use COLMAP's values and cast rays through
     x + 0.5 (nerfstudio, "Data conventions" and ``Cameras.get_image_coords``), and Blender's
     centre is that of the image's area: their pixel coordinates are ours.
@@ -62,12 +52,18 @@ def read_transforms_cameras(path: Path, sizes_of: SizesOf) -> list[PosedCamera]:
     Returns:
         In the order of the file; without frames of unknown size.
     """
-    frames = read_frames(path)
+    return cameras_of_frames(read_frames(path), DataSetPath(path, KIND), sizes_of)
+
+
+def cameras_of_frames(
+    frames: Sequence[Mapping[str, object]], file: DataSetPath, sizes_of: SizesOf = lambda _: ()
+) -> list[PosedCamera]:
+    """Return the cameras of frames, as :func:`read_nerf`."""
     names = [str(frame["file_path"]).replace("\\", "/") for frame in frames]
     sizes = [_stated_size(frame) for frame in frames]
     photograph_sizes = sizes if all(sizes) else sizes_of(names)
     cameras = [
-        _camera(frame, name, size, DataSetPath(path, KIND))
+        _camera(frame, name, size, file)
         for frame, name, *options in zip(frames, names, sizes, photograph_sizes, strict=True)
         if (size := options[0] or options[1])
     ]
@@ -152,12 +148,14 @@ def _lens(
     file.expect(focal > 0 or focal_y > 0, needed, "neither, or none above 0")
     fx, fy = focal or focal_y, focal_y or focal
     pinhole = (fx, fy, value("cx", width / 2), value("cy", height / 2))
-    k1, k2, k3, k4, p1, p2 = (value(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k1, k2, *others = (value(f"k{number}") for number in range(1, 7))
     model = str(frame.get("camera_model") or "OPENCV")
     fisheye = model == "OPENCV_FISHEYE" or frame.get("is_fisheye") is True
-    file.expect(fisheye or model in _POLYNOMIAL, f"a camera_model of {_POLYNOMIAL}", model)
-    file.expect(fisheye or k4 == 0, f"k4 = 0 for {name}, unless it is a fisheye", f"{k4}")
-    kind, params = polynomial_lens(k1, k2, p1, p2, k3)
+    file.expect(fisheye or model in _OPENCV, f"a camera_model of {_OPENCV}", model)
+    last = 4 if fisheye else 6 if model == "FULL_OPENCV" else 3
+    needed = f"k{last + 1} = 0 for {name}, or a model that has it (OPENCV_FISHEYE, FULL_OPENCV)"
+    file.expect(not any(others[last - 2 :]), needed, f"k3 to k6 = {others}, camera_model {model}")
     if fisheye:
-        kind, params = "OPENCV_FISHEYE", (k1, k2, k3, k4)
-    return CameraModel(camera=1, model=kind, params=(*pinhole, *params), width=width, height=height)
+        terms = (k1, k2, *others[:2])
+        return opencv_lens(size_px, pinhole).replace(model="OPENCV_FISHEYE", params=pinhole + terms)
+    return opencv_lens(size_px, pinhole, (k1, k2, value("p1"), value("p2"), *others))

@@ -101,6 +101,15 @@ def test_a_fisheye_distorts_by_the_angle(save, lens_of):
     assert found == pytest.approx([7 + 2 * bent, 5 + 6 * bent])
 
 
+def test_the_rational_terms_of_opencv_are_a_denominator(save, lens_of):
+    more = {"k1": 0.2, "k2": -1.0, "k3": 3.0, "k4": 0.5, "k5": 2.0, "k6": -8.0, "p1": 0.3}
+    found = lens_of(read_transforms, save(camera_model="FULL_OPENCV", **more), 0.1, 0.2)
+    r2 = 0.05
+    ratio = (1 + 0.2 * r2 - r2**2 + 3 * r2**3) / (1 + 0.5 * r2 + 2 * r2**2 - 8 * r2**3)
+    x, y = 0.1 * ratio + 2 * 0.3 * 0.02, 0.2 * ratio + 0.3 * (r2 + 2 * 0.04)
+    assert found == pytest.approx([7 + 20 * x, 5 + 30 * y])
+
+
 @pytest.mark.parametrize(
     ("more", "needed"),
     [
@@ -113,6 +122,8 @@ def test_a_fisheye_distorts_by_the_angle(save, lens_of):
         ({"mask_path": "none.png"}, "the mask of a photograph"),
         ({"camera_model": "EQUIRECTANGULAR"}, "a camera_model of"),
         ({"k4": 0.1}, "k4 = 0"),
+        ({"k6": 0.1}, r"k4 = 0 for .*Found: k3 to k6 = \[0\.0, 0\.0, 0\.0, 0\.1\]"),
+        ({"k5": 0.1, "camera_model": "OPENCV_FISHEYE"}, "k5 = 0"),
         ({"k1": "much"}, "1 finite number as k1"),
         ({"fl_x": 0, "fl_y": 0}, "fl_x or camera_angle_x"),
         (
