@@ -46,7 +46,6 @@ SOLE_IMPORTERS = {
     "tyro": {"cli/", "pimper_bench/cli/"},
     "matplotlib": {"viz/", "pimper_bench/table/contact_sheet.py"},
     "viser": {"viewer/"},
-    "pxr": {"io/assets/usd.py"},
     "onnxruntime": {"priors/network.py"},
     "rembg": {"priors/salient_networks.py"},
     "distributed": {"cli/batches/engines.py"},
@@ -57,7 +56,6 @@ SOLE_IMPORTERS = {
 MODULES = {
     "pyyaml": "yaml",
     "pillow": "PIL",
-    "usd-core": "pxr",
     "scikit-image": "skimage",
     "opencv-python-headless": "cv2",
 }

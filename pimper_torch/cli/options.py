@@ -67,7 +67,6 @@ class CommonOptions:
         watertight: Close the mesh; caps are marked as not measured.
         stl: Also write the mesh as STL.
         obj: Also write mesh and asset as OBJ.
-        usdz: Also write the asset as USDZ; needs pip install "pimper_torch[usd]".
         texture: Format of the textures in asset.glb.
         asset_cameras: Include the cameras of the photographs in asset.glb.
         no_report: Do not write report.html.
@@ -87,7 +86,6 @@ class CommonOptions:
     watertight: Flag = False
     stl: Flag = False
     obj: Flag = False
-    usdz: Flag = False
     texture: TextureFormat = "png"
     asset_cameras: Flag = False
     no_report: Flag = False
@@ -107,7 +105,7 @@ class CommonOptions:
     @property
     def files(self) -> MeshFiles:
         """Faces and file formats of the written surface."""
-        wanted: dict[MeshFormat, bool] = {"stl": self.stl, "obj": self.obj, "usdz": self.usdz}
+        wanted: dict[MeshFormat, bool] = {"stl": self.stl, "obj": self.obj}
         return MeshFiles(
             faces=self.faces,
             watertight=self.watertight,
@@ -192,7 +190,7 @@ class Job:
 _RARE = (
     *("--scales", "--on-failure", "--max-kept", "--camera-distance", "--markers", "--unit"),
     *("--no-report", "--normals", "--axes", "--normals-error-deg", "--depth", "--depth-error"),
-    *("--silhouettes", "--segmenter", "--object-at", "--usdz", "--texture", "--asset-cameras"),
+    *("--silhouettes", "--segmenter", "--object-at", "--texture", "--asset-cameras"),
 )
 
 # Both cranium and face of the skull are visible in this photograph.

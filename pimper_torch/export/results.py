@@ -21,7 +21,6 @@ from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.geometry.pinholes import up_world
 from pimper_torch.io.assets.mesh_files import MeshFiles as MeshFiles
 from pimper_torch.io.assets.placement import Placement, standing
-from pimper_torch.io.assets.usd import write_usdz
 from pimper_torch.io.assets.write import write_asset, write_asset_obj
 from pimper_torch.io.meshes import write_glb, write_obj, write_ply, write_stl
 from pimper_torch.radiometry import to_bytes
@@ -146,8 +145,6 @@ def _write_assets(
     asset: TexturedMesh, files: MeshFiles, placement: Placement, folder: Path
 ) -> None:
     write_asset(asset, folder / "asset.glb", placement, files.texture)
-    if "usdz" in files.formats:
-        write_usdz(asset, folder / "asset.usdz", placement)
     if "obj" in files.formats:
         write_asset_obj(asset, folder / "asset.obj", placement)
 

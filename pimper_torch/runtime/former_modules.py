@@ -30,7 +30,6 @@ _FORMER = {
     "result.asset.finish": "stages.meshing.finish",
     "result.asset.gltf": "io.assets.gltf",
     "result.asset.mesh_files": "io.assets.mesh_files",
-    "result.asset.usd": "io.assets.usd",
     "result.asset.write": "io.assets.write",
     "result.relighting": "stages.relighting",
     "result.report": "viz.report",

@@ -3,7 +3,6 @@ import json
 import os
 import shutil
 import subprocess
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from pimper_torch.geometry.rigid import rotate, transform
 from pimper_torch.geometry.tangents import vertex_tangents
 from pimper_torch.geometry.visibility import RayCaster
 from pimper_torch.io.assets.placement import Placement, standing
-from pimper_torch.io.assets.usd import write_usdz
 from pimper_torch.io.assets.write import write_asset, write_asset_obj
 from pimper_torch.io.meshes import write_glb
 from pimper_torch.radiometry import linear_from_srgb, srgb_from_linear
@@ -343,33 +341,6 @@ def test_the_mask_of_unreliable_albedo_is_a_texture_of_the_glb(full, few, asset,
     texture = tree["materials"][0]["extras"]["albedo_uncertainty"]["index"]
     mask = picture_in(tmp_path / "doubtful.glb", tree["textures"][texture]["source"])
     assert np.array_equal(mask, doubtful.uncertainty)
-
-
-def test_a_usdz_is_complete_and_in_metres(asset, placement, tmp_path):
-    pytest.importorskip("pxr")
-    from pxr import Usd, UsdGeom, UsdShade, UsdValidation
-
-    write_usdz(asset, tmp_path / "asset.usdz", placement)
-    stage = Usd.Stage.Open(str(tmp_path / "asset.usdz"))
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    assert len(validators) > 10
-    issues = UsdValidation.ValidationContext(validators).Validate(stage)
-    assert [issue.GetMessage() for issue in issues] == []
-    assert UsdGeom.GetStageUpAxis(stage) == "Y"
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/asset/surface"))
-    vertices, _ = placement.placed(asset.mesh.vertices_world, asset.normals)
-    assert_close(torch.tensor(np.array(mesh.GetPointsAttr().Get())), vertices)
-    back = list(mesh.GetPrim().GetCustomDataByKey("scene_from_asset"))
-    assert back == pytest.approx(placement.extras["scene_from_asset"])
-    material, _ = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()
-    texture = UsdShade.Shader(stage.GetPrimAtPath("/asset/material/albedo"))
-    assert material.GetPath() == "/asset/material"
-    with zipfile.ZipFile(tmp_path / "asset.usdz") as archive:
-        picture = archive.read(texture.GetInput("file").Get().path.removeprefix("./"))
-    assert np.array_equal(np.asarray(Image.open(io.BytesIO(picture))), asset.base_color)
-    uv = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
-    assert np.allclose(uv * [1, -1] + [0, 1], asset.uv)  # v is up
 
 
 def test_the_glb_of_a_mesh_is_valid(full, tmp_path):

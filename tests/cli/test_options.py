@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-from importlib.util import find_spec
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -30,7 +29,7 @@ RUNS = {
         "--hold-out 2 --preset {preset} --reference view_002 --max-size-px 48 --overwrite "
         "--cache {out}_kept --fresh --max-kept 2GB --object masks --mask-object bright "
         "--region (-9.0,-9.0,-9.0,9.0,9.0,9.0) --watertight --stl --obj --open "
-        "--usdz --texture webp --asset-cameras "
+        "--texture webp --asset-cameras "
         "--scale-bar view_000.png,32,24+view_003,32,24 view_001,32,24 250 "
         "--camera-distance view_000 view_003.png 0.5 --markers 25 --unit cm --view --no-report "
         "--normals {maps} --axes world --normals-error-deg 10 --depth {maps} --depth-error 0.05",
@@ -46,7 +45,7 @@ RUNS = {
     "demo": [
         "-o {out} --preset default --scales (0.5,) --reference 39 --device cpu --max-size-px 60 "
         "--overwrite --faces 500 --watertight --stl --obj --no-report --fresh --cache {out}_kept "
-        "--usdz --texture jpeg --asset-cameras --max-kept 1.5GB --max-memory 20GB "
+        "--texture jpeg --asset-cameras --max-kept 1.5GB --max-memory 20GB "
         "--on-failure skip --view --hold-out 0 --open"
     ],
     "render": [
@@ -169,8 +168,6 @@ def engines(request, monkeypatch, tmp_path):
 
 def run(command, line, world, tmp_path):
     words = line.format(out=tmp_path / "out", **world).split()
-    if find_spec("pxr") is None:
-        words = [word for word in words if word != "--usdz"]
     return main([command, *words])
 
 

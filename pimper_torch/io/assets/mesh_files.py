@@ -1,13 +1,11 @@
 """File options of a mesh."""
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Literal
 
 from pimper_torch.runtime.config import require
-from pimper_torch.runtime.errors import ConfigError
 
-MeshFormat = Literal["stl", "obj", "usdz"]
+MeshFormat = Literal["stl", "obj"]
 TextureFormat = Literal["png", "jpeg", "webp"]
 
 
@@ -18,8 +16,7 @@ class MeshFiles:
     Attributes:
         faces: Maximum number of faces; ``None`` for as few as represent the surface to a twentieth
             of a sample's spacing and 1.5 degrees.
-        formats: In addition to PLY and GLB, which are always written. USDZ contains the asset, and
-            needs usd-core, the extra ``usd``.
+        formats: In addition to PLY and GLB, which are always written.
         texture: Of the images in ``asset.glb``; other images are PNG.
         cameras: Whether ``asset.glb`` contains the cameras of the photographs.
     """
@@ -33,7 +30,3 @@ class MeshFiles:
     def __post_init__(self) -> None:
         too_few = self.faces is not None and self.faces != "all" and self.faces < 4
         require(not too_few, "faces", self.faces, "all, or at least 4, a tetrahedron's")
-        if "usdz" in self.formats and find_spec("pxr") is None:
-            raise ConfigError(
-                "USDZ needs usd-core, which is not installed: pip install 'pimper_torch[usd]'."
-            )
