@@ -22,9 +22,8 @@ from pimper_torch.records.shapes import Scalars
 from pimper_torch.stages.silhouettes.mask_evidence import MaskEvidence, Signs
 
 # Rounds of the alternation, those with soft labels, and those without reordering in every second
-# start; signs of masks at points that are kept; largest common shift, of the longer side, and views
-# that are compared for it: choices.
-_ROUNDS, _SOFT, _IN_ORDER, _SIGNS, _SHIFT, _VIEWS = 12, 2, 4, 1e8, 0.2, 40
+# start; largest common shift, of the longer side, and views that are compared for it: choices.
+_ROUNDS, _SOFT, _IN_ORDER, _SHIFT, _VIEWS = 12, 2, 4, 0.2, 40
 # Fractions of contradicting points that decide nothing: a choice.
 _EVEN = 5e-4
 
@@ -93,7 +92,6 @@ def _assigned(evidence: MaskEvidence, turn: int, in_order: int) -> Reading:
     Args:
         in_order: Rounds before masks are reordered.
     """
-    evidence = evidence.thinned(_SIGNS / len(evidence.names) / len(evidence.files))
     named, files = list(evidence.files), list(evidence.files.values())
     forms = [(turn, _is_inverted(mask)) for mask in files]
     signs = [_in_all_views(evidence, *each) for each in zip(files, forms, strict=True)]

@@ -6,7 +6,7 @@ agree that it is outside.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Int, Int8
@@ -21,8 +21,9 @@ from pimper_torch.records import Cameras, SparseScene
 from pimper_torch.records.shapes import PerView
 from pimper_torch.stages.silhouettes.cues import soft_masks_of
 
-# Longer side of the compared masks, and number of points: choices.
-_SMALL_PX, _POINTS = 320, 4000
+# Longer side of the compared masks, number of points, and signs of all masks at points in all views:
+# choices.
+_SMALL_PX, _POINTS, _SIGNS = 320, 4000, 400_000_000
 _FEWEST = 50  # pairs of points and views needed as evidence
 _BARE = 0.02  # contradiction of masks without points; a choice
 MARGIN = 0.01  # tolerance for masks drawn by hand, of the longer side
@@ -71,7 +72,8 @@ class MaskEvidence:
         if len(files) < 3:
             return None
         tracked = well_tracked(scene).cpu()
-        sampled = tracked.nonzero()[:, 0][:: math.ceil((int(tracked.sum()) + 1) / _POINTS)]
+        most = min(_POINTS, _SIGNS // (len(files) * views.num_views))
+        sampled = tracked.nonzero()[:, 0][:: math.ceil((int(tracked.sum()) + 1) / most)]
         intrinsics = scale_intrinsics(cameras.intrinsics, factor, factor)
         cameras = cameras.replace(intrinsics=intrinsics, sizes_px=sizes)
         points = scene.points_world.detach().cpu().float()[sampled]
@@ -86,14 +88,6 @@ class MaskEvidence:
             in_frame=in_frame,
             observed=scene.observed.cpu()[sampled].mT & in_frame,
         )
-
-    def thinned(self, count: float) -> "MaskEvidence":
-        """Return the evidence of about ``count`` points, or of all if there are fewer."""
-        step = math.ceil(self.pixels.shape[1] / max(count, 1)) or 1
-        pixels, in_frame, observed = (
-            x[:, ::step] for x in (self.pixels, self.in_frame, self.observed)
-        )
-        return replace(self, pixels=pixels, in_frame=in_frame, observed=observed)
 
     def signs(self, mask: Raster, view: int) -> Signs:
         """Return 1 for points inside a mask in a view, -1 outside, 0 near its border."""
