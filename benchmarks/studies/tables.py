@@ -23,14 +23,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
 from declared import Figures, Key, Place, Study, Table
 
 from pimper_bench.table.measure import this_machine
 from pimper_torch.runtime.user_cache import user_cache
 
 # In the order in which they are measured.
-NAMES = ("comparison",)
+NAMES = ("comparison", "capture_modes", "ingredients", "cameras", "lights")
+ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "benchmarks" / "figures"
 PICTURES = ROOT / "docs" / "images"
 OLD = 2  # minor versions after which a table is out of date
