@@ -128,4 +128,5 @@ STUDY = Study(
         ),
     ],
     draw=draw,
+    picture="docs/images/comparison.jpg",
 )

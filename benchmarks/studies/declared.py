@@ -89,12 +89,17 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """A question: its rows, its tables, and a picture that is drawn from kept files."""
+    """A question: its rows and its tables.
+
+    Attributes:
+        draw: Draws the file ``picture`` of the repository from what rows kept.
+    """
 
     name: str
     rows: Mapping[Key, Row]
     tables: Sequence[Table]
     draw: Callable[[Place, Path], None] | None = None
+    picture: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,16 +29,32 @@ from pimper_bench.table.measure import this_machine
 from pimper_torch.runtime.user_cache import user_cache
 
 # In the order in which they are measured.
-NAMES = ("comparison", "capture_modes", "ingredients", "cameras", "lights")
+NAMES = (
+    "comparison",
+    "capture_modes",
+    "ingredients",
+    "strangers",
+    "cameras",
+    "lights",
+    "priors",
+    "file_encodings",
+    "sfm",
+    "walk",
+    "normal_integration",
+    "gamma",
+    "gradients",
+    "gradient_cost",
+)
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "benchmarks" / "figures"
-PICTURES = ROOT / "docs" / "images"
 OLD = 2  # minor versions after which a table is out of date
 Record = dict[str, Any]
 
 
 def study_named(name: str) -> Study:
     """Return the declaration of a study."""
+    if (helpers := str(ROOT / "tests" / "helpers")) not in sys.path:
+        sys.path.append(helpers)
     return importlib.import_module(name).STUDY
 
 
@@ -58,18 +74,18 @@ def commit() -> str:
     return told["log"] + "+" * bool(told["status"])
 
 
-def kept_rows(study: Study) -> dict[Key, Record]:
+def kept_rows(study: Study, folder: Path = FIGURES) -> dict[Key, Record]:
     """Read the kept rows of a study, in the order of its declaration."""
-    path = FIGURES / f"{study.name}.json"
+    path = folder / f"{study.name}.json"
     rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     known = {tuple(row["key"]): row for row in rows}
     return {key: known[key] for key in study.rows if key in known}
 
 
-def keep(study: Study, rows: Mapping[Key, Record]) -> None:
+def keep(study: Study, rows: Mapping[Key, Record], folder: Path) -> None:
     """Write the rows of a study."""
-    FIGURES.mkdir(exist_ok=True)
-    path = FIGURES / f"{study.name}.json"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{study.name}.json"
     ordered = [rounded(rows[key]) for key in study.rows if key in rows]
     part = path.with_suffix(".part")
     part.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -180,7 +196,7 @@ def write_tables(study: Study) -> None:
 
 def measure_study(study: Study, options: argparse.Namespace) -> None:
     """Measure the rows of a study that are missing or of another version, then write its tables."""
-    rows = kept_rows(study)
+    rows = kept_rows(study, options.figures)
     for key in study.rows:
         former, name = rows.get(key), " ".join(key)
         if options.only not in name or not needed(former, options.again):
@@ -190,15 +206,18 @@ def measure_study(study: Study, options: argparse.Namespace) -> None:
         except RuntimeError as error:
             say(f"{study.name}: {name} failed: {error}")
             continue
-        keep(study, rows)
+        keep(study, rows, options.figures)
         say(f"{study.name}: {name}, {rows[key]['CPU s']:.0f} CPU s")
-    write_tables(study)
+    if options.tiny:
+        say("\n".join(markdown(table, rows) for table in study.tables))
+    else:
+        write_tables(study)
 
 
 def draw(study: Study, options: argparse.Namespace) -> None:
     """Draw the picture of a study, if all its rows are kept."""
     if study.draw is not None and len(kept_rows(study)) == len(study.rows):
-        study.draw(Place(cache=options.cache), PICTURES / f"{study.name}.jpg")
+        study.draw(Place(cache=options.cache), ROOT / study.picture)
 
 
 def state(study: Study) -> str:
@@ -230,6 +249,7 @@ def options_of(arguments: list[str] | None) -> argparse.Namespace:
     for name in ("--row", "--out", "--digest"):  # of the process of one row
         parser.add_argument(name, nargs="+" if name == "--row" else None, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
+    options.figures = FIGURES if not options.tiny else options.cache / "figures"
     options.cache = options.cache or user_cache() / "tables"
     options.out = options.out and Path(options.out)
     return options
@@ -248,7 +268,8 @@ def main(arguments: list[str] | None = None) -> None:
             write_tables(study)
         else:
             measure_study(study, options)
-            draw(study, options)
+            if not options.tiny:
+                draw(study, options)
 
 
 if __name__ == "__main__":
