@@ -13,7 +13,7 @@ from pimper_torch.io.meshes import read_mesh
 from pimper_torch.viz.render import shade
 from pimper_torch.viz.tiles import Tile, array, encoded, sheet
 
-SCENES = ("jar", "balls", "potatoes", "mug")
+SCENES = ("jar", "potatoes", "mug", "balls")
 METHODS = {
     "default": "`default`",
     "openmvs": "OpenMVS 2.3, refined",
@@ -29,7 +29,8 @@ def best(kept: Kept, scene: str, name: str) -> float:
 
 
 def side_by_side(kept: Kept) -> list[list[str]]:
-    """Return normals and Chamfer of each method, a column for each scene; the best in bold."""
+    """Return normals and Chamfer of each method on the scenes that all have; the best in bold."""
+    scenes = [scene for scene in SCENES if all((scene, method) in kept for method in METHODS)]
 
     def cell(scene: str, method: str) -> str:
         row = kept.get((scene, method), {})
@@ -40,8 +41,8 @@ def side_by_side(kept: Kept) -> list[list[str]]:
             texts.append(f"**{text}**" if bold else text)
         return " · ".join(texts)
 
-    head = ["normals in degrees · Chamfer in %", *SCENES]
-    rows = [[told, *(cell(scene, method) for scene in SCENES)] for method, told in METHODS.items()]
+    head = ["normals in degrees · Chamfer in %", *scenes]
+    rows = [[told, *(cell(scene, method) for scene in scenes)] for method, told in METHODS.items()]
     return [head, *rows]
 
 

@@ -6,6 +6,7 @@ A study has rows, each a function that returns figures. A table shows some of th
 
 import hashlib
 import json
+import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,8 @@ Key = tuple[str, ...]
 Kept = Mapping[Key, Figures]
 Lines = Callable[[Kept], list[list[str]]]
 
-DATA = Path(__file__).parents[3] / "shared" / "data"  # next to the repository
+# Data that may not be published with the package; by default next to the repository.
+DATA = Path(os.environ.get("PIMPER_DATA", Path(__file__).parents[3] / "shared" / "data"))
 TINY = {"num_views": 8, "width": 240, "height": 180}  # of scenes, for tests
 MISSING = "\N{EN DASH}"
 

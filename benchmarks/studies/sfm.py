@@ -57,15 +57,15 @@ def measure(place: Place, photographs: str, settings: str) -> Figures:
         warnings.simplefilter("ignore", PimperWarning)
         scene = Reconstruct(SETTINGS[settings])(views)
     seconds = cpu_seconds() - began
-    angles = rotation_errors_deg(scene, reference)
-    length = torch.bincount(scene.observation_point)
-    return {
+    length, figures = torch.bincount(scene.observation_point), {}
+    if reference.exists():
+        angles = rotation_errors_deg(scene, reference)
+        figures = {"wrong": int((angles > 2).sum()), "rotation": float(angles.median())}
+    return figures | {
         "views": f"{scene.views.num_views} of {views.num_views}",
         "points": len(length),
         "track": float(length.double().mean()),
         "error": float(scene.reprojection_errors_px.mean()),
-        "wrong": int((angles > 2).sum()),
-        "rotation": float(angles.median()),
         "CPU s": seconds,
     }
 

@@ -44,10 +44,10 @@ NAMES = (
     "gamma",
     "gradients",
     "gradient_cost",
+    "growth",
 )
 ROOT = Path(__file__).parents[2]
 FIGURES = ROOT / "benchmarks" / "figures"
-OLD = 2  # minor versions after which a table is out of date
 Record = dict[str, Any]
 
 
@@ -126,8 +126,13 @@ def measured(study: Study, key: Key, former: Record | None, options: argparse.Na
             process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             raise RuntimeError(log.read_text(encoding="utf-8", errors="replace").strip()[-600:])
-        found = json.loads(out.read_text(encoding="utf-8"))
-    if found["figures"] is None:
+        told = json.loads(out.read_text(encoding="utf-8"))
+    return record_of(key, told, former, usage.ru_utime + usage.ru_stime)
+
+
+def record_of(key: Key, told: Record, former: Record | None, seconds: float) -> Record:
+    """Return a row with version, commit, processor and cores, or a rival's that is kept."""
+    if told["figures"] is None:
         assert former is not None
         return former | {"version": version()}
     machine = this_machine()
@@ -137,9 +142,9 @@ def measured(study: Study, key: Key, former: Record | None, options: argparse.Na
         "commit": commit(),
         "processor": machine.cpu,
         "cores": machine.cores,
-        "digest": found["digest"],
-        "CPU s": usage.ru_utime + usage.ru_stime,
-        "figures": found["figures"],
+        "digest": told["digest"],
+        "CPU s": seconds,
+        "figures": told["figures"],
     }
 
 
@@ -161,7 +166,8 @@ def markdown(table: Table, rows: Mapping[Key, Record]) -> str:
     """Return a table with the line that says what it was measured with."""
     head, *lines = table.lines({key: row["figures"] for key, row in rows.items()})
     rule = ["---" if index < table.labels else "--:" for index in range(len(head))]
-    text = "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *lines))
+    body = (f"| {' | '.join(cells)} |" for cells in lines)
+    text = "\n".join((f"| {' | '.join(head)} |", f"|{'|'.join(rule)}|", *body))
     return f"{text}\n\n{provenance(rows)}"
 
 
