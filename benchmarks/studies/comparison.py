@@ -41,8 +41,14 @@ def side_by_side(kept: Kept) -> list[list[str]]:
             texts.append(f"**{text}**" if bold else text)
         return " · ".join(texts)
 
-    head = ["normals in degrees · Chamfer in %", *scenes]
-    rows = [[told, *(cell(scene, method) for scene in scenes)] for method, told in METHODS.items()]
+    def seconds(method: str) -> str:
+        return number(sum(kept[scene, method]["CPU s"] / len(scenes) for scene in scenes), 0)
+
+    head = ["normals in degrees · Chamfer in %", *scenes, "CPU s, mean"]
+    rows = [
+        [told, *(cell(scene, method) for scene in scenes), seconds(method)]
+        for method, told in METHODS.items()
+    ]
     return [head, *rows]
 
 
