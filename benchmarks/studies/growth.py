@@ -15,9 +15,9 @@ COUNTS = (10, 30)
 
 def measure(place: Place, count: int, width: int, height: int) -> Figures:
     """Run the command line on every third photograph of an armadillo, or on all."""
-    scene, upright = model("armadillo", MESHES, place.cache / "shapes")
-    settings = {"specular": 0.3, "table": "patterned", **upright}
-    folder = place.scene(scene, num_views=30, width=width, height=height, **settings)
+    scene, _ = model("armadillo", MESHES, place.cache / "shapes")
+    size = {"num_views": 30, "width": width, "height": height}
+    folder = place.scene(scene, specular=0.3, table="patterned", **size)
     taken = place.cache / "growth" / f"{folder.name}-{count}"
     (taken / "photos").mkdir(parents=True, exist_ok=True)
     for path in sorted((folder / "photos").iterdir())[:: 30 // count]:

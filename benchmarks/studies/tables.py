@@ -15,6 +15,7 @@ import importlib
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -122,7 +123,11 @@ def measured(study: Study, key: Key, former: Record | None, options: argparse.Na
             process = subprocess.Popen(
                 command + ["--tiny"] * options.tiny, stdout=printed, stderr=printed
             )
-            _, status, usage = os.wait4(process.pid, 0)
+            try:
+                _, status, usage = os.wait4(process.pid, 0)
+            except BaseException:  # the command is stopped, and its row, too
+                process.terminate()
+                raise
             process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             raise RuntimeError(log.read_text(encoding="utf-8", errors="replace").strip()[-600:])
@@ -279,4 +284,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the process of a row, too
     main()
