@@ -12,7 +12,7 @@ from pimper_torch.io.photographs import read_mask
 from pimper_torch.runtime.errors import ReconstructionError
 
 SHAPE = "armadillo"
-SIZE = {"num_views": 24, "width": 320, "height": 240}
+SIZE = {"num_views": 20, "width": 320, "height": 240}
 ALONG = {"arc": "arc of 50°", "wide": "arc of 120°", "round": "all round"}
 MADE_OF = {"plain": "textured", "weak": "of one colour", "gloss": "glossy"}
 

@@ -4,22 +4,23 @@ The linear photographs of a scene are written as PNG in other encodings, with an
 that state it. Each set is reconstructed with the true cameras and masks and measured.
 """
 
-import io
-import json
 import struct
-import warnings
 import zlib
-from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from bench_runs import figures_of
 from declared import Figures, Place, Row, Study, Table, figure, listed
 from PIL import Image
 
-from pimper_torch.cli.main import main as pimper
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.metrics.estimates import estimate_of
+from pimper_bench.metrics.evaluation import evaluate
 from pimper_torch.io.decode import decode, write_deep_png
+from pimper_torch.io.photographs import load_views
+from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.radiometry.primaries import (
     DISPLAY_P3,
@@ -35,6 +36,14 @@ ENCODINGS = {
     "Display P3": (DISPLAY_P3, False, bytes([12, 13, 0, 1])),
     "BT.2020": (REC_2020, False, bytes([9, 13, 0, 1])),
 }
+
+SETS = (
+    ("sRGB", True),
+    ("linear", True),
+    ("linear", False),
+    ("Display P3", False),
+    ("BT.2020", False),
+)
 
 
 def write_photographs(scene: Path, folder: Path, name: str, *, says: bool) -> None:
@@ -70,32 +79,18 @@ def measure(place: Place, name: str, says: bool) -> Figures:
     scene = place.scene("potatoes", bits=16, encoding="linear", **size)
     folder = place.cache / "encodings" / f"{name} {'said' if says else 'silent'}"
     write_photographs(scene, folder / "photos", name, says=says)
-    truth, report = scene / "truth", folder / "evaluation.json"
-    run = [folder / "photos", "--sparse", truth / "sparse", "--masks", scene / "masks"]
-    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        for line in (
-            ["reconstruct", *run, "-o", folder / "out", "--overwrite", "--quiet"],
-            ["evaluate", folder / "out", scene, "-o", report, "--overwrite", "--quiet"],
-        ):
-            if pimper([str(one) for one in line]) != 0:
-                raise RuntimeError(f"{line[0]} failed")
-    told = json.loads(report.read_text(encoding="utf-8"))
-    view = told["views"][0]
-    return {
-        "lights": told["lights"]["mean_rotated_deg"],
-        "normals": view["shape_normals"]["mean_deg"],
-        "albedo": view["albedo"]["one_scale_percent"],
-        "albedo, median": view["albedo"]["one_scale_median_percent"],
-    }
+    place.photographs(folder, "photos")
+    views = load_views(folder / "photos", masks=scene / "masks")
+    result = load_chain("default")(views, scene / "truth" / "sparse")
+    found = evaluate(estimate_of(result), read_rendered(scene, photographs=False))
+    return figures_of(found)
 
 
 STUDY = Study(
     name="file_encodings",
     rows={
         (name, "yes" if says else "no"): Row(measure=partial(measure, name=name, says=says))
-        for name in ENCODINGS
-        for says in (True, False)
+        for name, says in SETS
     },
     tables=[
         Table(

@@ -14,7 +14,7 @@ from probes import probes, small_scene
 import pimper_torch as pt
 from pimper_torch.runtime.errors import PimperWarning
 
-STAGES = ("warp", "factorize", "sweep", "fuse", "repair", "remesh", "decompose", "chain")
+STAGES = ("factorize", "sweep", "fuse", "chain")
 
 
 def measure(place: Place, stage: str) -> Figures:

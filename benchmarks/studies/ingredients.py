@@ -8,7 +8,7 @@ from declared import Row, Study, Table, bracketed, figure, listed
 from pimper_bench.table.bench_inputs import BenchConfig
 
 TRUE = BenchConfig(cameras="true", masks=True)
-SIZE = {"num_views": 12, "width": 320, "height": 240}
+SIZE = {"num_views": 8, "width": 240, "height": 180}
 ROOM = {"ambient": 0.05, "window": 0.4, "irradiance": 0.45}
 INGREDIENTS = {
     "`default`": "default",
@@ -18,26 +18,9 @@ INGREDIENTS = {
     "without removing the normal bias of facets": "without-normal-bias",
     "without cast shadows": "without-shadows",
     "lights of a patch free": "without-light-prior",
-    "only the light field, no lights per patch": "without-patch-lights",
     "least squares instead of the robust loss": "without-robust-loss",
-    "one pass, at full size": "without-rounds",
     "the smoothed sparse cloud": "smoothed",
 }
-LIGHTS = {
-    "a room with a window": ("potatoes", ROOM, "without-room-light"),
-    "lamps of different colours": ("jar", {"lamp_colour": 0.4}, "without-light-colours"),
-}
-
-
-def light_rows() -> dict[tuple[str, ...], Row]:
-    """Return the rows of rooms and of lamps, with their models and without."""
-    rows = {}
-    for told, (scene, light, without) in LIGHTS.items():
-        for method in ("default", without):
-            settings = "`default`" if method == "default" else method.replace("-", " ")
-            measure = partial(run, name=scene, method=method, given=TRUE, **SIZE, **light)
-            rows["light", f"{scene}, {told}", settings] = Row(measure=measure)
-    return rows
 
 
 STUDY = Study(
@@ -48,7 +31,15 @@ STUDY = Study(
         )
         for told, method in INGREDIENTS.items()
     }
-    | light_rows(),
+    | {
+        ("room", told): Row(
+            measure=partial(run, name="potatoes", method=method, given=TRUE, **SIZE, **ROOM)
+        )
+        for told, method in {
+            "`default`": "default",
+            "without the room's light": "without-room-light",
+        }.items()
+    },
     tables=[
         Table(
             name="ingredients",
@@ -66,17 +57,16 @@ STUDY = Study(
             ),
         ),
         Table(
-            name="light-models",
+            name="room",
             document="benchmarks/README.md",
-            labels=2,
             lines=listed(
-                ["scene", "settings"],
+                ["settings"],
                 [
                     bracketed("accuracy, % (median)", "accuracy", "accuracy, median", 3),
                     bracketed("normals, mean (median) °", "normals", "normals, median"),
                     bracketed("albedo, % (median)", "albedo", "albedo, median", 1),
                 ],
-                first="light",
+                first="room",
             ),
         ),
     ],

@@ -37,7 +37,6 @@ OURS = ReconstructConfig()
 UNGUIDED = dataclasses.replace(OURS, guided_pairs=0, starts=0, track_iterations=0)
 SETTINGS = {
     "COLMAP's": COLMAP,
-    "COLMAP's, second start": dataclasses.replace(COLMAP, starts=OURS.starts),
     "contrast 0.002, affine, 2 px": UNGUIDED,
     "`default`": OURS,
 }

@@ -171,7 +171,7 @@ def write(scene: Scene, folder: Path, *, strangers: bool, people: bool) -> None:
 
 def measure(place: Place, name: str) -> Figures:
     """Write a set unless it exists, reconstruct it, and measure."""
-    scene = scene_of(*((8, 320) if place.tiny else (24, 480)))
+    scene = scene_of(*((8, 320) if place.tiny else (20, 400)))
     folder = place.cache / "strangers" / name
     if not folder.exists():
         write(scene, folder, strangers=name != "one", people=name == "strangers")

@@ -36,16 +36,16 @@ ROWS = {
     "comparison": "jar smoothed",
     "ingredients": "the smoothed sparse cloud",
     "strangers": "one camera and exposure",
-    "cameras": "mug features",
-    "lights": "6 places, 6 lights each",
-    "priors": "jar smooth errors of 10°",
+    "cameras": "features",
+    "lights": "6 places, 4 lights each",
+    "priors": "jar smooth errors",
     "file_encodings": "linear no",
     "sfm": "skull, 26 COLMAP's",
     "walk": "30",
     "normal_integration": "creases supp_tent",
     "gamma": "sRGB 0.2",
-    "gradients": "repair",
-    "gradient_cost": "warp",
+    "gradients": "sweep",
+    "gradient_cost": "factorize",
 }
 OF_MESHES = {"capture_modes", "growth"}  # which are not in the repository
 PARTS = {"bench_runs", "declared", "fleet_captures", "tables"}
