@@ -47,17 +47,17 @@ def run(
         outcome.estimate, inputs.capture, given.evaluation, surface=inputs.surface, maps=inputs.maps
     )
     mesh = transfer(outcome.estimate.mesh, found.alignment.truth_from_world)
-    write_ply(mesh, mesh_of(place, name, method))
+    write_ply(mesh, mesh_of(place, name, method, **scene))
     views = inputs.scene.views.num_views
     cost = {"CPU s": seconds, "GB": max(memory or 0.0, children * outcome.external) / 2**10}
     return {"registered": views} | figures_of(found) | cost
 
 
-def mesh_of(place: Place, name: str, method: str) -> Path:
+def mesh_of(place: Place, name: str, method: str, **scene: Any) -> Path:  # noqa: ANN401
     """Return the file of a surface that :func:`run` found, in the frame of the truth."""
     folder = place.cache / "meshes"
     folder.mkdir(parents=True, exist_ok=True)
-    return folder / f"{name}-{method}.ply"
+    return folder / f"{place.scene(name, **scene).name}-{method}.ply"
 
 
 def figures_of(found: Evaluation) -> Figures:

@@ -87,7 +87,7 @@ def draw(place: Place, path: Path) -> None:
         photograph = inputs.scene.views.images[inputs.coarse.reference].movedim(0, -1)
         pictures = {"photograph": encoded(photograph)}
         for method, title in (("openmvs", "OpenMVS"), ("default", "pimper_torch")):
-            mesh = read_mesh(mesh_of(place, scene, method))
+            mesh = read_mesh(mesh_of(place, scene, method, **SIZE))
             pictures[title] = array(shade(mesh, maps.cameras))
         tiles.append([Tile(title=title, picture=one[crop]) for title, one in pictures.items()])
     sheet(tiles, 400).convert("RGB").save(path, quality=88, optimize=True)

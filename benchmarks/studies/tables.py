@@ -173,7 +173,7 @@ def markdown(table: Table, rows: Mapping[Key, Record]) -> str:
     rule = ["---" if index < table.labels else "--:" for index in range(len(head))]
     body = (f"| {' | '.join(cells)} |" for cells in lines)
     text = "\n".join((f"| {' | '.join(head)} |", f"|{'|'.join(rule)}|", *body))
-    return f"{text}\n\n{provenance(rows)}"
+    return "\n\n".join(filter(None, (text, provenance(rows))))
 
 
 def provenance(rows: Mapping[Key, Record]) -> str:
@@ -183,7 +183,7 @@ def provenance(rows: Mapping[Key, Record]) -> str:
         f"{row['cores']} core{'s' * (row['cores'] != 1)}."
         for row in rows.values()
     )
-    return f"*{' '.join(told)}*"
+    return f"*{' '.join(told)}*" if told else ""
 
 
 def block(name: str) -> re.Pattern[str]:
