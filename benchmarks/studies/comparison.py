@@ -20,7 +20,7 @@ METHODS = {
     "smoothed": "the smoothed sparse cloud",
 }
 SIZE = {"num_views": 16, "width": 640, "height": 480}
-PICTURED = ("jar", "potatoes")
+PICTURED = {"openmvs": "OpenMVS", "default": "pimper_torch"}
 
 
 def best(kept: Kept, scene: str, name: str) -> float:
@@ -76,9 +76,12 @@ EXPECTED = listed(
 
 
 def draw(place: Place, path: Path) -> None:
-    """Draw photograph, OpenMVS and this package: the same view, material, light and crop."""
+    """Draw photograph and surfaces of two scenes: the same view, material, light and crop."""
     tiles: list[list[Tile]] = []
-    for scene in PICTURED:
+    for scene in SCENES:
+        files = {told: mesh_of(place, scene, name, **SIZE) for name, told in PICTURED.items()}
+        if len(tiles) == 2 or not all(file.exists() for file in files.values()):
+            continue
         inputs = inputs_of(place, scene, BenchConfig(), **SIZE)
         maps = inputs.maps
         assert maps.cameras is not None
@@ -86,11 +89,11 @@ def draw(place: Place, path: Path) -> None:
         crop = crop_to(maps.truth.foreground[0])
         photograph = inputs.scene.views.images[inputs.coarse.reference].movedim(0, -1)
         pictures = {"photograph": encoded(photograph)}
-        for method, title in (("openmvs", "OpenMVS"), ("default", "pimper_torch")):
-            mesh = read_mesh(mesh_of(place, scene, method, **SIZE))
-            pictures[title] = array(shade(mesh, maps.cameras))
-        tiles.append([Tile(title=title, picture=one[crop]) for title, one in pictures.items()])
-    sheet(tiles, 400).convert("RGB").save(path, quality=88, optimize=True)
+        for told, file in files.items():
+            pictures[told] = array(shade(read_mesh(file), maps.cameras))
+        tiles.append([Tile(title=told, picture=one[crop]) for told, one in pictures.items()])
+    if tiles:
+        sheet(tiles, 400).save(path, quality=88, optimize=True)
 
 
 def rival(scene: str, place: Place) -> Figures:

@@ -225,12 +225,6 @@ def measure_study(study: Study, options: argparse.Namespace) -> None:
         write_tables(study)
 
 
-def draw(study: Study, options: argparse.Namespace) -> None:
-    """Draw the picture of a study, if all its rows are kept."""
-    if study.draw is not None and len(kept_rows(study)) == len(study.rows):
-        study.draw(Place(cache=options.cache), ROOT / study.picture)
-
-
 def state(study: Study) -> str:
     """Return a study's rows and their versions in one line."""
     rows = kept_rows(study)
@@ -279,8 +273,8 @@ def main(arguments: list[str] | None = None) -> None:
             write_tables(study)
         else:
             measure_study(study, options)
-            if not options.tiny:
-                draw(study, options)
+            if study.draw is not None and not options.tiny:
+                study.draw(Place(cache=options.cache), ROOT / study.picture)
 
 
 if __name__ == "__main__":
