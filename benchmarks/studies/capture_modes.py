@@ -38,8 +38,10 @@ def measure(place: Place, path: str, material: str) -> Figures:
 
 
 def outlines(capture: Path, result: Path) -> Figures:
-    """Compare the silhouettes of a result with the true masks."""
+    """Compare the silhouettes of a result with the true masks; it may have found none."""
     names = [path.name for path in sorted((result / "masks").glob("*.png"))]
+    if not names:
+        return {}
     found, known = (
         torch.stack([read_mask(folder / "masks" / name) for name in names])
         for folder in (result, capture)
