@@ -25,6 +25,8 @@ def run(
     name: str,
     method: str = "default",
     given: BenchConfig | None = None,
+    *,
+    keep: bool = False,
     **scene: Any,  # noqa: ANN401 - of SceneConfig
 ) -> Figures:
     """Run a method on a scene, and compare it with the truth.
@@ -32,11 +34,13 @@ def run(
     Args:
         method: A preset, a baseline, or a file of ``configs/ablation`` without its ending.
         given: Whether masks and cameras are true; neither by default.
+        keep: Keep stages for rows with other settings; seconds are then of no use.
     """
     given = given or BenchConfig()
     inputs = inputs_of(place, name, given, **scene)
     file = SETTINGS / f"{method}.yaml"
-    chosen = method_named(str(file) if file.exists() else method)
+    stages = place.cache / "stages" if keep else None
+    chosen = method_named(str(file) if file.exists() else method, stages)
     began = cpu_seconds()
     with peak_memory() as peak:
         outcome = chosen(inputs.scene, inputs.coarse)

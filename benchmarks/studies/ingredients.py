@@ -27,13 +27,15 @@ STUDY = Study(
     name="ingredients",
     rows={
         ("ingredient", told): Row(
-            measure=partial(run, name="potatoes", method=method, given=TRUE, **SIZE)
+            measure=partial(run, name="potatoes", method=method, given=TRUE, keep=True, **SIZE)
         )
         for told, method in INGREDIENTS.items()
     }
     | {
         ("room", told): Row(
-            measure=partial(run, name="potatoes", method=method, given=TRUE, **SIZE, **ROOM)
+            measure=partial(
+                run, name="potatoes", method=method, given=TRUE, keep=True, **SIZE, **ROOM
+            )
         )
         for told, method in {
             "`default`": "default",

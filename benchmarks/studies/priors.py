@@ -11,7 +11,7 @@ import math
 from functools import partial
 
 import torch
-from bench_runs import cpu_seconds, figures_of
+from bench_runs import figures_of
 from declared import Figures, Place, Row, Study, Table, figure, listed
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
@@ -90,13 +90,12 @@ def measure(place: Place, scene: str, kind: str) -> Figures:
     capture = read_rendered(folder)
     photographs = pt.load_views(folder / "photos", masks=folder / "masks")
     photographs = photographs.replace(priors=prior_of(kind, capture))
-    began = cpu_seconds()
-    result = pt.load_chain("default")(photographs, folder / "truth" / "sparse")
-    seconds = cpu_seconds() - began
+    chain = pt.load_chain("default", cache=place.cache / "stages")
+    result = chain(photographs, folder / "truth" / "sparse")
     chosen = EvaluateConfig(samples=50_000, views=capture.views.names)
     found = evaluate(estimate_of(result), capture, chosen)
     angles = [float(view.shape_normals.mean_deg) for view in found.views if view.shape_normals]
-    return figures_of(found) | {"normals": sum(angles) / len(angles), "CPU s": seconds}
+    return figures_of(found) | {"normals": sum(angles) / len(angles)}
 
 
 STUDY = Study(
@@ -116,7 +115,6 @@ STUDY = Study(
                 [
                     figure("normals, °", "normals"),
                     figure("accuracy, %", "accuracy", 3),
-                    figure("CPU s", "CPU s", 0),
                 ],
             ),
         )
