@@ -24,7 +24,7 @@ import pimper_torch as pt
 from pimper_torch.runtime.errors import PimperWarning
 from pimper_torch.runtime.memory import release_memory
 
-STAGES = ("factorize", "sweep", "fuse", "the chain")
+STAGES = ("warp", "factorize", "sweep", "fuse", "decompose", "the chain")
 
 
 def tracked(arguments: Any) -> tuple[Any, list[Tensor]]:  # noqa: ANN401 - records and tuples of them

@@ -33,10 +33,10 @@ def measure(place: Place, stage: str) -> Figures:
         if check.spread == check.spread and bool(check.numeric.any() or check.analytic.any())
     }
     (source, target), worst = max(checks.items(), key=lambda item: item[1].spread)
-    off = sorted(abs(check.median - 1) for check in checks.values())
+    medians = sorted(check.median for check in checks.values())
     return {
         "pairs": len(checks),
-        "median": 1 + off[len(off) // 2],
+        "median": medians[len(medians) // 2],
         "farthest median": worst.median,
         "farthest": worst.spread,
         "worst": f"{target} by {source}",
@@ -54,7 +54,7 @@ STUDY = Study(
                 ["stage"],
                 [
                     figure("outputs by inputs", "pairs", 0),
-                    figure("median deviation of ratios", "median", 4),
+                    figure("median ratio", "median", 4),
                     said("least accurate", "worst"),
                     figure("its median ratio", "farthest median", 4),
                     figure("farthest from 1", "farthest", 4),

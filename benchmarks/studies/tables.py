@@ -177,10 +177,13 @@ def markdown(table: Table, rows: Mapping[Key, Record]) -> str:
 
 
 def provenance(rows: Mapping[Key, Record]) -> str:
-    """Return versions, commits and processors of rows in one line."""
+    """Return versions, commits and processors of rows in one line.
+
+    A row of an earlier version may have a note: on what it was measured, if not on the same.
+    """
     told = dict.fromkeys(
         f"Version {row['version']}, commit {row['commit']}; {row['processor']}, "
-        f"{row['cores']} core{'s' * (row['cores'] != 1)}."
+        f"{row['cores']} core{'s' * (row['cores'] != 1)}{row.get('note', '')}."
         for row in rows.values()
     )
     return f"*{' '.join(told)}*" if told else ""
