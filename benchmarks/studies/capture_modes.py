@@ -11,7 +11,7 @@ from fleet_captures import MATERIALS, MESHES, PATHS, model
 from pimper_torch.io.photographs import read_mask
 from pimper_torch.runtime.errors import ReconstructionError
 
-SHAPE = "armadillo"
+SHAPE = "potatoes"
 SIZE = {"num_views": 20, "width": 320, "height": 240}
 ALONG = {"arc": "arc of 50°", "wide": "arc of 120°", "round": "all round"}
 MADE_OF = {"plain": "textured", "weak": "of one colour", "gloss": "glossy"}
