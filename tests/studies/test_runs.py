@@ -34,10 +34,11 @@ RUNS = {
 # A row of each study of the tables, whose labels begin its line.
 ROWS = {
     "comparison": "jar smoothed",
+    "capture_modes": "arc of 50° textured",
     "ingredients": "the smoothed sparse cloud",
     "strangers": "one camera and exposure",
     "cameras": "features",
-    "lights": "6 places, 4 lights each",
+    "lights": "24 places, a light each",
     "priors": "jar smooth errors",
     "file_encodings": "linear no",
     "sfm": "skull, 26 COLMAP's",
@@ -47,7 +48,6 @@ ROWS = {
     "gradients": "sweep",
     "gradient_cost": "factorize",
 }
-OF_MESHES = {"capture_modes", "growth"}  # which are not in the repository
 PARTS = {"bench_runs", "declared", "fleet_captures", "tables"}
 
 
@@ -70,7 +70,7 @@ def flat(folder: Path, *, depth: bool) -> None:
 
 
 def test_all_studies_are_run():
-    assert {*ROWS} | OF_MESHES == {*tables.NAMES}
+    assert {*ROWS} == {*tables.NAMES} - {"growth"}  # its mesh is not in the repository
     assert {path.stem for path in STUDIES.glob("*.py")} == {*RUNS, *tables.NAMES} | PARTS
 
 
