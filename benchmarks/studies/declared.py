@@ -81,12 +81,20 @@ class Table:
         document: Path in the repository.
         lines: The head and the rows, as texts of cells.
         labels: Number of columns that are aligned to the left.
+        part: Only rows whose key begins with this, without it.
     """
 
     name: str
     document: str
     lines: Lines
     labels: int = 1
+    part: str | None = None
+
+    def shown(self, rows: Mapping[Key, Figures]) -> dict[Key, Figures]:
+        """Return the rows of this table."""
+        if self.part is None:
+            return dict(rows)
+        return {key[1:]: row for key, row in rows.items() if key[0] == self.part}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,24 +150,11 @@ def said(heading: str, name: str) -> Column:
     return Column(heading, lambda row: str(row.get(name, MISSING)))
 
 
-def listed(labels: Sequence[str], columns: Iterable[Column], first: str | None = None) -> Lines:
-    """Return lines with the parts of each key, then columns of figures.
-
-    Args:
-        first: Only rows whose key begins with this, without it.
-    """
+def listed(labels: Sequence[str], columns: Iterable[Column]) -> Lines:
+    """Return lines with the parts of each key, then columns of figures."""
     shown = [*columns]
-
-    def lines(kept: Kept) -> list[list[str]]:
-        chosen = {
-            key if first is None else key[1:]: row
-            for key, row in kept.items()
-            if first in (None, key[0])
-        }
-        head = [*labels, *(column.heading for column in shown)]
-        return [
-            head,
-            *([*key, *(column.text(row) for column in shown)] for key, row in chosen.items()),
-        ]
-
-    return lines
+    head = [*labels, *(column.heading for column in shown)]
+    return lambda kept: [
+        head,
+        *([*key, *(column.text(row) for column in shown)] for key, row in kept.items()),
+    ]

@@ -55,8 +55,8 @@ STUDY = Study(
                     figure("accuracy, %", "accuracy", 3),
                     figure("Chamfer, %", "Chamfer", 3),
                 ],
-                first="ingredient",
             ),
+            part="ingredient",
         ),
         Table(
             name="room",
@@ -68,8 +68,8 @@ STUDY = Study(
                     bracketed("normals, mean (median) °", "normals", "normals, median"),
                     bracketed("albedo, % (median)", "albedo", "albedo, median", 1),
                 ],
-                first="room",
             ),
+            part="room",
         ),
     ],
 )

@@ -34,8 +34,8 @@ STUDY = Study(
                     NORMALS,
                     figure("true over expected error", "ratio", 1),
                 ],
-                first="one",
             ),
+            part="one",
         ),
         Table(
             name="several-lights",
@@ -50,8 +50,8 @@ STUDY = Study(
                     figure("lights, °", "lights", 1),
                     figure("CPU s", "CPU s", 0),
                 ],
-                first="several",
             ),
+            part="several",
         ),
     ],
 )

@@ -249,7 +249,8 @@ STUDY = Study(
         Table(
             name="integration",
             document="benchmarks/README.md",
-            lines=listed(["method"], [*ERRORS, figure("CPU s", "CPU s", 1)], first="depth"),
+            lines=listed(["method"], [*ERRORS, figure("CPU s", "CPU s", 1)]),
+            part="depth",
         ),
         Table(
             name="creases",
@@ -264,8 +265,8 @@ STUDY = Study(
                     ),
                     figure("steps rejected, %", "rejected"),
                 ],
-                first="creases",
             ),
+            part="creases",
         ),
     ],
     draw=draw,

@@ -169,6 +169,7 @@ def measure_row(study: Study, options: argparse.Namespace) -> None:
 
 def markdown(table: Table, rows: Mapping[Key, Record]) -> str:
     """Return a table with the line that says what it was measured with."""
+    rows = table.shown(rows)
     head, *lines = table.lines({key: row["figures"] for key, row in rows.items()})
     rule = ["---" if index < table.labels else "--:" for index in range(len(head))]
     body = (f"| {' | '.join(cells)} |" for cells in lines)
