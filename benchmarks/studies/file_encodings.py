@@ -1,27 +1,26 @@
 """Error if files do not state the encoding of their samples, or if it is ignored.
 
-Run as ``python benchmarks/studies/file_encodings.py SCENE -o FOLDER``, with a scene from ``pimper
-render`` with ``--bits 16 --encoding linear``. Its photographs are written as PNG in other
-encodings, with and without the chunks that state it. Each set is reconstructed with the true
-cameras and masks and measured. Prints rows of a table.
+The linear photographs of a scene are written as PNG in other encodings, with and without the chunks
+that state it. Each set is reconstructed with the true cameras and masks and measured.
 """
 
-import argparse
-import io
-import json
 import struct
-import sys
-import warnings
 import zlib
-from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from bench_runs import figures_of
+from declared import Figures, Place, Row, Study, Table, figure, listed
 from PIL import Image
 
-from pimper_torch.cli.main import main as pimper
+from pimper_bench.datasets.rendered import read_rendered
+from pimper_bench.metrics.estimates import estimate_of
+from pimper_bench.metrics.evaluation import evaluate
 from pimper_torch.io.decode import decode, write_deep_png
+from pimper_torch.io.photographs import load_views
+from pimper_torch.presets.load_chain import load_chain
 from pimper_torch.radiometry import srgb_from_linear
 from pimper_torch.radiometry.primaries import (
     DISPLAY_P3,
@@ -37,24 +36,14 @@ ENCODINGS = {
     "Display P3": (DISPLAY_P3, False, bytes([12, 13, 0, 1])),
     "BT.2020": (REC_2020, False, bytes([9, 13, 0, 1])),
 }
-COLUMNS = ("encoding", "says so", "lights", "normals", "albedo, mean", "median")
 
-
-def main() -> None:
-    """Read the command line, run every encoding with its chunk and without, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scene", type=Path, help="folder of a scene, linear and of 16 bits")
-    parser.add_argument("-o", "--out", type=Path, required=True, help="folder for all files")
-    parser.add_argument("--encodings", nargs="+", choices=ENCODINGS, default=list(ENCODINGS))
-    options = parser.parse_args()
-    sys.stdout.write("| " + " | ".join(COLUMNS) + " |\n|---|---|--:|--:|--:|--:|\n")
-    for name in options.encodings:
-        for says in (True, False):
-            folder = options.out / f"{name} {'said' if says else 'silent'}"
-            write_photographs(options.scene, folder / "photos", name, says=says)
-            cells = measure(options.scene, folder)
-            sys.stdout.write("| " + " | ".join([name, "yes" if says else "no", *cells]) + " |\n")
-            sys.stdout.flush()
+SETS = (
+    ("sRGB", True),
+    ("linear", True),
+    ("linear", False),
+    ("Display P3", False),
+    ("BT.2020", False),
+)
 
 
 def write_photographs(scene: Path, folder: Path, name: str, *, says: bool) -> None:
@@ -84,27 +73,39 @@ def write_photographs(scene: Path, folder: Path, name: str, *, says: bool) -> No
             target.write_bytes(data[:33] + chunk + data[33:])  # behind the header
 
 
-def measure(scene: Path, folder: Path) -> list[str]:
+def measure(place: Place, name: str, says: bool) -> Figures:
     """Reconstruct and evaluate: mean angles of lights and normals, and errors of albedo."""
-    truth, report = scene / "truth", folder / "evaluation.json"
-    run = [folder / "photos", "--sparse", truth / "sparse", "--masks", scene / "masks"]
-    with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        for line in (
-            ["reconstruct", *run, "-o", folder / "out", "--overwrite", "--quiet"],
-            ["evaluate", folder / "out", scene, "-o", report, "--overwrite", "--quiet"],
-        ):
-            if pimper([str(one) for one in line]) != 0:
-                return ["failed", "", "", ""]
-    told = json.loads(report.read_text(encoding="utf-8"))
-    view = told["views"][0]
-    return [
-        f"{told['lights']['mean_rotated_deg']:.1f}°",
-        f"{view['shape_normals']['mean_deg']:.1f}°",
-        f"{view['albedo']['one_scale_percent']:.1f} %",
-        f"{view['albedo']['one_scale_median_percent']:.1f} %",
-    ]
+    size = {"num_views": 8, "width": 240, "height": 180}
+    scene = place.scene("potatoes", bits=16, encoding="linear", **size)
+    folder = place.cache / "encodings" / f"{name} {'said' if says else 'silent'}"
+    write_photographs(scene, folder / "photos", name, says=says)
+    place.photographs(folder, "photos")
+    views = load_views(folder / "photos", masks=scene / "masks")
+    result = load_chain("default")(views, scene / "truth" / "sparse")
+    found = evaluate(estimate_of(result), read_rendered(scene, photographs=False))
+    return figures_of(found)
 
 
-if __name__ == "__main__":
-    main()
+STUDY = Study(
+    name="file_encodings",
+    rows={
+        (name, "yes" if says else "no"): Row(measure=partial(measure, name=name, says=says))
+        for name, says in SETS
+    },
+    tables=[
+        Table(
+            name="encodings",
+            document="benchmarks/README.md",
+            labels=2,
+            lines=listed(
+                ["encoding", "declared"],
+                [
+                    figure("lights, °", "lights", 1),
+                    figure("normals, °", "normals", 1),
+                    figure("albedo, %", "albedo", 1),
+                    figure("median", "albedo, median", 1),
+                ],
+            ),
+        )
+    ],
+)

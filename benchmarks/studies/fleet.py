@@ -123,8 +123,9 @@ def reconstructed(place: Path, result: Path, preset: str) -> Row:
         raise error(ran.stderr.strip()[-500:])
     shutil.rmtree(result / STAGES, ignore_errors=True)  # of use only to an interrupted run
     told = json.loads((result / "summary.json").read_text(encoding="utf-8"))
-    entries = ("views", "registered", "diagnosis", "failures", "warnings")
+    entries = ("views", "registered", "diagnosis", "failures", "warnings", "vertices")
     row = {name: told[name] for name in entries} | {"score": told["verdict"]["score"]}
+    row |= {"PSNR": told["relighting"]["psnr_db"], "GB": told["peak_memory_mb"] / 2**10}
     return row | {"announced": announced(told), "CPU s": sum(after[2:4]) - sum(before[2:4])}
 
 

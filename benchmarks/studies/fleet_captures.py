@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from declared import DATA
 from scipy.interpolate import CubicSpline
 
 from pimper_bench.scenes import SceneConfig, render_scene
@@ -17,7 +18,7 @@ from pimper_torch.records import Mesh
 
 Settings = dict[str, Any]
 
-MESHES = Path(__file__).parents[3] / "shared" / "data" / "meshes"  # next to the repository
+MESHES = DATA / "meshes"
 # Stone and plate are low, and lie in their own shadow.
 SHAPES = (
     *("spot", "armadillo", "ogre", "falconstatue", "scorpion", "demosthenes-low-res", "bunny_hr"),

@@ -1,24 +1,21 @@
 """Time and memory of gradients, for each stage and for the whole chain.
 
-    PYTHONPATH=tests/helpers python benchmarks/studies/gradient_cost.py SCENE [--only factorize]
-
-SCENE is a folder of `pimper render`; cameras and masks are true. Each stage gets the inputs of the
-chain's last pass. It runs first without gradients, then with gradients of all results (the sum of
-their squares) with respect to all input tensors. Seconds are wall time, the better of two calls.
-Memory is the maximum growth of the process during the call, where Linux reports it, and the total
-after it. Gradients that are not finite are counted.
+Cameras and masks are true. Each stage gets the inputs of the chain's last pass. It runs first
+without gradients, then with gradients of all results (the sum of their squares) with respect to all
+input tensors. Seconds are wall time, the better of two calls. Memory is the maximum growth of the
+process during the call, where Linux reports it, and the total after it. Gradients that are not
+finite are counted.
 """
 
-import argparse
-import sys
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from declared import Column, Figures, Place, Row, Study, Table, figure, listed, number
 from probes import calls, stage_of
 from torch import Tensor
 from torch.utils import _pytree as pytree
@@ -27,27 +24,7 @@ import pimper_torch as pt
 from pimper_torch.runtime.errors import PimperWarning
 from pimper_torch.runtime.memory import release_memory
 
-STAGES = ("warp", "factorize", "sweep", "fuse", "repair", "remesh", "decompose", "extract")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cost:
-    """Seconds and gigabytes without gradients and with them, and gradients that are not finite."""
-
-    seconds: tuple[float, float]
-    gigabytes: tuple[float, float]
-    in_all: tuple[float, float]
-    not_finite: int
-    gradients: int
-
-    def row(self, name: str) -> str:
-        """Return a row of the table."""
-        (plain, tracked), (least, most) = self.seconds, self.gigabytes
-        cells = [name, f"{plain:.2f}", f"{tracked:.2f}", f"{tracked / plain:.1f}"]
-        cells += [f"{least:.2f}", f"{most:.2f}"]
-        (least, most) = self.in_all
-        cells += [f"{least:.2f}", f"{most:.2f}", f"{most / max(least, 1e-3):.1f}"]
-        return "| " + " | ".join([*cells, f"{self.not_finite} of {self.gradients}"]) + " |"
+STAGES = ("warp", "factorize", "sweep", "fuse", "decompose", "the chain")
 
 
 def tracked(arguments: Any) -> tuple[Any, list[Tensor]]:  # noqa: ANN401 - records and tuples of them
@@ -93,8 +70,8 @@ def peak_gigabytes() -> float:
     return next((int(line.split()[1]) / 2**20 for line in lines if line.startswith("VmHWM")), 0.0)
 
 
-def cost(stage: Callable[..., Any], arguments: tuple[Any, ...]) -> Cost:
-    """Measure a stage."""
+def cost(stage: Callable[..., Any], arguments: tuple[Any, ...]) -> Figures:
+    """Measure a stage without gradients and with them."""
     given, inputs = tracked(arguments)
 
     def with_gradients() -> list[Tensor]:
@@ -105,44 +82,53 @@ def cost(stage: Callable[..., Any], arguments: tuple[Any, ...]) -> Cost:
     with_gradients()
     found = [measured(with_gradients) for _ in range(2)]
     slopes = found[-1][3]
-    seconds, gigabytes, in_all = (
-        (min(each[i] for each in plain), min(each[i] for each in found)) for i in range(3)
-    )
-    return Cost(
-        seconds=seconds,
-        gigabytes=gigabytes,
-        in_all=in_all,
-        not_finite=sum(int((~slope.isfinite()).sum()) for slope in slopes),
-        gradients=sum(slope.numel() for slope in slopes),
-    )
+    figures: Figures = {}
+    for i, name in enumerate(("s", "GB more", "GB")):
+        figures[name] = min(each[i] for each in plain)
+        figures[f"{name} with"] = min(each[i] for each in found)
+    figures["not finite"] = sum(int((~slope.isfinite()).sum()) for slope in slopes)
+    return figures
 
 
-def main() -> None:
-    """Print a Markdown table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("--scales", nargs="+", type=float, default=[0.25, 0.5])
-    parser.add_argument("--only", nargs="+", default=[*STAGES, "chain"])
-    options = parser.parse_args()
+def measure(place: Place, name: str) -> Figures:
+    """Measure a stage on its inputs in the last pass, or the whole chain."""
     warnings.simplefilter("ignore", PimperWarning)
-    views = pt.load_views(options.scene / "photos", masks=options.scene / "masks")
-    load = pt.load_chain("default", {"scales": options.scales})
-    scene = load.reconstruct(views, options.scene / "truth" / "sparse")
-    given = calls(load, lambda: load(scene))
-    say("| stage | s | with | times | GB more | with | GB in all | with | times | not finite |")
-    say("|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|")
-    for name in [name for name in STAGES if name in options.only and name in given]:
-        say(cost(stage_of(load, name), given[name]).row(name))
-    if "chain" in options.only:
-        chain = pt.load_chain("default", {"scales": options.scales})
-        say(cost(chain, (scene,)).row("chain"))
+    scales = {"scales": [0.25] if place.tiny else [0.25, 0.5]}
+    folder = place.scene("potatoes", num_views=8, width=240, height=180)
+    views = pt.load_views(folder / "photos", masks=folder / "masks")
+    chain = pt.load_chain("default", scales)
+    scene = chain.reconstruct(views, folder / "truth" / "sparse")
+    if name == "the chain":
+        return cost(chain, (scene,))
+    given = calls(chain, lambda: chain(scene))
+    return cost(stage_of(chain, name), given[name])
 
 
-def say(line: str) -> None:
-    """Write a line of the table at once."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
+def times(name: str) -> Column:
+    """Return the column of how many times as much gradients take."""
+    return Column("times", lambda row: number(row[f"{name} with"] / max(row[name], 1e-3), 1))
 
 
-if __name__ == "__main__":
-    main()
+STUDY = Study(
+    name="gradient_cost",
+    rows={(name,): Row(measure=partial(measure, name=name)) for name in STAGES},
+    tables=[
+        Table(
+            name="gradient-cost",
+            document="benchmarks/README.md",
+            lines=listed(
+                ["stage"],
+                [
+                    figure("s", "s"),
+                    figure("with", "s with"),
+                    times("s"),
+                    figure("GB more", "GB more"),
+                    figure("with", "GB more with"),
+                    figure("GB in all", "GB"),
+                    figure("with", "GB with"),
+                    figure("not finite", "not finite", 0),
+                ],
+            ),
+        )
+    ],
+)

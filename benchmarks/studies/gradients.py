@@ -1,68 +1,65 @@
-"""Compare the gradients of every stage and of the whole chain with finite differences.
+"""The gradients of every stage and of the whole chain, compared with finite differences.
 
-    PYTHONPATH=tests/helpers python benchmarks/studies/gradients.py
-
-Prints a Markdown table. On a small closed-form scene in float64, or on ``--scene``, a folder of
-`pimper render`: the derivative of a random sum of each output along random directions of each
-input, the ratio of autograd to central differences.
-``--config`` and ``--scales`` choose the chain, ``--only`` the stages.
+On a small closed-form scene in float64: the derivative of a random sum of each output along random
+directions of each input, the ratio of autograd to central differences.
 """
 
-import argparse
-import sys
 import warnings
-from pathlib import Path
+from functools import partial
 
 import torch
-from probes import probes, rendered_scene, small_scene
+from declared import Figures, Place, Row, Study, Table, figure, listed, said
+from probes import probes, small_scene
 
 import pimper_torch as pt
 from pimper_torch.runtime.errors import PimperWarning
 
+STAGES = ("factorize", "sweep", "fuse", "chain")
 
-def main() -> None:
-    """Read the command line, check, print a row for each pair of input and output."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--config", default="default", help="preset or YAML file")
-    parser.add_argument("--scene", type=Path, help="the closed-form one if not given")
-    parser.add_argument("--scales", nargs="*", type=float, help="of the photographs")
-    parser.add_argument("--only", nargs="*", default=[], help="stages, or chain")
-    parser.add_argument("--directions", type=int, default=3, help="random ones of each input")
-    parser.add_argument("--weights", type=int, default=2, help="random sums of each output")
-    parser.add_argument("--steps", nargs=2, type=float, default=[1e-6, 1e-7], help="relative")
-    parser.add_argument("--seed", type=int, default=5, help="of directions and sums")
-    options = parser.parse_args()
+
+def measure(place: Place, stage: str) -> Figures:
+    """Check every output of a stage by every input that it depends on."""
     warnings.simplefilter("ignore", PimperWarning)
-    changes = {} if options.scales is None else {"scales": options.scales}
-    chain = pt.load_chain(options.config, changes)
-    scene = rendered_scene(options.scene) if options.scene else small_scene()
-    say("| stage | by | of | ratio | median | farthest from 1 | directions | jump or bend, % |")
-    say("|---|---|---|--:|--:|--:|--:|--:|")
-    for stage, probe in probes(chain, *scene).items():
-        if options.only and stage not in options.only:
-            continue
-        found = probe.check(
-            torch.Generator().manual_seed(options.seed),
-            directions=options.directions,
-            weights=options.weights,
-            steps=tuple(options.steps),
+    chain = pt.load_chain("default", {"scales": [1.0]} if place.tiny else {})
+    found = probes(chain, *small_scene())[stage].check(
+        torch.Generator().manual_seed(5),
+        directions=1 if place.tiny else 3,
+        weights=2,
+        steps=(1e-6, 1e-7),
+    )
+    checks = {
+        pair: check
+        for pair, check in found.items()
+        if check.spread == check.spread and bool(check.numeric.any() or check.analytic.any())
+    }
+    (source, target), worst = max(checks.items(), key=lambda item: item[1].spread)
+    medians = sorted(check.median for check in checks.values())
+    return {
+        "pairs": len(checks),
+        "median": medians[len(medians) // 2],
+        "farthest median": worst.median,
+        "farthest": worst.spread,
+        "worst": f"{target} by {source}",
+    }
+
+
+STUDY = Study(
+    name="gradients",
+    rows={(stage,): Row(measure=partial(measure, stage=stage)) for stage in STAGES},
+    tables=[
+        Table(
+            name="gradients",
+            document="benchmarks/README.md",
+            lines=listed(
+                ["stage"],
+                [
+                    figure("outputs by inputs", "pairs", 0),
+                    figure("median ratio", "median", 4),
+                    said("least accurate", "worst"),
+                    figure("its median ratio", "farthest median", 4),
+                    figure("farthest from 1", "farthest", 4),
+                ],
+            ),
         )
-        for (source, target), check in found.items():
-            if not bool(check.numeric.any()) and not bool(check.analytic.any()):
-                continue  # they do not depend on one another
-            told = f"{int(check.smooth.sum())} of {len(check.smooth)}"
-            say(
-                f"| {stage} | {source} | {target} | {check.ratio:.4f} | {check.median:.4f} | "
-                f"{check.spread:.4f} | "
-                f"{told} | {100 * check.jumped:.1f} |"
-            )
-
-
-def say(line: str) -> None:
-    """Write a line of the table at once."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    main()
+    ],
+)

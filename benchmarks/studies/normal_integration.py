@@ -1,9 +1,8 @@
 """Integration of normal maps: error and seconds of each method.
 
-    python benchmarks/studies/normal_integration.py FOLDER [--figure FILE]
-
-FOLDER contains ``diligent/NAME`` with ``normal_map.png, mask.png, K.txt, depth_gt.npz``, and maps
-without depth, as the bilateral-integration set distributes them. The error is the mean absolute
+``normal_integration/diligent/NAME`` of the shared data has ``normal_map.png, mask.png, K.txt,
+depth_gt.npz``, and ``normal_integration/NAME`` maps without depth, as the bilateral-integration set
+distributes them. The error is the mean absolute
 error of depth in mm after scaling by the median ratio. ``published`` is bilateral normal
 integration (Cao et al. 2022). ``weights from the truth`` solves once, with the robust weights at
 the true depth: the remaining error is in the normals themselves. For maps without depth, the angle
@@ -11,16 +10,17 @@ between the given normals and those of the surface, over steps that it keeps, sh
 survive.
 """
 
-import argparse
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 
 import matplotlib as mpl
 import numpy as np
 import torch
+from bench_runs import cpu_seconds
+from declared import DATA, Figures, Place, Row, Study, Table, figure, listed
 from jaxtyping import Bool, Float
 from matplotlib import pyplot as plt
 from torch import Tensor
@@ -43,55 +43,34 @@ from pimper_torch.single_view.integration.steps import (
 PUBLISHED = {"bear": 0.334, "cat": 0.074, "cow": 0.058, "goblet": 9.018, "pot1": 0.635}
 # Occluding contours divide it into parts; normals say nothing of their distances.
 SPLIT = "goblet"
+MAPS = DATA / "normal_integration"
+DILIGENT = MAPS / "diligent"
+CREASED = ("Fig1_thinker", "Fig4_stripes", "supp_tent", "supp_vase")
 METHODS = ("weighted", "discontinuities")
 # At the true depth, residuals are noise and rounding; larger ones are discontinuities.
 TRUE_SCALE_PX = 0.1
 
 
-def main() -> None:
-    """Print two tables, and draw the maps without depth."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--figure", type=Path)
-    options = parser.parse_args()
-    with_depth(options.folder / "diligent")
-    without = sorted(
-        path.parent for path in options.folder.glob("*/normal_map.png") if path.parent.is_dir()
-    )
-    without_depth(without, options.figure)
+def errors_of(place: Place, method: str) -> Figures:
+    """Return the error of each object whose depth is known, with the CPU seconds of a method."""
+    maps = {name: read_normal_map(place.photographs(DILIGENT / name)) for name in PUBLISHED}
+    began = cpu_seconds()
+    if method == "weights from the truth":
+        found = [with_true_weights(one) for one in maps.values()]
+    else:
+        found = [integrate(one, method).depth for one in maps.values()]
+    seconds = cpu_seconds() - began
+    pairs = zip(maps.items(), found, strict=True)
+    return means({name: depth_error(one, depth) for (name, one), depth in pairs}) | {
+        "CPU s": seconds
+    }
 
 
-def with_depth(folder: Path) -> None:
-    """Print errors and seconds where the depth is known."""
-    print("| method | " + " | ".join(PUBLISHED) + " | mean | without goblet | s, all |")  # noqa: T201
-    print("|---|" + "--:|" * (len(PUBLISHED) + 3))  # noqa: T201
-    row("published", PUBLISHED, "")
-    maps = {name: read_normal_map(folder / name) for name in PUBLISHED}
-    for method in METHODS:
-        began = time.perf_counter()
-        found = [integrate(one, method) for one in maps.values()]
-        seconds = time.perf_counter() - began
-        errors = {
-            name: depth_error(one, result.depth)
-            for (name, one), result in zip(maps.items(), found, strict=True)
-        }
-        row(method, errors, f"{seconds:.1f}")
-    errors = {name: depth_error(one, with_true_weights(one)) for name, one in maps.items()}
-    row("weights from the truth", errors, "")
-    print("\nMean by which true steps leave those of the normals, in thousandths of a pixel:")  # noqa: T201
-    for axis, name in enumerate(("right", "down")):
-        biases = [1e3 * true_bias(one)[axis] for one in maps.values()]
-        print(name + ": " + ", ".join(f"{bias:.1f}" for bias in biases))  # noqa: T201
-    print()  # noqa: T201
-
-
-def row(name: str, errors: Mapping[str, float], seconds: str) -> None:
-    """Print one line, with the mean of all objects and of those whose depth normals determine."""
-    determined = [error for one, error in errors.items() if one != SPLIT]
-    cells = " | ".join(
-        f"{error:.3f}" for error in (*errors.values(), fmean(errors.values()), fmean(determined))
-    )
-    print(f"| {name} | {cells} | {seconds} |", flush=True)  # noqa: T201
+def means(errors: Mapping[str, float]) -> Figures:
+    """Add the mean of all objects, and of those whose depth normals determine."""
+    determined = [error for name, error in errors.items() if name != SPLIT]
+    means = {"mean": fmean(errors.values()), f"without {SPLIT}": fmean(determined)}
+    return {**errors, **means}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,15 +133,6 @@ def with_true_weights(one: NormalMap) -> Tensor:
     return RasterSystem(*weights).fit_steps(*steps.target).exp()
 
 
-def true_bias(one: NormalMap) -> list[float]:
-    """Return the mean residual of steps to the right and down at the true depth, jumps apart."""
-    _, apart, weights = at_the_truth(one)
-    return [
-        float((weight * residual).sum() / weight.sum())
-        for residual, weight in zip(apart, weights, strict=True)
-    ]
-
-
 def at_the_truth(one: NormalMap) -> tuple[Steps, list[Tensor], list[Tensor]]:
     """Return the steps wanted, by how many pixels the true depth leaves them, and weights."""
     assert one.depth is not None
@@ -182,32 +152,20 @@ def at_the_truth(one: NormalMap) -> tuple[Steps, list[Tensor], list[Tensor]]:
     return steps, apart, weights
 
 
-def without_depth(folders: list[Path], figure: Path | None) -> None:
-    """Print how well the surface found has the normals given, and draw it."""
-    print("| map | method | steps given up % | normals, deg: mean | 99 % | s |")  # noqa: T201
-    print("|---|---|--:|--:|--:|--:|")  # noqa: T201
-    panels = []
-    for folder in folders:
-        one = read_normal_map(folder)
-        found = {}
-        for method in ("weighted", "discontinuities"):
-            began = time.perf_counter()
-            found[method] = result = integrate(one, method)
-            seconds = time.perf_counter() - began
-            angle = rotated_by(one, result)
-            given_up = torch.nan
-            if result.continuity is not None:
-                fractions = result.continuity.right, result.continuity.down
-                inside = torch.cat([fraction[fraction > 0] for fraction in fractions])
-                given_up = 100 * float((inside < 0.25).double().mean())
-            print(  # noqa: T201
-                f"| {folder.name} | {method} | {given_up:.2f} | {float(angle.mean()):.2f} "
-                f"| {float(angle.quantile(0.99)):.2f} | {seconds:.1f} |",
-                flush=True,
-            )
-        panels.append((folder.name, one, found))
-    if figure is not None:
-        draw(panels, figure)
+def creases(place: Place, name: str) -> Figures:
+    """Return how well the surface of each method has the given normals."""
+    one = read_normal_map(place.photographs(MAPS / name))
+    figures: Figures = {}
+    for method in METHODS:
+        result = integrate(one, method)
+        angle = rotated_by(one, result)
+        figures[f"{method} mean"] = float(angle.mean())
+        figures[f"{method} 99 %"] = float(angle.quantile(0.99))
+        if result.continuity is not None:
+            fractions = result.continuity.right, result.continuity.down
+            inside = torch.cat([fraction[fraction > 0] for fraction in fractions])
+            figures["rejected"] = 100 * float((inside < 0.25).double().mean())
+    return figures
 
 
 def rotated_by(one: NormalMap, found: IntegratedMap) -> Tensor:
@@ -242,8 +200,13 @@ def _mean_of_kept(steps: Tensor, kept: Tensor, axis: int) -> Tensor:
     return summed / torch.where(count > 0, count, torch.nan)
 
 
-def draw(panels: list[tuple[str, NormalMap, dict[str, IntegratedMap]]], figure: Path) -> None:
-    """Draw normals, both surfaces, and the steps given up."""
+def draw(place: Place, path: Path) -> None:
+    """Draw the maps without depth: normals, both surfaces, and the steps given up."""
+    maps = {name: read_normal_map(MAPS / name) for name in CREASED}
+    panels = [
+        (name, one, {method: integrate(one, method) for method in METHODS})
+        for name, one in maps.items()
+    ]
     mpl.use("Agg")
     names = "normals", "least squares", "discontinuities", "steps given up"
     canvas, axes = plt.subplots(len(panels), 4, figsize=(10, 2.2 * len(panels)), squeeze=False)
@@ -266,8 +229,46 @@ def draw(panels: list[tuple[str, NormalMap, dict[str, IntegratedMap]]], figure: 
     for panel, title in zip(axes[0], names, strict=True):
         panel.set_title(title, fontsize=9)
     canvas.tight_layout()
-    canvas.savefig(figure, dpi=80)
+    canvas.savefig(path, dpi=80)
 
 
-if __name__ == "__main__":
-    main()
+ERRORS = [figure(name, name, 3) for name in (*PUBLISHED, "mean", f"without {SPLIT}")]
+METHOD_ROWS = (*METHODS, "weights from the truth")
+
+STUDY = Study(
+    name="normal_integration",
+    rows={
+        ("depth", "published"): Row(measure=lambda place: means(PUBLISHED)),
+        **{
+            ("depth", method): Row(measure=partial(errors_of, method=method))
+            for method in METHOD_ROWS
+        },
+        **{("creases", name): Row(measure=partial(creases, name=name)) for name in CREASED},
+    },
+    tables=[
+        Table(
+            name="integration",
+            document="benchmarks/README.md",
+            lines=listed(["method"], [*ERRORS, figure("CPU s", "CPU s", 1)]),
+            part="depth",
+        ),
+        Table(
+            name="creases",
+            document="benchmarks/README.md",
+            lines=listed(
+                ["map"],
+                [
+                    *(
+                        figure(f"{method}: {told} °", f"{method} {told}")
+                        for method in METHODS
+                        for told in ("mean", "99 %")
+                    ),
+                    figure("steps rejected, %", "rejected"),
+                ],
+            ),
+            part="creases",
+        ),
+    ],
+    draw=draw,
+    picture="notebooks/images/integration.jpg",
+)

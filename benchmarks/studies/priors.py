@@ -1,21 +1,18 @@
 """Gain of priors on photographs, and cost of wrong ones.
 
-    python benchmarks/studies/priors.py SCENE [SCENE ...] [--kinds none normals:2 normals:2:5 ...]
-
-Scenes are folders of `pimper render`; cameras and masks are true. A kind is a prior made from the
+Cameras and masks are true. A kind is a prior made from the
 true maps: `normals:DEG` with independent noise of DEG degrees per pixel, `smooth:DEG` with errors
 that vary over a fifth of the image, like those of networks, `depth:MILLE` with noise of MILLE
 thousandths of the mean depth, `inliers` with the pixels that were rendered without a highlight. A
 third number divides the stated variance.
 """
 
-import argparse
 import math
-import sys
-import time
-from pathlib import Path
+from functools import partial
 
 import torch
+from bench_runs import figures_of
+from declared import Figures, Place, Row, Study, Table, figure, listed
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
@@ -26,7 +23,11 @@ from pimper_bench.metrics.evaluation import EvaluateConfig, evaluate
 from pimper_bench.truth import Capture
 from pimper_torch.records import Prior
 
-KINDS = ("none", "normals:2", "normals:2:5", "smooth:10", "smooth:10:5", "depth:5", "inliers")
+KINDS = {
+    "none": "none",
+    "normals:2": "noise of 2° in each pixel",
+    "smooth:10": "smooth errors of 10°",
+}
 
 
 def tilted(normals: Tensor, noise: Tensor, degrees: float) -> Tensor:
@@ -83,36 +84,39 @@ def prior_of(kind: str, capture: Capture) -> tuple[Prior, ...]:
     )
 
 
-def run(folder: Path, kind: str) -> str:
+def measure(place: Place, scene: str, kind: str) -> Figures:
     """Reconstruct with a prior, and measure."""
+    folder = place.scene(scene, num_views=8, width=240, height=180)
     capture = read_rendered(folder)
     photographs = pt.load_views(folder / "photos", masks=folder / "masks")
     photographs = photographs.replace(priors=prior_of(kind, capture))
-    chain = pt.load_chain("default")
-    began = time.process_time()
+    chain = pt.load_chain("default", cache=place.cache / "stages")
     result = chain(photographs, folder / "truth" / "sparse")
-    seconds = time.process_time() - began
     chosen = EvaluateConfig(samples=50_000, views=capture.views.names)
     found = evaluate(estimate_of(result), capture, chosen)
-    assert found.surface is not None
-    off = [float(view.shape_normals.mean_deg) for view in found.views]
-    accuracy = 100 * float(found.surface.accuracy.mean) / float(found.surface.diagonal)
-    cells = folder.name, kind, f"{sum(off) / len(off):.2f}", f"{accuracy:.3f}", f"{seconds:.1f}"
-    return "| " + " | ".join(cells) + " |"
+    angles = [float(view.shape_normals.mean_deg) for view in found.views if view.shape_normals]
+    return figures_of(found) | {"normals": sum(angles) / len(angles)}
 
 
-def say(line: str) -> None:
-    """Print a line at once."""
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scenes", nargs="+", type=Path)
-    parser.add_argument("--kinds", nargs="+", default=KINDS)
-    options = parser.parse_args()
-    say("| scene | prior | mean error of normals ° | accuracy % | CPU s |\n|---|---|--:|--:|--:|")
-    for scene in options.scenes:
-        for one in options.kinds:
-            say(run(scene, one))
+STUDY = Study(
+    name="priors",
+    rows={
+        (scene, told): Row(measure=partial(measure, scene=scene, kind=kind))
+        for scene in ("jar",)
+        for kind, told in KINDS.items()
+    },
+    tables=[
+        Table(
+            name="priors",
+            document="benchmarks/README.md",
+            labels=2,
+            lines=listed(
+                ["scene", "prior"],
+                [
+                    figure("normals, °", "normals"),
+                    figure("accuracy, %", "accuracy", 3),
+                ],
+            ),
+        )
+    ],
+)

@@ -1,22 +1,19 @@
 """Compare photographs by five strangers with those of one camera, from the same positions.
 
-    python benchmarks/studies/strangers.py FOLDER [--scene potatoes] [--num-views 36] [--width 640]
-
-Writes ``FOLDER/one``, ``FOLDER/alone`` and ``FOLDER/strangers`` unless they exist, reconstructs
-each set with ``default``, and prints a table. The strangers have cameras of five sizes, focal
+The strangers have cameras of five sizes, focal
 lengths and distortions, exposures over four stops, arbitrary white balance, and people in front of
 the object in every third photograph; ``alone`` has no people. All sets have the same lights, by day
 and at dusk.
 """
 
-import argparse
 import math
-import sys
-import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
+from bench_runs import cpu_seconds, figures_of
+from declared import Figures, Place, Row, Study, Table, figure, listed
 from PIL import ExifTags, Image
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
@@ -36,7 +33,11 @@ from pimper_torch.records import CameraModel, Views
 
 RENDERED_FOCAL = 1.3  # widths of a picture that all cameras' pictures are cut from
 NOISELESS = SensorConfig(read_noise=0.0, shot_noise=0.0, exposure=0.4)
-SETS = ("one", "alone", "strangers")
+SETS = {
+    "one": "one camera and exposure",
+    "alone": "five cameras and exposures",
+    "strangers": "the same, with people in front",
+}
 STOPS = 2.0  # of exposure, up and down
 WHITE = 0.2  # standard deviation of the logarithm of a white balance's gains
 DUSK, DAY = (0.02, 0.5), (0.45, 1.0)  # ambient and lamp, as fractions of the day's lamp
@@ -78,18 +79,18 @@ CAMERAS = (
 )
 
 
-def scene_of(options: argparse.Namespace) -> Scene:
+def scene_of(num_views: int, width: int) -> Scene:
     """Build the scene by day and at dusk, in turns of five photographs."""
     config = SceneConfig(
-        num_views=options.num_views,
-        width=options.width,
-        height=options.width * 3 // 4,
+        num_views=num_views,
+        width=width,
+        height=width * 3 // 4,
         path="handheld",
         table="patterned",
         fill=0.62,
         irradiance=1.0,
     )
-    scene = build_scene(options.scene, config)
+    scene = build_scene("potatoes", config)
     dusk = torch.arange(config.num_views) // 5 % 2 == 1
     ambient, lamp = torch.where(dusk[:, None], torch.tensor(DUSK), torch.tensor(DAY)).unbind(1)
     lights: Lights = scene.lights
@@ -168,8 +169,13 @@ def write(scene: Scene, folder: Path, *, strangers: bool, people: bool) -> None:
         Image.fromarray(samples).save(folder / f"view_{view:03d}.jpg", quality=95, exif=exif)
 
 
-def measure(scene: Scene, folder: Path) -> str:
-    """Reconstruct a set, and return its row of the table."""
+def measure(place: Place, name: str) -> Figures:
+    """Write a set unless it exists, reconstruct it, and measure."""
+    scene = scene_of(*((8, 320) if place.tiny else (20, 400)))
+    folder = place.cache / "strangers" / name
+    if not folder.exists():
+        write(scene, folder, strangers=name != "one", people=name == "strangers")
+    place.photographs(folder)
     truth = Capture(
         views=Views(
             images=torch.zeros(scene.config.num_views, 1, 1, 1),
@@ -182,50 +188,32 @@ def measure(scene: Scene, folder: Path) -> str:
         position=torch.arange(scene.config.num_views),
         light=torch.arange(scene.config.num_views),
     )
-    began = time.process_time()
+    began = cpu_seconds()
     result = pt.load_chain("default")(pt.load_views(folder))
-    seconds = time.process_time() - began
+    seconds = cpu_seconds() - began
     found = evaluate(estimate_of(result), truth, EvaluateConfig(samples=50_000, alignment="icp"))
-    assert found.surface is not None
-    assert found.cameras is not None
-    assert found.surface.accuracy is not None
-    assert found.surface.seen is not None
-    surface, percent = found.surface, 100 / found.surface.diagonal
-    figures = (
-        f"{result.scene.cameras.num_views} of {scene.config.num_views}",
-        f"{float(found.cameras.median_rotation_deg):.3f}",
-        f"{percent * float(surface.accuracy.mean):.3f}",
-        f"{percent * float(surface.accuracy.median):.3f}",
-        f"{percent * float(surface.seen.completeness.mean):.3f}",
-        f"{seconds:.0f}",
-    )
-    return " | ".join(["", folder.name, *figures, ""]).strip()
+    views = {"registered": result.scene.cameras.num_views, "CPU s": seconds}
+    return figures_of(found) | views
 
 
-def say(line: str) -> None:
-    """Print a line at once."""
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
-
-
-def main() -> None:
-    """Write both sets, reconstruct them, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--scene", default="potatoes")
-    parser.add_argument("--num-views", type=int, default=36)
-    parser.add_argument("--width", type=int, default=640, help="pixels of the rendered pictures")
-    parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS)
-    options = parser.parse_args()
-    scene = scene_of(options)
-    say("| set | views | rotation ° | accuracy % | median % | completeness % | CPU s |")
-    say("|---|--:|--:|--:|--:|--:|--:|")
-    for name in options.sets:
-        if not (options.folder / name).exists():
-            people = name == "strangers"
-            write(scene, options.folder / name, strangers=name != "one", people=people)
-        say(measure(scene, options.folder / name))
-
-
-if __name__ == "__main__":
-    main()
+STUDY = Study(
+    name="strangers",
+    rows={(told,): Row(measure=partial(measure, name=name)) for name, told in SETS.items()},
+    tables=[
+        Table(
+            name="strangers",
+            document="benchmarks/README.md",
+            lines=listed(
+                ["photographs"],
+                [
+                    figure("registered", "registered", 0),
+                    figure("rotation of cameras, °", "rotation", 3),
+                    figure("accuracy, %", "accuracy", 3),
+                    figure("median", "accuracy, median", 3),
+                    figure("completeness seen, %", "completeness", 3),
+                    figure("CPU s", "CPU s", 0),
+                ],
+            ),
+        )
+    ],
+)

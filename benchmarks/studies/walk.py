@@ -1,28 +1,16 @@
-"""Measure how structure from motion grows with the number of photographs.
+"""How structure from motion grows with the number of photographs: CPU seconds of its parts."""
 
-Run as ``python benchmarks/studies/walk.py [--num-views 30 60 120 300] [--scene mug]``: renders
-walks around a scene on a patterned table to ``--renderings``, unless they exist, and prints a
-Markdown table with the CPU seconds of each part of structure from motion, and the camera errors.
-``growth`` is the CPU seconds per photograph relative to the first walk. A row is printed when its
-walk is done.
-"""
-
-import argparse
-import resource
-import sys
 from collections import defaultdict
 from collections.abc import Callable
-from functools import wraps
-from pathlib import Path
+from functools import partial, wraps
 from typing import Any
 
 import torch
+from bench_runs import cpu_seconds
+from declared import Figures, Place, Row, Study, Table, figure, listed
 
 from pimper_bench.datasets import read_rendered
 from pimper_bench.metrics.evaluation import camera_figures
-from pimper_bench.scenes.rendered_folder import render_scene
-from pimper_bench.scenes.scene_settings import SceneConfig
-from pimper_bench.table.measure import peak_memory
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import Estimate, Mesh
 from pimper_torch.stages.sfm import reconstruct, registration
@@ -46,67 +34,34 @@ PARTS = (
     (registration, "link_sessions", "others"),
     (reconstruct, "refine_tracks", "tracks"),
 )
-COLUMNS = (*dict.fromkeys(part for _, _, part in PARTS), "rest", "all", "growth")
-FIGURES = ("views", "points", "centres %", "rotation °", "focal %", "peak MB")
+SHOWN = ("features", "pairs", "matching", "mapping", "tracks", "doubts", "all")
 
 
-def main() -> None:
-    """Read the command line, run structure from motion on every walk, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--num-views", nargs="+", type=int, default=[30, 60, 120, 300])
-    parser.add_argument("--scene", default="mug", help="a rendered scene's name, or a mesh file")
-    parser.add_argument("--width", type=int, default=320)
-    parser.add_argument("--height", type=int, default=240)
-    parser.add_argument("--renderings", type=Path, default=Path("walks"))
-    parser.add_argument("--seed", type=int, default=0, help="of structure from motion")
-    options = parser.parse_args()
+def measure(place: Place, num_views: int) -> Figures:
+    """Run structure from motion on a walk around a mug, and compare its cameras."""
+    size = {"num_views": num_views, "width": 320, "height": 240}
+    folder = place.scene("mug", path="handheld", table="patterned", **size)
     spent = Spent(float)
     for module, name, part in PARTS:
         setattr(module, name, timed(getattr(module, name), part, spent))
-    say("| photographs | " + " | ".join((*COLUMNS, *FIGURES)) + " |")
-    say("|--:|" + "--:|" * len(COLUMNS + FIGURES))
-    first = None
-    for num_views in options.num_views:
-        folder = options.renderings / f"{Path(options.scene).stem}{num_views}"
-        if not folder.is_dir():
-            config = SceneConfig(
-                num_views=num_views,
-                width=options.width,
-                height=options.height,
-                path="handheld",
-                table="patterned",
-            )
-            render_scene(options.scene, folder, config)
-        spent.clear()
-        figures = run(folder, options.seed, spent)
-        each = spent["all"] / num_views
-        first = first or each
-        cells = [f"{spent[part]:.1f}" for part in COLUMNS[:-1]]
-        say(" | ".join((f"| {num_views}", *cells, f"{each / first:.2f}", *figures)) + " |")
-
-
-def run(folder: Path, seed: int, spent: Spent) -> list[str]:
-    """Run structure from motion on a rendered walk and return its figures as cells."""
     views = load_views(folder / "photos")
     capture = read_rendered(folder, maps=False, photographs=False)
-    config = ReconstructConfig(seed=seed)
-    with peak_memory() as peak:
-        model = timed(reconstruct.structure_from_motion, "all", spent)(views, config)
-        megabytes = peak() or float("nan")
-    spent["rest"] = spent["all"] - sum(spent[part] for part in COLUMNS[:-3])
+    whole = timed(reconstruct.structure_from_motion, "all", spent)
+    model = whole(views, ReconstructConfig())
     scene = assemble_scene(views, model)
     cloud = Mesh(vertices_world=scene.points_world, faces=torch.zeros(0, 3, dtype=torch.long))
     estimate = Estimate(mesh=cloud, names=scene.views.names, cameras=scene.cameras)
     found = camera_figures(estimate, capture)
     assert found is not None, "a walk has several cameras"
-    return [
-        f"{model.num_views}",
-        f"{len(model.points_world)}",
-        f"{found.mean_center_percent:.4f}",
-        f"{found.mean_rotation_deg:.4f}",
-        f"{found.mean_focal_percent:.3f}",
-        f"{megabytes:.0f}",
-    ]
+    return {
+        **spent,
+        "each": spent["all"] / num_views,
+        "registered": model.num_views,
+        "points": len(model.points_world),
+        "centres": found.mean_center_percent,
+        "rotation": found.mean_rotation_deg,
+        "focal": found.mean_focal_percent,
+    }
 
 
 def timed(function: Callable[..., Any], part: str, spent: Spent) -> Callable[..., Any]:
@@ -123,17 +78,25 @@ def timed(function: Callable[..., Any], part: str, spent: Spent) -> Callable[...
     return measured
 
 
-def cpu_seconds() -> float:
-    """Return the processor time that this process has used, all threads together."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
-
-
-def say(line: str) -> None:
-    """Write a line of the table at once."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    main()
+STUDY = Study(
+    name="walk",
+    rows={(str(count),): Row(measure=partial(measure, num_views=count)) for count in (30, 120)},
+    tables=[
+        Table(
+            name="walk",
+            document="benchmarks/README.md",
+            lines=listed(
+                ["photographs"],
+                [
+                    *(figure(part, part, 1) for part in SHOWN),
+                    figure("a photograph", "each"),
+                    figure("registered", "registered", 0),
+                    figure("points", "points", 0),
+                    figure("centres, %", "centres", 4),
+                    figure("rotation, °", "rotation", 4),
+                    figure("focal length, %", "focal", 3),
+                ],
+            ),
+        )
+    ],
+)

@@ -169,20 +169,26 @@ Method = Callable[[SparseScene, CoarseMesh], MethodRun]
 _BASELINES: dict[str, Callable[[], nn.Module]] = {"smoothed": Smoothed, "openmvs": OpenMvs}
 
 
-def method_named(name: str) -> Method:
-    """Return a baseline by name, or a preset, or a YAML file of settings."""
+def method_named(name: str, cache: Path | None = None) -> Method:
+    """Return a baseline by name, or a preset, or a YAML file of settings.
+
+    Args:
+        cache: Folder of a preset's stages, which are not repeated in runs with other settings.
+    """
     if name in _BASELINES:
         return partial(_run_baseline, _BASELINES[name]())
     try:
-        return partial(_run_preset, load_config(name))
+        return partial(_run_preset, load_config(name), cache)
     except ConfigError as error:
         raise ConfigError(
             f"method {name!r}: {error} Baselines are {', '.join(_BASELINES)}."
         ) from error
 
 
-def _run_preset(config: Config, scene: SparseScene, coarse: CoarseMesh) -> MethodRun:
-    chain = make_chain(config)
+def _run_preset(
+    config: Config, cache: Path | None, scene: SparseScene, coarse: CoarseMesh
+) -> MethodRun:
+    chain = make_chain(config, cache=cache)
     began = time.perf_counter()
     result = chain(scene)
     seconds = time.perf_counter() - began
