@@ -21,8 +21,8 @@ from pimper_torch.records import Cameras, SparseScene
 from pimper_torch.records.shapes import PerView
 from pimper_torch.stages.silhouettes.cues import soft_masks_of
 
-# Longer side of the compared masks, number of points, and signs of all masks at points in all views:
-# choices.
+# Longer side of the compared masks, number of points, and of signs of all masks at these points in
+# all views: choices.
 _SMALL_PX, _POINTS, _SIGNS = 320, 4000, 400_000_000
 _FEWEST = 50  # pairs of points and views needed as evidence
 _BARE = 0.02  # contradiction of masks without points; a choice
