@@ -11,7 +11,7 @@ from pimper_torch.geometry.pinholes import look_at, pinholes
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.records import CameraModel
-from pimper_torch.stages.sfm.photograph_check import agreement, of_something_else
+from pimper_torch.stages.sfm.photograph_check import correlations, of_something_else
 from pimper_torch.stages.sfm.sparse_scene import sound
 
 VIEWS, WIDTH, HEIGHT, FOCAL = 9, 160, 120, 170.0
@@ -62,7 +62,7 @@ def showing(scene, view, image):
 
 def test_photographs_of_their_cameras_are_accepted(scene):
     """Patches of a plane are the same in all views but for their light and resampling."""
-    assert agreement(scene).min() > 0.8
+    assert correlations(scene).min() > 0.8
     assert of_something_else(scene) == {}
     assert sound(scene) is scene
 
@@ -101,5 +101,5 @@ def test_nothing_is_concluded_where_views_hardly_correlate_or_have_no_points(sce
         observation_view=scene.observation_view[:0],
         observation_pixels=scene.observation_pixels[:0],
     )
-    assert agreement(bare).isnan().all()
+    assert correlations(bare).isnan().all()
     assert of_something_else(bare) == {}

@@ -23,7 +23,7 @@ _ALIKE, _RELATIVE = 0.4, 0.4
 
 def of_something_else(scene: SparseScene) -> dict[int, str]:
     """Return the views whose photographs do not show what their cameras see, and why so."""
-    alike = agreement(scene)
+    alike = correlations(scene)
     typical = float(alike.nanmedian())
     unlike = ((alike < _RELATIVE * typical) & (typical >= _ALIKE)).nonzero()[:, 0]
     return {
@@ -34,7 +34,7 @@ def of_something_else(scene: SparseScene) -> dict[int, str]:
 
 
 @torch.no_grad()
-def agreement(scene: SparseScene) -> PerView:
+def correlations(scene: SparseScene) -> PerView:
     """Return how well views correlate with the most similar of their neighbours.
 
     Returns:
