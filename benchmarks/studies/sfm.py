@@ -19,7 +19,7 @@ from pimper_torch.cli.options import bundled_photographs
 from pimper_torch.io.cameras.model_files import read_model
 from pimper_torch.io.photographs import load_views
 from pimper_torch.records import SparseScene
-from pimper_torch.runtime.errors import PimperWarning
+from pimper_torch.runtime.errors import PimperWarning, ReconstructionError
 from pimper_torch.stages.sfm.reconstruct import Reconstruct
 from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 
@@ -54,7 +54,10 @@ def measure(place: Place, photographs: str, settings: str) -> Figures:
     began = cpu_seconds()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PimperWarning)
-        scene = Reconstruct(SETTINGS[settings])(views)
+        try:
+            scene = Reconstruct(SETTINGS[settings])(views)
+        except ReconstructionError:
+            return {"views": "refused", "CPU s": cpu_seconds() - began}
     seconds = cpu_seconds() - began
     length, figures = torch.bincount(scene.observation_point), {}
     if reference.exists():
