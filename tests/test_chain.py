@@ -5,11 +5,11 @@ import warnings
 
 import pytest
 import torch
-from comparison import compare_in_view
 from photographs import save_masks, save_photographs
 from probes import small_scene
 from torch import nn
 from torch.nn.functional import normalize
+from view_comparison import compare_in_view
 
 import pimper_torch as pt
 from pimper_bench.metrics import pair_views, similarity_between_cameras

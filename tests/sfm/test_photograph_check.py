@@ -65,6 +65,10 @@ def test_photographs_of_their_cameras_are_accepted(scene):
     assert correlations(scene).min() > 0.8
     assert of_something_else(scene) == {}
     assert sound(scene) is scene
+    double = scene.replace(
+        cameras=scene.cameras.to("cpu", torch.float64), points_world=scene.points_world.double()
+    )
+    assert torch.allclose(correlations(double).float(), correlations(scene), atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,7 @@ def _correlation(scene: SparseScene, view: int, other: int, observed: Tensor) ->
         pixels, _ = project(patches, cameras.cam_from_world[index], cameras.intrinsics[index])
         width, height = scene.views.sizes_px[index].tolist()
         image = scene.views.images[index][None, :, :height, :width]
-        grid = grid_from_pixels(pixels, width, height)[None]
+        grid = grid_from_pixels(pixels, width, height)[None].to(image)
         values = grid_sample(image, grid, align_corners=False)[0].mean(dim=0)
         samples.append(normalize(values - values.mean(dim=-1, keepdim=True), dim=-1))
     return (samples[0] * samples[1]).sum(dim=-1).nan_to_num()

@@ -2,8 +2,8 @@ from functools import cache
 
 import pytest
 import torch
-from comparison import compare_in_view
 from reliefs import WavyPlane
+from view_comparison import compare_in_view
 
 from pimper_bench.scenes import render_shape, sparse_scene
 from pimper_bench.scenes.render_in_memory import Sphere

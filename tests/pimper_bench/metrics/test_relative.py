@@ -1,7 +1,7 @@
 import pytest
 import torch
-from comparison import compare_in_view
 from torch.testing import assert_close
+from view_comparison import compare_in_view
 
 from pimper_bench.metrics import relative_error
 from pimper_bench.metrics.in_view import angles_deg
