@@ -62,7 +62,7 @@ def showing(scene, view, image):
 
 def test_photographs_of_their_cameras_are_accepted(scene):
     """Patches of a plane are the same in all views but for their light and resampling."""
-    assert correlations(scene).min() > 0.8
+    assert correlations(scene)[:, 0].min() > 0.8
     assert of_something_else(scene) == {}
     assert sound(scene) is scene
     double = scene.replace(
