@@ -136,8 +136,8 @@ def _kept(evidence: MaskEvidence, kept: ViewMask) -> dict[int, Raster]:
 
 def _against_points(evidence: MaskEvidence, kept: ViewMask) -> PerView:
     """Return how many points masks contradict, relative to what is accepted in a few of them."""
-    _, by_view = evidence.of_points(_kept(evidence, kept))
-    share = by_view[list(evidence.files)] / max(_OF_ONE, _BEYOND * float(by_view.median()))
+    by_file = evidence.of_points(_kept(evidence, kept))[1][list(evidence.files)]
+    share = by_file / max(_OF_ONE, _BEYOND * float(by_file[kept].median()))
     return share * ((share > 1).float().mean() <= _FEW)
 
 
