@@ -91,6 +91,9 @@ def _draw_light(
     """Draw a sample's observed and predicted radiance in every view in which it is valid."""
     (views,), (templates,) = seen.buckets, seen.patches.buckets
     if sample is None:
+        if not residual.isfinite().any():
+            axes.set_title("no valid sample", fontsize="small")
+            return
         worst = int(residual.square().nansum(dim=0).argmax())
         sample = worst // residual.shape[2], worst % residual.shape[2]
     row, column = sample
