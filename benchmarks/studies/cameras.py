@@ -7,7 +7,7 @@ from declared import Row, Study, Table, bracketed, figure, listed
 
 from pimper_bench.table.bench_inputs import BenchConfig
 
-SIZE = {"num_views": 12, "width": 320, "height": 240}
+SIZE = {"num_views": 20, "width": 320, "height": 240}
 CAMERAS = ("true", "found", "features")
 
 STUDY = Study(
