@@ -10,9 +10,10 @@ from bench_runs import cpu_seconds
 from declared import Figures, Place, Row, Study, Table, figure, listed
 
 from pimper_bench.datasets import read_rendered
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.metrics.evaluation import camera_figures
 from pimper_torch.io.photographs import load_views
-from pimper_torch.records import Estimate, Mesh
+from pimper_torch.records import Mesh
 from pimper_torch.stages.sfm import reconstruct, registration
 from pimper_torch.stages.sfm.reconstruct_config import ReconstructConfig
 from pimper_torch.stages.sfm.sparse_scene import assemble_scene

@@ -32,7 +32,6 @@ from pimper_torch.records.priors import MapPrior as MapPrior
 from pimper_torch.records.priors import NormalPrior as NormalPrior
 from pimper_torch.records.priors import Prior as Prior
 from pimper_torch.records.priors import SilhouettePrior as SilhouettePrior
-from pimper_torch.records.reconstruction import Estimate as Estimate
 from pimper_torch.records.reconstruction import Reconstruction as Reconstruction
 from pimper_torch.records.record import Record as Record
 from pimper_torch.records.scene import CameraModel as CameraModel

@@ -1,10 +1,7 @@
-"""The complete result of a run, and estimates of other methods for comparison."""
+"""The complete result of a run."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
-
-from jaxtyping import Float
-from torch import Tensor
 
 from pimper_torch.records.finished import FinishedMesh, Relighting, TexturedMesh, Verdict
 from pimper_torch.records.heights import DepthPatches, SweptPatches
@@ -59,22 +56,3 @@ class Reconstruction(Record):
         """Draw the contact sheet of a run; see :func:`~pimper_torch.viz.overview.overview`."""
         image: Image = later("viz.overview.overview")(self)
         return image
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Estimate(Record):
-    """A method's estimate of an object, in an arbitrary frame.
-
-    Attributes:
-        mesh: The surface; may have no faces if the method gives only points.
-        names: Names of the photographs that have cameras.
-        cameras: One per name, in the same order; ``None`` if the method gives none.
-        lights_world: First-order light of each view, up to one scale; ``None`` if unknown.
-        reference: Name of the view in which the surface was estimated, if any.
-    """
-
-    mesh: Mesh
-    names: tuple[str, ...] = ()
-    cameras: Cameras | None = None
-    lights_world: Float[Tensor, "view 4"] | None = None
-    reference: str | None = None

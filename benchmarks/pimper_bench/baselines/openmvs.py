@@ -13,11 +13,12 @@ from pathlib import Path
 import torch
 
 from pimper_bench.baselines.missing import MissingProgramError
+from pimper_bench.metrics.estimates import Estimate
 from pimper_torch.export.colmap_workspace import write_pinholes
 from pimper_torch.export.picture_files import write_picture
 from pimper_torch.geometry.local_frame import NO_OFFSET
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
+from pimper_torch.records import CoarseMesh, Mesh, SparseScene
 from pimper_torch.runtime.cores import usable_cores
 from pimper_torch.runtime.errors import InputError, ReconstructionError
 from pimper_torch.runtime.progress import report

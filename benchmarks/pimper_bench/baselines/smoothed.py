@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from torch import Tensor
 
+from pimper_bench.metrics.estimates import Estimate
 from pimper_torch.geometry.finite_elements import cotangent_laplacian, elements, lumped_mass
 from pimper_torch.geometry.subdivision import Subdivision, subdivide
 from pimper_torch.geometry.surfaces import face_normals, side_lengths, vertex_normals
@@ -29,7 +30,7 @@ from pimper_torch.geometry.topology import (
     half_edges,
 )
 from pimper_torch.linalg.sparse import SparseCholesky
-from pimper_torch.records import CoarseMesh, Estimate, Mesh, SparseScene
+from pimper_torch.records import CoarseMesh, Mesh, SparseScene
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.stages.stage import Stage
 

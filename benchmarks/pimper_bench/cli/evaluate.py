@@ -16,7 +16,7 @@ from pimper_bench.datasets.diligent import read_diligent_mv
 from pimper_bench.datasets.dtu_sets import read_dtu_mvs, read_dtu_protocol
 from pimper_bench.datasets.rendered import read_rendered
 from pimper_bench.metrics.compared_page import write_compared_page
-from pimper_bench.metrics.estimates import read_estimate
+from pimper_bench.metrics.estimates import Estimate, read_estimate
 from pimper_bench.metrics.evaluation import (
     EvaluateConfig,
     Evaluation,
@@ -33,7 +33,7 @@ from pimper_torch.cli.output import Output
 from pimper_torch.export.result_folder.files import file_written_whole, prepare_file
 from pimper_torch.io.meshes import read_mesh
 from pimper_torch.io.version import installed_version
-from pimper_torch.records import Estimate, Views
+from pimper_torch.records import Views
 from pimper_torch.runtime.config import to_mapping
 from pimper_torch.runtime.errors import InputError
 from pimper_torch.viz.report.page import HEAD

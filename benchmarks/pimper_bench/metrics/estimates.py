@@ -1,8 +1,11 @@
 """Estimates to evaluate: a result in memory or in its folder, or a mesh of any method."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from pimper_torch.export.reports import common_lights
 from pimper_torch.export.result import read_lights, read_reference
@@ -10,8 +13,27 @@ from pimper_torch.geometry.lens_models import pinholes_of
 from pimper_torch.geometry.local_frame import NO_OFFSET, from_local
 from pimper_torch.io.cameras.model_files import read_model
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.records import Estimate, Reconstruction
+from pimper_torch.records import Cameras, Mesh, Reconstruction, Record
 from pimper_torch.runtime.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Estimate(Record):
+    """A method's estimate of an object, in an arbitrary frame.
+
+    Attributes:
+        mesh: The surface; may have no faces if the method gives only points.
+        names: Names of the photographs that have cameras.
+        cameras: One per name, in the same order; ``None`` if the method gives none.
+        lights_world: First-order light of each view, up to one scale; ``None`` if unknown.
+        reference: Name of the view in which the surface was estimated, if any.
+    """
+
+    mesh: Mesh
+    names: tuple[str, ...] = ()
+    cameras: Cameras | None = None
+    lights_world: Float[Tensor, "view 4"] | None = None
+    reference: str | None = None
 
 
 def read_estimate(path: Path | str) -> Estimate:

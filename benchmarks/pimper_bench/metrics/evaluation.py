@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pimper_bench.metrics import camera_errors, similarity
 from pimper_bench.metrics.dtu_protocol import DtuFigures, dtu_figures
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.metrics.frames import Frames
 from pimper_bench.metrics.in_view import ViewFigures, compare_along_rays
 from pimper_bench.metrics.surface_distances import (
@@ -18,7 +19,7 @@ from pimper_bench.metrics.surface_distances import (
     true_surface,
 )
 from pimper_bench.truth import Capture, DtuProtocol
-from pimper_torch.records import Estimate, Record
+from pimper_torch.records import Record
 from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.errors import InputError
 

@@ -14,13 +14,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.metrics.frames import Frames
 from pimper_bench.metrics.surface_distances import sample_surface, true_surface, with_surroundings
 from pimper_bench.truth import Capture
 from pimper_torch.geometry.nearest import NearestSurface
 from pimper_torch.geometry.rigid import rigid, transform
 from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.records import Cameras, Estimate, Mesh, Record
+from pimper_torch.records import Cameras, Mesh, Record
 from pimper_torch.runtime.errors import InputError, caution
 
 # Choices. The first two are for centres and rotations in agreement, the last for optical axes.

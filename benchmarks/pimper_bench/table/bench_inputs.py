@@ -12,7 +12,7 @@ from torch import nn
 from pimper_bench.baselines.openmvs import OpenMvs
 from pimper_bench.baselines.smoothed import Smoothed
 from pimper_bench.datasets.rendered import read_rendered
-from pimper_bench.metrics.estimates import estimate_of
+from pimper_bench.metrics.estimates import Estimate, estimate_of
 from pimper_bench.metrics.evaluation import EvaluateConfig, prepared_surface
 from pimper_bench.metrics.similarity import pair_views
 from pimper_bench.metrics.surface_distances import TrueSurface
@@ -23,7 +23,7 @@ from pimper_torch.io.photographs import load_views
 from pimper_torch.paper.triangulate import Triangulate
 from pimper_torch.presets.load_chain import make_chain
 from pimper_torch.presets.load_config import Config, load_config
-from pimper_torch.records import CoarseMesh, Estimate, Record, SparseScene
+from pimper_torch.records import CoarseMesh, Record, SparseScene
 from pimper_torch.runtime.config import Range, require, require_ranges
 from pimper_torch.runtime.errors import ConfigError
 from pimper_torch.stages.sfm.reconstruct import Reconstruct, find_model, placed_scene

@@ -5,13 +5,13 @@ from PIL import Image
 from scenes import write_ball
 
 from pimper_bench.cli.evaluate import mesh_capture, named_as
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.scenes.rendered_folder import render_scene
 from pimper_bench.scenes.scene_settings import SceneConfig
 from pimper_torch.chains.chain_config import CoarseToFineConfig
 from pimper_torch.cli.main import main
 from pimper_torch.export.results import write_result
 from pimper_torch.io.meshes import read_mesh, write_ply
-from pimper_torch.records import Estimate
 
 
 def run(*arguments):

@@ -5,9 +5,9 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.metrics import EvaluateConfig, evaluate, rows
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.metrics.surface_distances import calibrate, sample_surface
 from pimper_bench.truth import Truth
-from pimper_torch.records import Estimate
 
 COUNT = 40_000
 

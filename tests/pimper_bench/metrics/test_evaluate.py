@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from pimper_bench.metrics import EvaluateConfig, evaluate, report, rows
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.metrics.evaluation import chosen_views
 from pimper_bench.truth import Truth
 from pimper_torch.geometry.rigid import rigid
-from pimper_torch.records import Estimate
 from pimper_torch.runtime.errors import InputError
 
 FEW = {"samples": 3000}

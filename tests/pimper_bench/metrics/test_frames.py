@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from pimper_bench.metrics import EvaluateConfig, evaluate
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.metrics.frames import Frames
 from pimper_torch.geometry.rigid import rigid
-from pimper_torch.records import Estimate
 from pimper_torch.runtime.errors import InputError, PimperWarning
 
 FEW = {"samples": 3000}

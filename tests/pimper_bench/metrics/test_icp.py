@@ -5,9 +5,10 @@ import torch
 from torch.testing import assert_close
 
 from pimper_bench.metrics import align_estimate, trimmed_icp
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.metrics.similarity import rotation_angles_deg, split_similarity
 from pimper_torch.geometry.rigid import rigid
-from pimper_torch.records import Estimate, Mesh
+from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import InputError
 
 FEW = {"count": 800}

@@ -13,8 +13,9 @@ from pimper_bench.metrics import (
     sample_surface,
 )
 from pimper_bench.metrics.dtu_protocol import supersample
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.truth import DtuProtocol, Truth
-from pimper_torch.records import Estimate, Mesh
+from pimper_torch.records import Mesh
 from pimper_torch.runtime.errors import ConfigError, InputError
 
 FLAT = Mesh(vertices_world=torch.ones(3, 3), faces=torch.tensor([[0, 1, 2]]))

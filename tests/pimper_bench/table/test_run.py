@@ -6,6 +6,7 @@ from torch.testing import assert_close
 
 from pimper_bench.baselines.missing import MissingProgramError
 from pimper_bench.metrics import TrueSurface
+from pimper_bench.metrics.estimates import Estimate
 from pimper_bench.metrics.in_view import meet_truth
 from pimper_bench.scenes import SceneObject, render_objects, sparse_scene
 from pimper_bench.scenes.procedural_meshes import icosphere
@@ -20,7 +21,7 @@ from pimper_bench.truth import Capture, Truth
 from pimper_torch.export.result_folder.marker import MARKER
 from pimper_torch.geometry.rigid import transform
 from pimper_torch.io.meshes import read_mesh
-from pimper_torch.records import CoarseMesh, Estimate, Mesh
+from pimper_torch.records import CoarseMesh, Mesh
 from pimper_torch.runtime.errors import ConfigError, PimperWarning, ReconstructionError
 
 COUNTS = {"samples": 1000, "missing_samples": 250}
