@@ -63,7 +63,8 @@ _STEPS_AWAY, _UNIQUE = 6, 1 / 0.8
 # contradicts it. Spot along an arc, with true and with estimated silhouettes: 9.7 and 12.4 %. Jar,
 # balls, mug and potatoes, ogre along an arc, spot and ogre in an orbit: 0.3 to 2.0 %.
 _FALL, _FAR, _WRONG = 0.6, 0.02, 0.05
-_TEST_VIEWS = 3  # reference views whose rays test the mesh: a choice
+# Views whose rays test the mesh, and pixels between them: choices, thousands of rays for 5 %.
+_TEST_VIEWS, _TEST_STRIDE = 3, 4
 
 # Number of light fits, each followed by a sweep: after 0 to 6 of them, distances of spot along an
 # arc are 0.79, 0.64, 0.45, 0.29, 0.26, 0.29 and 0.36 %, and errors of lights are 28, 25, 22, 19,
@@ -177,21 +178,19 @@ class DepthFromLight(Stage):
             lamp does not explain the photographs better than soft light: on a dark, mirroring bust,
             light gives a wrong surface.
         """
-        vertices = mesh.vertices_world
-        empty = OrientedPoints(
-            points_world=vertices[:0], normals_world=vertices[:0], noise=vertices[:0, 0]
-        )
+        vertices, none = mesh.vertices_world, mesh.vertices_world[:0]
+        empty = OrientedPoints(points_world=none, normals_world=none, noise=none[:, 0])
         if not contours.confine or not bool(field.point_light.any()):
             return empty
         lit = _reduced(scene, contours.silhouettes, field)
-        all_rays = _references(lit, contours)
-        test_rays = all_rays[:_TEST_VIEWS]
+        test_rays = _references(lit, contours, _TEST_VIEWS, _TEST_STRIDE)
         swept = _sweep(lit, test_rays)
         caster, size = RayCaster(vertices, mesh.faces), (vertices.amax(0) - vertices.amin(0)).norm()
         masks = [_contradicted(*pair, caster, size) for pair in zip(test_rays, swept, strict=True)]
         if not masks or float(torch.cat(masks).double().mean()) < _WRONG:
             return empty
-        swept += _sweep(lit, all_rays[_TEST_VIEWS:])
+        all_rays = _references(lit, contours, _REFERENCES, _STRIDE)
+        swept = _sweep(lit, all_rays)
         for _ in range(_ROUNDS):
             lit = _refitted(lit, _oriented(lit, all_rays, swept))
             swept = _sweep(lit, all_rays)
@@ -221,7 +220,7 @@ def _reduced(scene: SparseScene, silhouettes: Silhouettes, field: LightField) ->
     )
 
 
-def _references(lit: _Lit, contours: Contours) -> list[_Rays]:
+def _references(lit: _Lit, contours: Contours, number: int, stride: int) -> list[_Rays]:
     """Return the rays of reference views: reliable, with neighbours, at wide angles to others."""
     reliable = contours.silhouettes.reliable
     axes = lit.cameras.cam_from_world[:, 2, :3]
@@ -229,11 +228,11 @@ def _references(lit: _Lit, contours: Contours) -> list[_Rays]:
     central = (angles < _WIDEST_DEG).sum(dim=1) - angles.mean(dim=1) / 360
     chosen: list[_Rays] = []
     view, apart = int(central.masked_fill(~reliable, -1).argmax()), angles.new_full((), torch.inf)
-    for _ in range(_REFERENCES):
+    for _ in range(number):
         views = angles[view].argsort()
         views = views[angles[view, views] < _WIDEST_DEG][:_VIEWS]
         if len(views) >= _FEWEST:
-            chosen.append(_cast(lit, contours.hull, view, views))
+            chosen.append(_cast(lit, contours.hull, view, views, stride))
         apart = torch.minimum(apart, angles[view]).masked_fill(~reliable, 0)
         view = int(apart.argmax())
         if apart[view] < _APART_DEG:
@@ -241,11 +240,11 @@ def _references(lit: _Lit, contours: Contours) -> list[_Rays]:
     return chosen
 
 
-def _cast(lit: _Lit, hull: Hull, view: int, views: Int[Tensor, " view"]) -> _Rays:
+def _cast(lit: _Lit, hull: Hull, view: int, views: Int[Tensor, " view"], stride: int) -> _Rays:
     cameras = lit.cameras
     frame, eye = cameras.cam_from_world[view], cameras.centers_world[view]
-    inside = lit.inside[view, _STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE].clone()
-    pixels = pixels_from_indices(_STRIDE * inside.nonzero().flip(1).to(frame) + _STRIDE // 2)
+    inside = lit.inside[view, stride // 2 :: stride, stride // 2 :: stride].clone()
+    pixels = pixels_from_indices(stride * inside.nonzero().flip(1).to(frame) + stride // 2)
     rays = rays_through(pixels, frame, cameras.intrinsics[view])
     low, high = hull.corners_world.to(frame)
     middle, half = (low + high) / 2, (high - low).norm() / 2
@@ -258,7 +257,7 @@ def _cast(lit: _Lit, hull: Hull, view: int, views: Int[Tensor, " view"]) -> _Ray
     thickness = depths[-1 - in_hull.flip(0).to(torch.uint8).argmax(dim=0)] - first
     # As deep as the silhouette is wide, since the hull of an arc is too long; two samples are in
     # front of the hull, as the mesh may touch it.
-    width = inside.sum().sqrt() * _STRIDE / cameras.intrinsics[view, 0, 0] * first.median()
+    width = inside.sum().sqrt() * stride / cameras.intrinsics[view, 0, 0] * first.median()
     step = width / (_DEPTHS - 4)
     index = torch.arange(_DEPTHS).to(frame)[:, None]
     return _Rays(
