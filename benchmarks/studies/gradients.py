@@ -15,13 +15,17 @@ import pimper_torch as pt
 from pimper_torch.runtime.errors import PimperWarning
 
 STAGES = ("factorize", "sweep", "fuse", "chain")
+# The scene of the whole chain in `tests/test_gradients.py`: no step changes a discrete choice.
+FEW = {"seed": 36, "num_views": 5, "width": 32, "num_points": 11}
 
 
 def measure(place: Place, stage: str) -> Figures:
     """Check every output of a stage by every input that it depends on."""
     warnings.simplefilter("ignore", PimperWarning)
-    chain = pt.load_chain("default", {"scales": [1.0]} if place.tiny else {})
-    found = probes(chain, *small_scene())[stage].check(
+    whole = stage == "chain"
+    scales = {"scales": [0.5, 1.0]} if whole else {"scales": [1.0]} if place.tiny else {}
+    scene = small_scene(**FEW) if whole else small_scene()
+    found = probes(pt.load_chain("default", scales), *scene)[stage].check(
         torch.Generator().manual_seed(5),
         directions=1 if place.tiny else 3,
         weights=2,

@@ -16,16 +16,6 @@ STUDIES = {name: tables.study_named(name) for name in tables.NAMES}
 DOCUMENTS = (ROOT / "README.md", ROOT / "benchmarks" / "README.md", *(ROOT / "docs").glob("*.md"))
 MARKER = re.compile(r"<!-- table: ([\w-]+) -->")
 OLDEST = 2  # minor versions
-# Studies with older rows, which name their version; a study that is measured leaves this list.
-WAITING = {
-    "cameras",
-    "file_encodings",
-    "gradients",
-    "lights",
-    "priors",
-    "sfm",
-    "walk",
-}
 
 
 def minor(version):
@@ -40,9 +30,7 @@ def test_figures_are_at_most_two_minor_versions_old(name):
     rows = tables.kept_rows(STUDIES[name])
     assert rows, f"nothing is measured: python benchmarks/studies/tables.py {name}"
     old = [" ".join(key) for key, row in rows.items() if now - minor(row["version"]) > OLDEST]
-    assert bool(old) == (name in WAITING), (
-        f"these rows are old: {old}; python benchmarks/studies/tables.py {name}"
-    )
+    assert not old, f"these rows are old: {old}; python benchmarks/studies/tables.py {name}"
 
 
 @pytest.mark.parametrize("name", STUDIES)
