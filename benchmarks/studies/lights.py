@@ -5,7 +5,7 @@ from functools import partial
 from bench_runs import run
 from declared import Row, Study, Table, bracketed, figure, listed
 
-WALK = {"path": "handheld", "num_views": 16, "width": 320, "height": 240, "ambient": 0.3}
+WALK = {"path": "handheld", "num_views": 24, "width": 320, "height": 240, "ambient": 0.3}
 PLACES = {"num_views": 24, "width": 240, "height": 180, "span_deg": 80.0}
 SETS = {
     ("one", "one"): WALK | {"constant_light": True},
