@@ -147,6 +147,10 @@ BAD = {
         lambda result: with_reliable(result, True, False, False),
         r"b\.png: 2 of 3 silhouettes contradict the others\. ",
     ),
+    "registered": (
+        lambda result: result.replace(scene=result.scene.replace(unregistered=("d.png", "e.png"))),
+        r"d\.png: 2 of 5 photographs were not registered\. Photograph the object",
+    ),
 }
 
 

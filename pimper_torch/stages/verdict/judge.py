@@ -16,6 +16,7 @@ from pimper_torch.stages.verdict.sides import unphotographed
 # Values of each figure that score 0, a half and 1: unusable, the last of good results, and best.
 # Fitted to ten captures of the fleet and the demo: docs/decisions.md, "The verdict".
 LIMITS = {
+    "registered": (0.2, 0.7, 1.0),
     "reliable": (0.2, 0.7, 1.0),
     "expected_overlap": (0.6, 0.855, 1.0),
     "covered": (0.7, 0.96, 1.0),
@@ -101,6 +102,14 @@ def _figures(result: Reconstruction) -> Iterator[_Figure]:
     """Yield the figures that the run determines."""
     scene, silhouettes, relighting = result.scene, result.silhouettes, result.relighting
     names, reference = scene.views.names, scene.views.names[result.coarse.reference]
+    if lost := scene.unregistered:
+        yield _Figure(
+            "registered",
+            len(names) / len(names + lost),
+            lost[0],
+            f"{len(lost)} of {len(names + lost)} photographs were not registered",
+            "Photograph the object from places between, or remove photographs of other things.",
+        )
     if silhouettes.source != "everything" and bool(silhouettes.reliable.any()):
         yield from _of_silhouettes(
             silhouettes, coverage_by(result.mesh, silhouettes, result.cameras), names
