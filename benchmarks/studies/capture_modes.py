@@ -51,6 +51,7 @@ def outlines(capture: Path, result: Path) -> Figures:
 
 COST = (figure("CPU s", "CPU s", 0), figure("GB", "GB", 1))
 VISITOR: tuple[Column, ...] = (
+    figure("registered", "registered", 0),
     said("verdict", "verdict"),
     figure("normals, °", "normals °", 1),
     figure("Chamfer, %", "Chamfer %", 3),
