@@ -148,5 +148,5 @@ def _spread(path: Path, values: Tensor) -> Saliency:
             "needed: a salient-object network, whose first output is a map (1, 1, height, width) "
             "from 0 to 1. Call other networks by `pt.priors_of`."
         )
-    saliency = values.reshape(values.shape[-2:]).float()
-    return (saliency - low) / (high - low) if high > low else torch.full_like(saliency, 0.5)
+    saliency, constant = values.reshape(values.shape[-2:]).float(), high - low < 1e-6  # rounding
+    return torch.full_like(saliency, 0.5) if constant else (saliency - low) / (high - low)
