@@ -11,7 +11,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[2] / "pimper_torch"
 
-BARS = {"lines of the package": 56_523, "functions of more than 60 lines": 8}
+BARS = {"lines of the package": 56_524, "functions of more than 60 lines": 8}
 
 
 def measure(package: Path) -> dict[str, int]:
