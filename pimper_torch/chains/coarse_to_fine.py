@@ -117,9 +117,9 @@ class CoarseToFine(Chain):
                 del sources  # takes as much memory as the photographs
             surface = run(self.fuse, heights, contours, last, *by_blocks)
             surface = run(self.repair, surface)
-            run(self.explain, surface, contours)
             yield Step(scale=scale, last=last, prepared=prepared, heights=heights, surface=surface)
             if not last:
+                run(self.explain, surface, contours)
                 coarse = run(self.remesh, heights, surface, contours)
 
     def _light(

@@ -1,8 +1,10 @@
 """Images of a finished result, which depend neither on formats nor on the unit of length."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
+from typing import Any
 
 import torch
 from jaxtyping import UInt8
@@ -12,7 +14,7 @@ from pimper_torch.chains.running import ChainRun
 from pimper_torch.geometry.visibility import visible_vertices
 from pimper_torch.records import FinishedMesh, Reconstruction, Record, Relighting, TexturedMesh
 from pimper_torch.records.shapes import PerVertex, VertexMask
-from pimper_torch.runtime.progress import part
+from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.scale.marker_scale import Marker, find_markers
 from pimper_torch.stages.sfm.sparse_scene import point_colors
 from pimper_torch.stages.stage import Stage
@@ -54,23 +56,27 @@ class Draw(Stage):
     def forward(self, result: Reconstruction) -> Pictures:
         """Draw the surface, the photographs and their predictions."""
         ready, asset, relighting = completed(result)
-        files = BytesIO(), BytesIO()
-        with part(0, 3):
-            draw_overview(result, files[0])
-        with part(1, 3):
-            draw_turn(result.mesh, result.cameras, result.coarse.reference, files[1])
-        overview, turn = (torch.frombuffer(file.getbuffer(), dtype=torch.uint8) for file in files)
-        with part(2, 3):
-            predicted = predictions(ready.few, result.scene, relighting)
-            return Pictures(
-                overview=overview,
-                turn=turn,
-                openness=openness(asset.mesh),
-                seen=visible_vertices(asset.mesh, result.cameras).any(dim=0),
-                views=json.dumps(view_images(result.scene, result.silhouettes, predicted)),
-                points=point_colors(result.scene),
-                markers=tuple(find_markers(result.scene)),
-            )
+        scene, cameras, turn, overview = result.scene, result.cameras, BytesIO(), BytesIO()
+        predicted = ready.few, scene, relighting
+        calls: tuple[Callable[[], Any], ...] = (
+            lambda: draw_turn(result.mesh, cameras, result.coarse.reference, turn),
+            lambda: view_images(scene, result.silhouettes, predictions(*predicted)),
+            lambda: draw_overview(result, overview),
+            lambda: openness(asset.mesh),
+            lambda: visible_vertices(asset.mesh, cameras).any(dim=0),
+            lambda: point_colors(scene),
+            lambda: tuple(find_markers(scene)),
+        )
+        _, views, _, opens, seen, points, markers = side_by_side(lambda call: call(), calls)
+        return Pictures(
+            overview=torch.frombuffer(overview.getbuffer(), dtype=torch.uint8),
+            turn=torch.frombuffer(turn.getbuffer(), dtype=torch.uint8),
+            openness=opens,
+            seen=seen,
+            views=json.dumps(views),
+            points=points,
+            markers=markers,
+        )
 
 
 def drawn(result: Reconstruction, store: Store | None = None) -> Pictures:

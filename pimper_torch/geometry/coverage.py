@@ -8,7 +8,7 @@ from torch import Tensor
 from pimper_torch.geometry.pixels import pixels_from_indices
 from pimper_torch.geometry.projection import rays_through
 from pimper_torch.geometry.surfaces import face_normals
-from pimper_torch.geometry.visibility import RayCaster
+from pimper_torch.geometry.visibility import ray_caster
 from pimper_torch.records import Cameras, Mesh, SilhouetteCoverage, Silhouettes, Surface
 from pimper_torch.runtime.parallel import side_by_side
 
@@ -21,8 +21,8 @@ def coverage_by(
 
     Rays are through about 20,000 pixels of a photograph. Not differentiable.
     """
-    vertices, faces = surface.vertices_world, surface.faces
-    caster, normals = RayCaster(vertices, faces), face_normals(vertices, faces)
+    vertices, caster = surface.vertices_world, ray_caster(surface)
+    normals = face_normals(vertices, surface.faces)
     cameras = cameras.to(vertices.dtype)
 
     def of_view(view: int) -> Tensor:

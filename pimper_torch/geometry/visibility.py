@@ -21,7 +21,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.projection import project, rays_through
 from pimper_torch.geometry.surfaces import carried_normals
-from pimper_torch.records import Cameras, Mesh, Record
+from pimper_torch.records import Cameras, Mesh, Record, Surface
 from pimper_torch.records.shapes import Faces, Scalars, Vectors, Vertices
 from pimper_torch.runtime.memory import emptied_on_release
 
@@ -103,9 +103,10 @@ class RayCaster:
             # Rounding to single precision moves a mesh this far away by over 1e-6 of its diagonal.
             if bool(middle.norm() > 16.0 * (high - low).norm()):
                 self._origin = middle
-        triangles = self._near(vertices.detach())[faces].to("cpu", torch.float32)
+        points = self._near(vertices.detach()).to("cpu", torch.float32)
+        corners = faces.to("cpu", torch.int32)
         self._scene = rtcore_scene.EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles.numpy()))
+        self._mesh = TriangleMesh(self._scene, points.numpy(), corners.numpy())
         # The first ray builds the tree, which is not thread-safe.
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
@@ -170,7 +171,7 @@ _prepared: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 _preparing = Lock()
 
 
-def ray_caster(mesh: Mesh) -> RayCaster:
+def ray_caster(mesh: Mesh | Surface) -> RayCaster:
     """Return the caster of a mesh, cached until :func:`forget_casters` or its vertices' end."""
     with _preparing:
         faces, caster = _prepared.get(mesh.vertices_world, (None, None))  # type: ignore[no-untyped-call]

@@ -25,6 +25,7 @@ from pimper_torch.lighting.light_field import LightField, harmonics, second_harm
 from pimper_torch.lighting.light_fit import LightFit, fit_lights, with_gradients
 from pimper_torch.lighting.light_models import ImageSamples, LightModel, SampleVectors
 from pimper_torch.records import PatchSet, PatchViews, Templates
+from pimper_torch.runtime.parallel import side_by_side
 
 # Models by their number of parameters.
 LightName = Literal["auto", "soft", "point_light", "room"]
@@ -255,9 +256,13 @@ def _selected(
     test = light_models.left_out(all_samples.seen)
     seen = all_samples.seen & ~test
     rest = ImageSamples(radiance=torch.where(seen, all_samples.radiance, 0), seen=seen)
+
+    def misfit_of(name: str) -> Float[Tensor, " view"]:
+        return _fit(name, rest, normals, points, iterations)[0].misfit(all_samples, test)
+
     best, least = "", torch.empty(0)
-    for name in _MODELS:
-        misfit = _fit(name, rest, normals, points, iterations)[0].misfit(all_samples, test)
+    misfits = side_by_side(misfit_of, _MODELS, tracked=False)
+    for name, misfit in zip(_MODELS, misfits, strict=True):
         if not best or light_models.predicts_better(misfit, least):
             best, least = name, misfit
     return best

@@ -23,7 +23,7 @@ Scale = Annotated[float, Range(above=0, most=1e12)]
 class Loss(ABC):
     r"""A loss of residuals, :math:`\tfrac{s^2}{2} \rho(r^2 / s^2)`, which reduces outliers' weight.
 
-    A custom loss defines :meth:`rho` and :meth:`weight`.
+    A custom loss defines :meth:`weight`.
 
     Attributes:
         scale: ``s`` in standard deviations of the residuals.
@@ -37,12 +37,8 @@ class Loss(ABC):
         require_ranges(self)
 
     @abstractmethod
-    def rho(self, square: Scalars) -> Scalars:
-        """Return the loss of squared residuals, both in units of the squared scale."""
-
-    @abstractmethod
     def weight(self, square: Scalars) -> Scalars:
-        """Return the derivative of :meth:`rho`: the weight in iteratively reweighted squares."""
+        r"""Return :math:`\rho'(u)` of ``u``, a square over :math:`s^2`: the residual's weight."""
 
     def slope(self, square: Scalars) -> Scalars:
         """Return the derivative of :meth:`weight`, by autograd."""
@@ -65,10 +61,6 @@ class Squares(Loss):
     code: ClassVar[int | None] = twin_constants.SQUARES
     scale: Scale = 1.0
 
-    def rho(self, square: Scalars) -> Scalars:
-        """Return the squares themselves."""
-        return square
-
     def weight(self, square: Scalars) -> Scalars:
         """Return 1."""
         return torch.ones_like(square)
@@ -83,10 +75,6 @@ class Cauchy(Loss):
 
     code: ClassVar[int | None] = twin_constants.CAUCHY
     scale: Scale = CAUCHY_TUNING
-
-    def rho(self, square: Scalars) -> Scalars:
-        """Return the logarithm."""
-        return square.log1p()
 
     def weight(self, square: Scalars) -> Scalars:
         r"""Return :math:`1 / (1 + u)`."""
@@ -103,10 +91,6 @@ class GemanMcClure(Loss):
     code: ClassVar[int | None] = twin_constants.GEMAN_MCCLURE
     scale: Scale = twin_constants.GEMAN_MCCLURE_TUNING
 
-    def rho(self, square: Scalars) -> Scalars:
-        r"""Return :math:`u / (1 + u)`."""
-        return square / (1 + square)
-
     def weight(self, square: Scalars) -> Scalars:
         r"""Return :math:`1 / (1 + u)^2`."""
         return 1 / (1 + square).square()
@@ -121,10 +105,6 @@ class Huber(Loss):
 
     code: ClassVar[int | None] = twin_constants.HUBER
     scale: Scale = twin_constants.HUBER_TUNING
-
-    def rho(self, square: Scalars) -> Scalars:
-        r"""Return :math:`u` up to 1, and :math:`2 \sqrt u - 1` beyond."""
-        return torch.where(square <= 1, square, 2 * square.clamp_min(1).sqrt() - 1)
 
     def weight(self, square: Scalars) -> Scalars:
         r"""Return 1 for :math:`u` up to 1, and :math:`1 / \sqrt u` beyond."""

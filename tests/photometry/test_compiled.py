@@ -61,9 +61,6 @@ class Welsch(Loss):
 
     scale: float = 2.985
 
-    def rho(self, square):
-        return -torch.expm1(-square)
-
     def weight(self, square):
         return torch.exp(-square)
 

@@ -49,12 +49,24 @@ def test_gradients_of_the_spread_match_differences(generator):
 LOSSES = {"linear": Squares(), "cauchy": Cauchy(), "huber": Huber(), None: GemanMcClure()}
 
 
-@pytest.mark.parametrize("loss", LOSSES.values())
-def test_weights_and_curvatures_are_derivatives_of_the_loss(generator, loss):
+def huber(square):
+    return torch.where(square <= 1, square, 2 * square.sqrt() - 1)
+
+
+@pytest.mark.parametrize(
+    ("loss", "rho"),
+    [
+        (Squares(), lambda square: square),
+        (Cauchy(), torch.log1p),
+        (Huber(), huber),
+        (GemanMcClure(), lambda square: square / (1 + square)),
+    ],
+)
+def test_weights_and_curvatures_are_derivatives_of_the_loss(generator, loss, rho):
     residual = normal(generator, 60).requires_grad_()
     deviation = torch.tensor(0.4, dtype=torch.float64)
     width = loss.scale * deviation
-    value = (width**2 / 2 * loss.rho((residual / width) ** 2)).sum()
+    value = (width**2 / 2 * rho((residual / width) ** 2)).sum()
     (slope,) = torch.autograd.grad(value, residual, create_graph=True)
     assert_close(slope, loss.weights(residual, deviation) * residual)
     (bend,) = torch.autograd.grad(slope.sum(), residual)

@@ -27,7 +27,7 @@ def estimate(megapixels: float, num_views: int) -> tuple[float, float]:
 
     >>> seconds, gigabytes = estimate(57.6, 30)
     >>> round(seconds), round(gigabytes, 2)
-    (298, 2.54)
+    (296, 2.54)
     """
     # Outside of stages: imports, reading photographs, hashing and keeping records.
     seconds = 3.0 + 0.35 * megapixels + sum(time for _, time in planned(megapixels, num_views))
@@ -68,11 +68,12 @@ def planned(
             ("photometry", 1.5 + 0.65 * megapixels**0.75 * scale**2),
             ("fuse", 0.8 + 26.0 * one * scale**2),
             ("repair", 1.2 * one * scale**2),
-            ("explain", 0.1 + 1.8 * one * scale**2),
+            ("explain", 0.1 + 1.0 * one * scale**2 if scale != scales[-1] else 0.0),
         ]
     return [
         *((name, seconds) for name, seconds in stages if seconds),
         ("extract", 0.5 + 4.0 * one * scales[-1] ** 2),
+        ("judge", 0.1 + 1.0 * one * scales[-1] ** 2),
         ("simplify", 2.5 * one),
         ("relight", 5.0 + 0.5 * one),
         ("texture", 2.0 + 4.0 * one),

@@ -10,7 +10,7 @@ from pimper_torch.geometry import surfaces
 from pimper_torch.geometry.pixels import pixel_centers
 from pimper_torch.geometry.surfaces import carried_normals
 from pimper_torch.geometry.tangents import frames, vertex_tangents
-from pimper_torch.geometry.visibility import Hits, RayCaster
+from pimper_torch.geometry.visibility import Hits, RayCaster, ray_caster
 from pimper_torch.radiometry import to_bytes
 from pimper_torch.radiometry.base_color import albedo_scale, base_color
 from pimper_torch.records import Mesh, Relighting, TexturedMesh
@@ -55,18 +55,18 @@ def textured(
         reflectance: Metallic, roughness and specular of its vertices; ``None`` for matte.
         atlas: Of ``few``; made by xatlas by default.
     """
+    caster = ray_caster(full)
     full, few = (mesh.detach().to(torch.float32) for mesh in (full, few))
     if atlas is None:
         side = float(surfaces.side_lengths(full.vertices_world[full.faces]).median())
         atlas = unwrapped(few, side / _TEXELS_PER_SIDE)
-    full, uncertainty = inpainted(full)
+    (full, uncertainty), texel_faces = inpainted(full), _texel_faces(atlas)
     normals = carried_normals(few)[atlas.vertex]
     mesh = few.take(atlas.vertex).replace(faces=atlas.faces)
     shape = surfaces.vertex_normals(few.vertices_world, few.faces)[atlas.vertex]
     tangent = vertex_tangents(mesh.vertices_world, normals, atlas.uv, mesh.faces)
     colors = base_color(full, albedo_scale(few)).expand(-1, 3)
     values = torch.cat([carried_normals(full), colors, uncertainty[:, None]], dim=1)
-    caster, texel_faces = RayCaster(full.vertices_world, full.faces), _texel_faces(atlas)
     face_normals = surfaces.unit_face_normals(full.vertices_world, full.faces)
     # The simplified mesh is off by far less than its sides; a surface farther away is unrelated.
     reach = surfaces.side_lengths(few.vertices_world[few.faces]).median()

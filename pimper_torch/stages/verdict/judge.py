@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pimper_torch.geometry.coverage import coverage_by
 from pimper_torch.records import Mesh, Reconstruction, SilhouetteCoverage, Silhouettes, Verdict
+from pimper_torch.runtime.reporting import add_counts
 from pimper_torch.stages.stage import Stage
 from pimper_torch.stages.verdict.sides import unphotographed
 
@@ -111,9 +112,9 @@ def _figures(result: Reconstruction) -> Iterator[_Figure]:
             "Photograph the object from places between, or remove photographs of other things.",
         )
     if silhouettes.source != "everything" and bool(silhouettes.reliable.any()):
-        yield from _of_silhouettes(
-            silhouettes, coverage_by(result.mesh, silhouettes, result.cameras), names
-        )
+        found = coverage_by(result.mesh, silhouettes, result.cameras)
+        add_counts(found.figures())
+        yield from _of_silhouettes(silhouettes, found, names)
     buckets = result.patches.photometric.buckets
     patches = max(1, sum(len(bucket.determined) for bucket in buckets))
     determined = sum(int(bucket.determined.sum()) for bucket in buckets) / patches
