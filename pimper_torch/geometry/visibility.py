@@ -166,26 +166,20 @@ class RayCaster:
         return (torch.from_numpy(faces) >= 0).reshape(shape).to(directions.device)
 
 
-# Faces and caster of each mesh, while its vertices exist.
+# Faces and caster of each mesh, while its vertices exist. The last surface's takes some 200 MB.
 _prepared: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+emptied_on_release(_prepared.clear)
 _preparing = Lock()
 
 
 def ray_caster(mesh: Mesh | Surface) -> RayCaster:
-    """Return the caster of a mesh, cached until :func:`forget_casters` or its vertices' end."""
+    """Return the caster of a mesh, cached until memory is released or its vertices' end."""
     with _preparing:
         faces, caster = _prepared.get(mesh.vertices_world, (None, None))  # type: ignore[no-untyped-call]
         if faces is not mesh.faces:
             caster = RayCaster(mesh.vertices_world, mesh.faces)
             _prepared[mesh.vertices_world] = mesh.faces, caster
         return caster
-
-
-@emptied_on_release
-def forget_casters() -> None:
-    """Free all cached casters: that of the last pass's surface takes some 200 MB."""
-    with _preparing:
-        _prepared.clear()
 
 
 def cast_view(mesh: Mesh | RayCaster, cameras: Cameras, view: int) -> Hits:

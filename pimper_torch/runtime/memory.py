@@ -31,10 +31,9 @@ def resident_bytes() -> float:
 _caches: list[Callable[[], None]] = []
 
 
-def emptied_on_release(empty: Callable[[], None]) -> Callable[[], None]:
+def emptied_on_release(empty: Callable[[], None]) -> None:
     """Register a function that empties a cache, for :func:`release_memory`."""
     _caches.append(empty)
-    return empty
 
 
 def release_memory() -> None:

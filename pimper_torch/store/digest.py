@@ -121,7 +121,7 @@ def tensor_hash(tensor: Tensor) -> str:
     if cached is not None and cached[0] == version:
         return cached[1]
     about = f"{tensor.dtype} {tuple(tensor.shape)} {tensor.device.type}"
-    hashed = hashlib.blake2b(about.encode(), digest_size=16)
+    hashed = hashlib.sha256(about.encode())  # processors have instructions for it
     flat = tensor.detach().cpu().resolve_conj().resolve_neg().reshape(-1)
     if flat.stride() != (1,):  # a tensor of one element may have any stride
         flat = flat.clone(memory_format=torch.contiguous_format)

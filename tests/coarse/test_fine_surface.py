@@ -10,7 +10,9 @@ from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.geometry.topology import face_components, face_pairs
 from pimper_torch.records import Support
 from pimper_torch.runtime.errors import ReconstructionError
-from pimper_torch.stages.coarse import trim
+from pimper_torch.runtime.memory import release_memory
+from pimper_torch.stages.coarse import oriented, trim
+from pimper_torch.stages.coarse.densify import depth_maps
 from pimper_torch.stages.coarse.fine_surface import closed_surface, cropped
 from pimper_torch.stages.coarse.oriented import no_points
 from pimper_torch.stages.coarse.surface import CoarseSurface
@@ -70,6 +72,33 @@ def test_a_half_textured_ball_is_closed_and_its_support_recorded(round_about):
     assert (coarse.support[below] == Support.POINTS).float().mean() < 0.02
     assert (coarse.support[below] == Support.CONTOUR).float().mean() > 0.3
     assert (coarse.support >= Support.LIGHT).float().mean() > 0.8
+
+
+def test_photographs_are_matched_once_for_a_second_surface_with_more_points(
+    round_about, monkeypatch
+):
+    scene = photographed(round_about.cameras.to(torch.float64), mottled)
+    contours = TraceContours()(silhouettes_of(scene.cameras), scene.cameras)
+    more = no_points(scene.points_world)
+    calls = []
+
+    def counted_maps(*given):
+        calls.append(given)
+        return depth_maps(*given)
+
+    monkeypatch.setattr(oriented, "depth_maps", counted_maps)
+    first = CoarseSurface(SETTINGS)(scene, contours)
+    again = CoarseSurface(SETTINGS)(scene, contours, None, more)
+    assert len(calls) == 1
+    assert torch.equal(first.mesh.vertices_world, again.mesh.vertices_world)
+    CoarseSurface(SETTINGS)(scene, contours)
+    release_memory()
+    CoarseSurface(SETTINGS)(scene, contours, None, more)
+    assert len(calls) == 3
+    darker = scene.replace(views=scene.views.replace(images=scene.views.images / 2))
+    CoarseSurface(SETTINGS)(scene, contours)
+    CoarseSurface(SETTINGS)(darker, contours, None, more)
+    assert len(calls) == 5
 
 
 def test_an_untextured_ball_follows_from_its_silhouettes(round_about):

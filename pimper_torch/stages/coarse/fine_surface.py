@@ -26,9 +26,11 @@ from pimper_torch.records.shapes import Faces, Vertices
 from pimper_torch.runtime.errors import ReconstructionError
 from pimper_torch.runtime.ledger import leave_out
 from pimper_torch.runtime.mapped import by_view, each, zeros
+from pimper_torch.runtime.memory import emptied_on_release
 from pimper_torch.stages.coarse import oriented, trim
 from pimper_torch.stages.coarse.densify import DepthMaps, factors
 from pimper_torch.stages.coarse.window_matching import MatchingLevel, level_of
+from pimper_torch.store import digest
 
 # In pixels of the finest depth maps, at the cloud's median depth. Largest distance of points and
 # surface outside the visual hull; largest distance of a face to the points or contour points that
@@ -37,6 +39,12 @@ TOLERANCE_PX, REACH_PX = 4.0, 4.0
 
 # Barycentric coordinates, times 6, of the points in a facet that vote for its support.
 _VOTES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
+
+
+_Matched = tuple[OrientedPoints, DepthMaps | None, MatchingLevel, float]
+# By a hash of its inputs: points from light need the surface a second time.
+_matches: dict[str, _Matched] = {}
+emptied_on_release(_matches.clear)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -84,7 +92,12 @@ def fine_surface(
     Raises:
         ReconstructionError: Silhouettes and photographs support no surface.
     """
-    cloud, maps, level, pixel = _matched(scene, reliable, contours, levels)
+    matched = scene, reliable, contours, levels
+    key = digest(*matched)
+    found = _matches.pop(key or "", None) or _matched(*matched)
+    if key and more is None:
+        _matches[key] = found
+    cloud, maps, level, pixel = found
     if more is not None:
         cloud = OrientedPoints.cat([cloud, oriented.grid_averaged(more, pixel)])
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
@@ -115,7 +128,7 @@ def fine_surface(
 
 def _matched(
     scene: SparseScene, reliable: Int[Tensor, " reliable"], contours: Contours, levels: int
-) -> tuple[OrientedPoints, DepthMaps | None, MatchingLevel, float]:
+) -> _Matched:
     """Return matched points in the hull, depth maps and their level, and the size of a pixel.
 
     An object without texture has no points and no depth maps.
