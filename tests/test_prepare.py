@@ -106,3 +106,15 @@ def test_the_stage_of_samples_normals_and_heights_is_replaced_as_a_whole(sphere)
     assert len(Mine.handed) == 2
     assert Mine.handed[0] == (chain.warp, chain.factorize, chain.sweep)
     assert step.last
+
+
+def test_kernels_of_gradients_are_compiled_ahead_if_gradients_are_recorded(sphere, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        "pimper_torch.chains.chain.compile_ahead", lambda gradients: asked.append(gradients)
+    )
+    chain = chain_of(sphere)
+    chain.prepare(sphere[0])
+    with torch.no_grad():
+        chain.prepare(sphere[0])
+    assert asked == [True, False]

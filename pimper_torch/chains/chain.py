@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
 from torch import nn
 
 from pimper_torch.chains.prepare import Prepared, prepare
@@ -212,7 +213,7 @@ class Chain(Stage):
         names = (views if isinstance(views, Views) else views.views).names
         for reference in self.references():
             view_named(reference, names)  # an unknown name fails before structure from motion
-        compile_ahead()
+        compile_ahead(gradients=torch.is_grad_enabled())
         with skipping(self.on_failure) as entries, observed(self.observer) as table:
             prepared = prepare(self, self.running(), views, sparse_model, mesh)
             self.show(prepared.scene, prepared.coarse)

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from pimper_torch.viewer.viewer import Viewer
 
 
+@torch.no_grad()
 def carry_out(job: Job, output: Output) -> None:
     """Reconstruct, write the result, and show it if the arguments require that."""
     if job.common.device == "cuda" and not torch.cuda.is_available():

@@ -56,11 +56,11 @@ class Draw(Stage):
     def forward(self, result: Reconstruction) -> Pictures:
         """Draw the surface, the photographs and their predictions."""
         ready, asset, relighting = completed(result)
-        scene, cameras, turn, overview = result.scene, result.cameras, BytesIO(), BytesIO()
-        predicted = ready.few, scene, relighting
+        scene, cameras, masks = result.scene, result.cameras, result.silhouettes
+        turn, overview = BytesIO(), BytesIO()
         calls: tuple[Callable[[], Any], ...] = (
             lambda: draw_turn(result.mesh, cameras, result.coarse.reference, turn),
-            lambda: view_images(scene, result.silhouettes, predictions(*predicted)),
+            lambda: view_images(scene, masks, predictions(ready.few, scene, relighting)),
             lambda: draw_overview(result, overview),
             lambda: openness(asset.mesh),
             lambda: visible_vertices(asset.mesh, cameras).any(dim=0),

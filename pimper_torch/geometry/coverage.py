@@ -19,7 +19,8 @@ def coverage_by(
 ) -> SilhouetteCoverage:
     """Return the fractions of every reliable silhouette that a surface lacks or exceeds.
 
-    Rays are through about 20,000 pixels of a photograph. Not differentiable.
+    None if they constrain nothing. Rays are through about 20,000 pixels of a photograph. Not
+    differentiable.
     """
     vertices, caster = surface.vertices_world, ray_caster(surface)
     normals = face_normals(vertices, surface.faces)
@@ -39,7 +40,8 @@ def coverage_by(
         outside = (hit * (1 - 2 * inside).clamp_min(0)).sum()
         return torch.stack([((inside > 0.5) & ~covered).sum() / area, outside / area])
 
-    views = silhouettes.reliable.nonzero()[:, 0].tolist()
+    found = silhouettes.source != "everything"
+    views = silhouettes.reliable.nonzero()[:, 0].tolist() if found else []
     rows = [vertices.new_zeros(0, 2), *(row[None] for row in side_by_side(of_view, views))]
     uncovered, outside = torch.cat(rows).unbind(dim=1)
     return SilhouetteCoverage(uncovered=uncovered, outside=outside)

@@ -46,13 +46,13 @@ SURFACE = (
     "decimation",
 )
 
-# Rows of modules that one process compiles, in order: both take about as long.
+# Only for gradients; the last one takes most of the time.
+GRADIENTS = ("resampling_adjoint", "sweep_adjoint", "factor_adjoint")
+
+# Rows of modules that one process compiles, in order: those of a run take about as long.
 _SECOND = ("factorization", "multigrid_levels", "decimation")
 _FIRST = (*SFM, *COARSE, *PHOTOMETRY, *SWEEP, *SURFACE)
-ROWS = (tuple(name for name in _FIRST if name not in _SECOND), _SECOND)
-
-# Only for gradients: compiled when a run first needs them.
-GRADIENTS = ("factor_adjoint", "resampling_adjoint", "sweep_adjoint")
+ROWS = (tuple(name for name in _FIRST if name not in _SECOND), _SECOND, GRADIENTS)
 
 # Relaxations of IEEE arithmetic for vectorized sums: reordering, fused and reciprocal operations.
 # NaN and infinity keep their meaning.
@@ -199,9 +199,9 @@ def load(names: Sequence[str]) -> None:
 
     If a child died, this process compiles the rest.
     """
-    late = time.monotonic() + _PATIENCE_S
+    late, gradients = time.monotonic() + _PATIENCE_S, not set(GRADIENTS).isdisjoint(names)
     for done, name in enumerate(names, start=1):
-        while not _is_done(name) and any(child.poll() is None for child in compile_ahead()):
+        while not _is_done(name) and any(c.poll() is None for c in compile_ahead(gradients)):
             time.sleep(0.05)
             if time.monotonic() > late:
                 late += _PATIENCE_S
@@ -215,7 +215,7 @@ def load(names: Sequence[str]) -> None:
 
 def all_compiled(folder: Path | None = None) -> bool:
     """Return whether all kernels of a run are cached, by default in :func:`cache_folder`."""
-    return all(_is_done(name, folder) for row in ROWS for name in row)
+    return all(_is_done(name, folder) for name in _FIRST)
 
 
 def _is_done(name: str, folder: Path | None = None) -> bool:
@@ -223,27 +223,30 @@ def _is_done(name: str, folder: Path | None = None) -> bool:
     return Path(folder or cache_folder(), f"{name}.done").exists()
 
 
-@cache
-def compile_ahead() -> "tuple[subprocess.Popen[bytes], ...]":
-    """Start processes, once, for all rows that are not completely cached.
+def compile_ahead(gradients: bool = False) -> "list[subprocess.Popen[bytes]]":
+    """Return the processes that compile what is not cached, started once; also for gradients.
 
     They end with this process in any case, because their standard input is closed then.
     """
+    children = map(_started, range(len(ROWS) if gradients else len(ROWS) - 1))
+    return [child for child in children if child is not None]
+
+
+@cache
+def _started(row: int) -> "subprocess.Popen[bytes] | None":
+    if all(map(_is_done, ROWS[row])):
+        return None
     path = [str(Path(pimper_torch.__path__[0]).parent), os.environ.get("PYTHONPATH", "")]
     variables = {
         "PYTHONPATH": os.pathsep.join(filter(None, path)),
         "NUMBA_CACHE_DIR": str(cache_folder().parent),
     }
-    return tuple(
-        subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import _child; _child({row})"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | variables,
-        )
-        for row, names in enumerate(ROWS)
-        if not all(map(_is_done, names))
+    return subprocess.Popen(
+        [sys.executable, "-c", f"from {__name__} import _child; _child({row})"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | variables,
     )
 
 
@@ -264,8 +267,12 @@ def _child(row: int) -> None:
     with suppress(OSError, NotImplementedError):
         lock.acquire()
     if not all(map(_is_done, ROWS[row])):
-        # Never load other processes' code: code depends on the modules compiled before.
-        _cache_class().load_overload = lambda *_: None  # type: ignore[attr-defined]
+        # Code depends on the modules compiled before: gradients come after all others, which never
+        # load other processes' code.
+        if ROWS[row] == GRADIENTS:
+            load(_FIRST)
+        else:
+            _cache_class().load_overload = lambda *_: None  # type: ignore[attr-defined]
         for name in ROWS[row]:
             import_module(modules().get(name, name))
             (folder / f"{name}.done").touch()

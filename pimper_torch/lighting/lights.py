@@ -25,7 +25,6 @@ from pimper_torch.lighting.light_field import LightField, harmonics, second_harm
 from pimper_torch.lighting.light_fit import LightFit, fit_lights, with_gradients
 from pimper_torch.lighting.light_models import ImageSamples, LightModel, SampleVectors
 from pimper_torch.records import PatchSet, PatchViews, Templates
-from pimper_torch.runtime.parallel import side_by_side
 
 # Models by their number of parameters.
 LightName = Literal["auto", "soft", "point_light", "room"]
@@ -207,16 +206,14 @@ def _fit(
     eye = torch.eye(9).to(basis)
     if name == "soft":
         return fit_lights(LightModel(basis=basis[:, :4]), samples, iterations), eye[:4]
-    model = LightModel(basis=basis[:, :1], normals=normals, points=points)
-    fit = fit_lights(model, samples, iterations)
-    if name == "point_light":
-        return fit, eye[:1]
-    room = eye[:1]
-    for _ in range(8):
-        room = _fit_room(fit, samples, basis, room)
-        model = LightModel(basis=basis @ room.mT, normals=normals, points=points)
-        fit = fit_lights(model, samples, iterations, (fit.lights, fit.albedo))
-    return fit, room
+    room, start = eye[:1], None
+    with torch.no_grad():  # for gradients, the last fit alone has to converge to rounding
+        for _ in range(8 if name == "room" else 0):
+            model = LightModel(basis=basis @ room.mT, normals=normals, points=points)
+            fit = fit_lights(model, samples, iterations, start)
+            room, start = _fit_room(fit, samples, basis, room), (fit.lights, fit.albedo)
+    model = LightModel(basis=basis @ room.mT, normals=normals, points=points)
+    return fit_lights(model, samples, iterations, start), room
 
 
 @torch.no_grad()
@@ -256,13 +253,9 @@ def _selected(
     test = light_models.left_out(all_samples.seen)
     seen = all_samples.seen & ~test
     rest = ImageSamples(radiance=torch.where(seen, all_samples.radiance, 0), seen=seen)
-
-    def misfit_of(name: str) -> Float[Tensor, " view"]:
-        return _fit(name, rest, normals, points, iterations)[0].misfit(all_samples, test)
-
     best, least = "", torch.empty(0)
-    misfits = side_by_side(misfit_of, _MODELS, tracked=False)
-    for name, misfit in zip(_MODELS, misfits, strict=True):
+    for name in _MODELS:
+        misfit = _fit(name, rest, normals, points, iterations)[0].misfit(all_samples, test)
         if not best or light_models.predicts_better(misfit, least):
             best, least = name, misfit
     return best

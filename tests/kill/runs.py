@@ -36,9 +36,9 @@ def main(folder: Path, count: int, seed: int) -> None:
     import pycolmap  # noqa: F401
 
     import pimper_bench.cli.render_command  # noqa: F401
-    from pimper_torch.kernels.compile import ROWS, load
+    from pimper_torch.kernels.compile import GRADIENTS, ROWS, load
 
-    load([name for row in ROWS for name in row])
+    load([name for row in ROWS for name in row if row != GRADIENTS])
     scene, moments = folder / "scene", random.Random(seed)
     small = "--num-views 6 --width 64 --height 48 --processes 1 --supersample 1 --seed 1"
     assert forked(["render", "balls", "-o", str(scene), *small.split()]) == 0

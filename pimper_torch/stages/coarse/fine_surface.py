@@ -41,9 +41,8 @@ TOLERANCE_PX, REACH_PX = 4.0, 4.0
 _VOTES = ((4, 1, 1), (1, 4, 1), (1, 1, 4), (2, 2, 2))
 
 
-_Matched = tuple[OrientedPoints, DepthMaps | None, MatchingLevel, float]
-# By a hash of its inputs: points from light need the surface a second time.
-_matches: dict[str, _Matched] = {}
+# What was matched, by a hash of the inputs: points from light need the surface a second time.
+_matches: dict[str | None, tuple[OrientedPoints, DepthMaps | None, MatchingLevel, float]] = {}
 emptied_on_release(_matches.clear)
 
 
@@ -92,12 +91,9 @@ def fine_surface(
     Raises:
         ReconstructionError: Silhouettes and photographs support no surface.
     """
-    matched = scene, reliable, contours, levels
-    key = digest(*matched)
-    found = _matches.pop(key or "", None) or _matched(*matched)
-    if key and more is None:
-        _matches[key] = found
-    cloud, maps, level, pixel = found
+    if (key := digest(scene, reliable, contours, levels)) not in _matches:
+        _matches[key] = _matched(scene, reliable, contours, levels)
+    cloud, maps, level, pixel = _matches[key] if key else _matches.pop(key)
     if more is not None:
         cloud = OrientedPoints.cat([cloud, oriented.grid_averaged(more, pixel)])
     vertices, faces, contour = closed_surface(cloud, contours, pixel)
@@ -128,7 +124,7 @@ def fine_surface(
 
 def _matched(
     scene: SparseScene, reliable: Int[Tensor, " reliable"], contours: Contours, levels: int
-) -> _Matched:
+) -> tuple[OrientedPoints, DepthMaps | None, MatchingLevel, float]:
     """Return matched points in the hull, depth maps and their level, and the size of a pixel.
 
     An object without texture has no points and no depth maps.

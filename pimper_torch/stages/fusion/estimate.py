@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from pimper_torch.kernels.arrays import as_array
@@ -55,12 +56,12 @@ class FusedHeights(Record):
     weights: tuple[Float[Tensor, " _"], ...]
     damping: PerVertex
 
-    def matrix(
-        self,
-    ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"], Float[Tensor, " entry"]]:
-        """Return rows, columns and values of the last system's matrix."""
-        start = torch.zeros_like(self.damping)
-        return _system(self.kinds, self.weights, self.factors, start, self.damping)[0]
+    def system(
+        self, targets: Sequence[Float[Tensor, " _"]], start: PerVertex
+    ) -> tuple[csr_array, PerVertex]:
+        """Return the last system for other targets and initial heights, without gradients."""
+        kinds = [kind.replace(targets=t) for kind, t in zip(self.kinds, targets, strict=True)]
+        return _compressed(kinds, self.weights, self.factors, start, self.damping)
 
 
 def fuse_terms(
@@ -169,17 +170,27 @@ def _solved(
     if not compiled_for(start, damping, *tensors, *weights, *factors):
         entries, rhs = _system(kinds, weights, factors, start, damping)
         return solutions(*entries, rhs, *further, what="the fusion", tolerance=_EXACT)
-    terms = [
-        (kind.unknowns, kind.coefficients, kind.targets, weight * kind.information / factor)
-        for kind, weight, factor in zip(kinds, weights, factors, strict=True)
-    ]
-    matrix, rhs = compressed_equations(terms, damping, start)
+    matrix, rhs = _compressed(kinds, weights, factors, start, damping)
     initial = None
     if guess is not None:
         initial = torch.stack([guess, *(torch.zeros_like(guess) for _ in further)], dim=1)
     sides = torch.stack([rhs, *further], dim=1)
     result = solve_compressed(matrix, sides, what="the fusion", tolerance=tolerance, start=initial)
     return result.unbind(dim=1)
+
+
+def _compressed(
+    kinds: Sequence[Equations],
+    weights: Sequence[Float[Tensor, " _"]],
+    factors: Sequence[Scalar],
+    start: PerVertex,
+    damping: PerVertex,
+) -> tuple[csr_array, PerVertex]:
+    terms = [
+        (kind.unknowns, kind.coefficients, kind.targets, weight * kind.information / factor)
+        for kind, weight, factor in zip(kinds, weights, factors, strict=True)
+    ]
+    return compressed_equations(terms, damping, start)
 
 
 def _evaluated(

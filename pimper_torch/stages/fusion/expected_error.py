@@ -24,7 +24,7 @@ from torch.nn.functional import normalize
 from pimper_torch.geometry.subdivision import Subdivision
 from pimper_torch.geometry.surfaces import face_normals
 from pimper_torch.linalg.sums import sum_at
-from pimper_torch.linalg.systems import prepare_system
+from pimper_torch.linalg.systems import solve_compressed
 from pimper_torch.records.shapes import PerVertex, Scalar
 from pimper_torch.stages.fusion.equations import Equations
 from pimper_torch.stages.fusion.estimate import FusedHeights
@@ -57,26 +57,25 @@ def expected_error(
         Errors along the directions of the heights, scene units, float64. Not differentiable.
 
     Raises:
-        SingularSystemError: See :func:`~pimper_torch.linalg.systems.prepare_system`.
+        SingularSystemError: See :func:`~pimper_torch.linalg.systems.solve_compressed`.
     """
     generator = torch.Generator().manual_seed(0)  # of noise; any seed
     region = regions(subdivision)
     solves = (coarse,) if fine is coarse else (coarse, fine)
-    sides: list[list[Tensor]] = [[] for _ in solves]
+    sides = []
     for _ in range(draws):
         noise = [
             _noise(kind, weight, factor, subdivision, region, generator)
             for kind, weight, factor in zip(coarse.kinds, coarse.weights, fine.factors, strict=True)
         ]
         start = _normal(generator, coarse.damping) / coarse.damping.double().sqrt()
-        for solve, side in zip(solves, sides, strict=True):
-            side.append(_noise_rhs(solve, noise, start))
+        systems = [solve.system(noise, start) for solve in solves]
+        sides.append([side for _, side in systems])
     solutions = []
-    for solve, side in zip(solves, sides, strict=True):
-        size, what = len(solve.heights), "the expected error"
-        system = prepare_system(*solve.matrix(), size, what, tolerance=1e-2)
-        solutions.append(system.solve(torch.stack(side, dim=1)))
-        del system
+    for (matrix, _), drawn in zip(systems, zip(*sides, strict=True), strict=True):
+        columns, what = torch.stack(drawn, dim=1), "the expected error"
+        found = solve_compressed(matrix, columns, what=what, tolerance=1e-2)
+        solutions.append(found.to(coarse.damping.device))
     error = solutions[0]
     for detail in solutions[1:]:
         error = detail + PiecewiseLinearFit(subdivision, facets)(error - detail)
@@ -128,20 +127,6 @@ def _noise(
         shared = _normal(generator, variance.new_empty(num_regions))[region[facet]]
     single = _normal(generator, variance)
     return variance.sqrt() * ((1 - common).sqrt() * single + common.sqrt() * shared)
-
-
-def _noise_rhs(
-    fused: FusedHeights, noise: list[Float[Tensor, " _"]], starts: PerVertex
-) -> PerVertex:
-    """Return the right-hand side for errors of the targets and of the initial heights."""
-    rhs = fused.damping.double() * starts
-    for kind, weight, factor, error in zip(
-        fused.kinds, fused.weights, fused.factors, noise, strict=True
-    ):
-        scaled = (weight * kind.information.double() / factor * error)[:, None]
-        weighted = (scaled * kind.coefficients.double()).flatten()
-        rhs = rhs.index_add(0, kind.unknowns.flatten(), weighted)
-    return rhs
 
 
 def _normal(generator: torch.Generator, like: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from pimper_torch.geometry.pyramids import (
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.geometry.visibility import RayCaster, ray_caster
 from pimper_torch.kernels.arrays import as_array, pulled_back
-from pimper_torch.kernels.compile import PHOTOMETRY
+from pimper_torch.kernels.compile import PHOTOMETRY, load
 from pimper_torch.kernels.signatures import FractionRows, PictureRows, Projection, Samples
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.records import (
@@ -108,6 +108,7 @@ class _Resampled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, on_radiance: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return gradients of images and geometry."""
+        load(("resampling_adjoint",))
         from pimper_torch.stages.patches.kernels import resampling_adjoint as adjoint
 
         valid, *inputs = ctx.saved_tensors

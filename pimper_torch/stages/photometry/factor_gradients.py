@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pimper_torch.kernels.arrays import as_array
+from pimper_torch.kernels.compile import load
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.linalg.robust import Squares, with_slope
 from pimper_torch.records import Record
@@ -86,6 +87,7 @@ class _Compiled(torch.autograd.Function):
         ctx: Any, problem: Bilinear, factors: Factors, *data: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return lights, shading, weights and residuals of the refined solution."""
+        load(("factor_adjoint",))
         from pimper_torch.stages.photometry.kernels import factor_adjoint, packed_patches
 
         code, scale, stride = problem.loss.code, problem.loss.scale, problem.stride

@@ -11,7 +11,4 @@ class Explain(Stage):
 
     def forward(self, surface: Mesh | Surface, contours: Contours) -> SilhouetteCoverage:
         """Return the fractions of every silhouette that the surface lacks or exceeds."""
-        if not contours.confine:
-            empty = surface.vertices_world.new_zeros(0)
-            return SilhouetteCoverage(uncovered=empty, outside=empty)
         return coverage_by(surface, contours.silhouettes, contours.cameras)

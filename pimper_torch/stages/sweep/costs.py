@@ -24,6 +24,7 @@ from pimper_torch.geometry.pyramids import (
 )
 from pimper_torch.geometry.rigid import invert_rigid, rotate, transform
 from pimper_torch.kernels.arrays import as_array, pulled_back
+from pimper_torch.kernels.compile import load
 from pimper_torch.kernels.switch import compiled_for
 from pimper_torch.records import Cameras, Observations, Photometry, Record, Templates
 
@@ -237,6 +238,7 @@ class _Compiled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, on_cost: Tensor, _: Tensor | None) -> tuple[Tensor | None, ...]:
         """Return gradients of images, geometry and light."""
+        load(("sweep_adjoint",))
         from pimper_torch.stages.sweep.kernels import sweep_adjoint as adjoint
 
         of_images = any(ctx.needs_input_grad[1:3])
