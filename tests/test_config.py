@@ -198,6 +198,11 @@ def test_settings_name_their_chain():
         load_config("paper", {"sweep": {"steps": 9}})
 
 
+def test_changes_that_are_no_settings_are_refused():
+    with pytest.raises(ConfigError, match="changes is 'text'; needed: settings nested by stage"):
+        load_config("default", "text")
+
+
 def test_changes_override_a_preset():
     changed = load_config("fast", {"reconstruct": {"seed": 12}})
     assert changed.reconstruct.seed == 12

@@ -40,8 +40,7 @@ def coverage_by(
         outside = (hit * (1 - 2 * inside).clamp_min(0)).sum()
         return torch.stack([((inside > 0.5) & ~covered).sum() / area, outside / area])
 
-    found = silhouettes.source != "everything"
-    views = silhouettes.reliable.nonzero()[:, 0].tolist() if found else []
+    views = (silhouettes.reliable & (silhouettes.source != "everything")).nonzero()[:, 0].tolist()
     rows = [vertices.new_zeros(0, 2), *(row[None] for row in side_by_side(of_view, views))]
     uncovered, outside = torch.cat(rows).unbind(dim=1)
     return SilhouetteCoverage(uncovered=uncovered, outside=outside)

@@ -23,6 +23,7 @@ def load_config(
     Raises:
         ConfigError: Names the file or `changes`, section and key, and the nearest valid one.
     """
+    require(isinstance(changes, Mapping | None), "changes", changes, "settings nested by stage")
     path = find_config(name_or_path)
     settings = read_mapping(path)
     config = _built(settings, str(path))

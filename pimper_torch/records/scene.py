@@ -56,6 +56,7 @@ class SparseScene(Record):
         observation_pixels: Position in the photograph before undistortion.
         lenses: Intrinsics of the photographs before undistortion.
         unregistered: Names of the photographs that were not registered.
+        given: Whether cameras were given: those of some photographs may be missing on purpose.
         diagnosis: Why the cameras may be wrong, and what to do; empty without such evidence.
         background_from_view: Homographies from pixels of each undistorted photograph to pixels of
             the static background of a turntable; NaN where a view contains too little of it. Empty
@@ -76,6 +77,7 @@ class SparseScene(Record):
     observation_pixels: Float[Tensor, "observation 2"]
     lenses: tuple[CameraModel, ...]
     unregistered: tuple[str, ...] = ()
+    given: bool = False
     diagnosis: str = ""
     background_from_view: Float[Tensor, "mapped 3 3"] = field(default_factory=no_maps)
     offset_world: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -56,6 +56,7 @@ def test_photographs_missing_from_the_model_are_excluded_with_a_warning(scene, v
     with pytest.warns(PimperWarning, match=r"4 of 5 photographs.*excluded: new\.jpg"):
         placed = Reconstruct()(more, tmp_path)
     assert placed.unregistered == ("new.jpg",)
+    assert placed.given
     assert placed.views.names == ("ü.tif", "b.jpg", "c 1.png", "d.jpg")
     assert_close(
         placed.cameras.cam_from_world,

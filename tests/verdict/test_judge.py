@@ -164,6 +164,12 @@ def test_the_least_favourable_figure_is_named_with_a_photograph(result, name):
     assert re.match(f"Look at {text}", found.text), found.text
 
 
+def test_photographs_without_given_cameras_do_not_count_against_the_result(result):
+    missing = result.scene.replace(unregistered=tuple(f"{index}.png" for index in range(9)))
+    assert judge(result.replace(scene=missing)).scores["registered"] < 0.5
+    assert "registered" not in judge(result.replace(scene=missing.replace(given=True))).scores
+
+
 def test_the_sentence_has_the_figures_of_the_view_and_of_the_mean(result):
     inside = result.silhouettes.inside.clone()
     inside[1, :4] = 1  # a strip above the surface

@@ -75,7 +75,7 @@ class Reconstruct(Stage):
         model = existing_model(bare, path)
         if lacks_points(model):
             model = self._triangulated(registered_views(bare, model), model, source_label(path))
-        return placed_scene(views, model)
+        return placed_scene(views, model).replace(given=True)
 
     def with_points(self, scene: SparseScene) -> SparseScene:
         """Triangulate points for a scene with hardly any observations, its cameras held fixed."""

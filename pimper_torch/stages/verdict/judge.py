@@ -103,7 +103,7 @@ def _figures(result: Reconstruction) -> Iterator[_Figure]:
     """Yield the figures that the run determines."""
     scene, silhouettes, relighting = result.scene, result.silhouettes, result.relighting
     names, reference = scene.views.names, scene.views.names[result.coarse.reference]
-    if lost := scene.unregistered:
+    if (lost := scene.unregistered) and not scene.given:
         yield _Figure(
             "registered",
             len(names) / len(names + lost),
