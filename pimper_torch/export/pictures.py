@@ -14,6 +14,7 @@ from pimper_torch.chains.running import ChainRun
 from pimper_torch.geometry.visibility import visible_vertices
 from pimper_torch.records import FinishedMesh, Reconstruction, Record, Relighting, TexturedMesh
 from pimper_torch.records.shapes import PerVertex, VertexMask
+from pimper_torch.runtime.memory import release_memory
 from pimper_torch.runtime.parallel import side_by_side
 from pimper_torch.scale.marker_scale import Marker, find_markers
 from pimper_torch.stages.sfm.sparse_scene import point_colors
@@ -55,6 +56,7 @@ class Draw(Stage):
 
     def forward(self, result: Reconstruction) -> Pictures:
         """Draw the surface, the photographs and their predictions."""
+        release_memory()  # of the full mesh's caster
         ready, asset, relighting = completed(result)
         scene, cameras, masks = result.scene, result.cameras, result.silhouettes
         turn, overview = BytesIO(), BytesIO()

@@ -19,8 +19,7 @@ def coverage_by(
 ) -> SilhouetteCoverage:
     """Return the fractions of every reliable silhouette that a surface lacks or exceeds.
 
-    None if they constrain nothing. Rays are through about 20,000 pixels of a photograph. Not
-    differentiable.
+    None if they constrain nothing. Rays are through some 20,000 pixels. Not differentiable.
     """
     vertices, caster = surface.vertices_world, ray_caster(surface)
     normals = face_normals(vertices, surface.faces)

@@ -267,8 +267,7 @@ def _child(row: int) -> None:
     with suppress(OSError, NotImplementedError):
         lock.acquire()
     if not all(map(_is_done, ROWS[row])):
-        # Code depends on the modules compiled before: gradients come after all others, which never
-        # load other processes' code.
+        # Code depends on modules compiled before: gradients are last, others load no foreign code.
         if ROWS[row] == GRADIENTS:
             load(_FIRST)
         else:
