@@ -58,14 +58,13 @@ class Draw(Stage):
         """Draw the surface, the photographs and their predictions."""
         release_memory()  # of the full mesh's caster
         ready, asset, relighting = completed(result)
-        scene, cameras, masks = result.scene, result.cameras, result.silhouettes
-        turn, overview = BytesIO(), BytesIO()
+        scene, masks, turn, overview = result.scene, result.silhouettes, BytesIO(), BytesIO()
         calls: tuple[Callable[[], Any], ...] = (
-            lambda: draw_turn(result.mesh, cameras, result.coarse.reference, turn),
+            lambda: draw_turn(result.mesh, result.cameras, result.coarse.reference, turn),
             lambda: view_images(scene, masks, predictions(ready.few, scene, relighting)),
             lambda: draw_overview(result, overview),
             lambda: openness(asset.mesh),
-            lambda: visible_vertices(asset.mesh, cameras).any(dim=0),
+            lambda: visible_vertices(asset.mesh, result.cameras).any(dim=0),
             lambda: point_colors(scene),
             lambda: tuple(find_markers(scene)),
         )

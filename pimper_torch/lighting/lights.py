@@ -206,14 +206,16 @@ def _fit(
     eye = torch.eye(9).to(basis)
     if name == "soft":
         return fit_lights(LightModel(basis=basis[:, :4]), samples, iterations), eye[:4]
-    room, start = eye[:1], None
-    with torch.no_grad():  # for gradients, the last fit alone has to converge to rounding
-        for _ in range(8 if name == "room" else 0):
-            model = LightModel(basis=basis @ room.mT, normals=normals, points=points)
-            fit = fit_lights(model, samples, iterations, start)
-            room, start = _fit_room(fit, samples, basis, room), (fit.lights, fit.albedo)
-    model = LightModel(basis=basis @ room.mT, normals=normals, points=points)
-    return fit_lights(model, samples, iterations, start), room
+    model = LightModel(basis=basis[:, :1], normals=normals, points=points)
+    fit = fit_lights(model, samples, iterations)
+    if name == "point_light":
+        return fit, eye[:1]
+    room = eye[:1]
+    for _ in range(8):
+        room = _fit_room(fit, samples, basis, room)
+        model = LightModel(basis=basis @ room.mT, normals=normals, points=points)
+        fit = fit_lights(model, samples, iterations, (fit.lights, fit.albedo))
+    return fit, room
 
 
 @torch.no_grad()

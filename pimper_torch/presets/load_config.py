@@ -24,8 +24,7 @@ def load_config(
         ConfigError: Names the file or `changes`, section and key, and the nearest valid one.
     """
     require(isinstance(changes, Mapping | None), "changes", changes, "settings nested by stage")
-    path = find_config(name_or_path)
-    settings = read_mapping(path)
+    settings = read_mapping(path := find_config(name_or_path))
     config = _built(settings, str(path))
     return _built(overlay(settings, changes), "changes") if changes else config
 
