@@ -21,7 +21,7 @@ def coverage_by(
 
     None if they constrain nothing. Rays are through some 20,000 pixels. Not differentiable.
     """
-    vertices, caster = surface.vertices_world, ray_caster(surface)
+    vertices = surface.vertices_world
     normals = face_normals(vertices, surface.faces)
     cameras = cameras.to(vertices.dtype)
 
@@ -32,7 +32,7 @@ def coverage_by(
         inside = silhouettes.inside[view, rows][:, columns].to(vertices)
         pixels = pixels_from_indices(torch.cartesian_prod(columns, rows).to(vertices))
         rays = rays_through(pixels, cameras.cam_from_world[view], cameras.intrinsics[view])
-        face = caster.cast(cameras.centers_world[view], rays).face
+        face = ray_caster(surface).cast(cameras.centers_world[view], rays).face
         front = (face >= 0) & ((normals[face.clamp_min(0)] * rays).sum(dim=1) < 0)
         hit, covered = (x.reshape(len(columns), len(rows)).mT for x in (face >= 0, front))
         area = (inside > 0.5).sum().clamp_min(1)
